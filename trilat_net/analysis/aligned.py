@@ -407,8 +407,9 @@ class _PeerMotion(NamedTuple):
 class PeerTrajectory:
     """The motion of a site as a function of continuous time, interpolated from its records.
 
-    It tells where the site was when it sent a sample, or between two ticks. The motion is a
-    polynomial between two records. Before the first record the arm rests (assumption L7).
+    The trajectory gives the position of the site at the time of sending a sample, or between
+    two ticks. The motion is a polynomial between two records. Before the first record the arm
+    rests (assumption L7).
 
     Args:
         records: Records of the site.
@@ -573,7 +574,7 @@ def find_latest_rows(records: AlignedRecords, t_s: Array) -> tuple[Ints, Bools]:
     """Finds the last record of an arm at or before each of several times.
 
     It relates arms whose control loops have different rates: a time of one arm is looked up in
-    the records of another one.
+    the records of another arm.
 
     Args:
         records: Records of the site, with one row per tick.

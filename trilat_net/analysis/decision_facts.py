@@ -1,7 +1,7 @@
 """Defines the evidence on the stability of a run, and the decision that rests on it.
 
-`stability_decision` decides, and the package `presentation` writes the sentences about what a
-decision rests on and what prevents a better one.
+`stability_decision` decides, and the package `presentation` writes the sentences about the
+basis of a decision and the reasons against a better one.
 
 Invariant:
     - A decision and its evidence contain only names and numbers, apart from phrases that the

@@ -66,9 +66,9 @@ class DominanceHistory(NamedTuple):
 def trace_dominance(log: Log, site: str, t_s: Array) -> DominanceHistory:
     """Returns the dominance factors of a site at successive ticks.
 
-    They change by the timeline of the scenario and by commands during the run. If the site lost
-    a peer and continues without it, the factors of the others are scaled so that their sum is
-    1.
+    The factors change according to the timeline of the scenario and the commands during the
+    run. If the site lost a peer and continues without it, the factors of the others are scaled
+    so that their sum is 1.
 
     Args:
         log: The log of the run.
@@ -134,8 +134,8 @@ def find_users(scenario: Scenario) -> tuple[str, list[str]]:
         scenario: The description of the experiment.
 
     Returns:
-        Name of the first slave. Empty if there is none.
-        Names of all masters, each of which stands for its user.
+        Name of the first slave, empty if there is no slave. Names of all masters, each of which
+        represents its user.
     """
     slaves = []
     masters = []
@@ -454,7 +454,7 @@ def evaluate_ramps(
 def plan_dominance(scenario: Scenario, site: str, t_s: Array) -> Array:
     """Returns the dominance factors of an arm over time, as its scenario plans them.
 
-    A dominance factor is the weight, from 0 to 1, with which an arm follows another one. A
+    A dominance factor is the weight, from 0 to 1, with which an arm follows another arm. A
     scenario can shift these weights during the run, for example from a teacher to a student.
 
     Args:
@@ -498,7 +498,7 @@ class _LyapunovWeights(NamedTuple):
 def find_closed_groups(alpha: Array) -> tuple[tuple[int, ...], ...]:
     """Finds the groups of arms that follow each other, and no arm outside the group.
 
-    An arm may follow another one directly or through further arms. If there are several groups,
+    An arm may follow another arm directly or through further arms. If there are several groups,
     the weights of the arms in the energy function V are not unique.
 
     Args:
@@ -580,10 +580,11 @@ def find_kd_scales(Kd: Array) -> Array | None:
 def compute_lyapunov_weights(alpha: Array, Kd: Array) -> _LyapunovWeights:
     """Computes the weight of each site in the energy function of the stability proof.
 
-    A site is the process that runs one arm. Its weight is beta_i = pi_i / c_i, where pi is the
-    left eigenvector of `alpha` for the eigenvalue 1, and c_i is the factor between the damping
-    gain of site i and that of the first site. The weights are scaled so that their sum is N. If
-    the gains are not multiples of each other, c_i = 1 is used, and the energy may rise.
+    A site is the process that runs one arm. The weight of site i is beta_i = pi_i / c_i, where
+    pi is the left eigenvector of `alpha` for the eigenvalue 1, and c_i is the factor between
+    the damping gain of site i and that of the first site. The weights are scaled so that their
+    sum is N. If the gains are not multiples of each other, c_i = 1 is used, and the energy may
+    rise.
 
     Args:
         alpha: Dominance factors: entry (i, j) is the weight with which site i follows site j,

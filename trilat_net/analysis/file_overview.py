@@ -578,9 +578,9 @@ def _parse_number(text: str) -> int | None:
 
 
 def summarise_run(log: Log, twin: Log | None = None) -> JsonObject:
-    """Collects the most important figures of a run, for the file `summary.json`.
+    """Collects the most important quantities of a run, for the file `summary.json`.
 
-    The log may be torn, short or empty. Figures that the log does not determine are `None`.
+    The log may be torn, short or empty. Quantities that the log does not determine are `None`.
 
     Args:
         log: The log of the run.
@@ -588,7 +588,7 @@ def summarise_run(log: Log, twin: Log | None = None) -> JsonObject:
             computed. `None` if there is no such log.
 
     Returns:
-        The figures as plain values, ready for JSON.
+        The quantities as plain values, ready for JSON.
     """
     sites = {site: _summarise_site(log, site, twin) for site in log.sites}
     settling_times_s = [site["settle_s"] for site in sites.values()]
@@ -640,9 +640,9 @@ def summarise_run(log: Log, twin: Log | None = None) -> JsonObject:
 
 
 def _summarise_site(log: Log, site: str, twin: Log | None) -> JsonObject:
-    """Returns the most important figures of one arm in a run, such as its largest error.
+    """Returns the most important quantities of one arm in a run, such as its largest error.
 
-    The figures are written to `summary.json`, from which other programs can read them.
+    These quantities are written to `summary.json`, from which other programs can read them.
 
     Args:
         log: The log of the run.
@@ -698,7 +698,7 @@ def _summarise_site(log: Log, site: str, twin: Log | None) -> JsonObject:
 
 
 def _summarise_link(log: Log, link: LinkSummary) -> JsonObject:
-    """Returns the figures of a link for `summary.json`, such as its delays and losses."""
+    """Returns the quantities of a link for `summary.json`, such as its delays and losses."""
     counts = link.counts
     clock = summarise_clock(log, link.peer, link.site)
 

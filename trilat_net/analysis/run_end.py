@@ -186,8 +186,8 @@ class RunEnd(NamedTuple):
         frequency_hz: Frequency of a bounded oscillation. `None` if there is none.
         missing_sites: Sites without any record, which leave the run undecided.
         error_unit: Unit of |e|: "rad", or "m" if the sites follow positions in task space.
-        counts_from_s: Time from which the run counts, in s. The second half of the time after
-            it is the judged part.
+        counts_from_s: Time after which the run is considered, in s. The second half of the time
+            after it is the judged part.
         quiet_from_s: Time from which no operator acts and the control loop does not change, in
             s.
         lasts_s: Length of the record, in s.
@@ -999,7 +999,7 @@ def find_hanging_sites(scenario: Scenario, ends: Mapping[str, Array]) -> list[st
 def _find_last_operator_action(scenario: Scenario, span_s: float) -> float:
     """Returns the last time before `span_s` at which an operator changed its action, in s.
 
-    The action is known from the scenario, which states what each operator does over time.
+    The actions are known from the scenario, which states the action of each operator over time.
     Operators who act live are not part of the scenario. An operator who only holds an arm does
     not act.
 

@@ -43,7 +43,7 @@ class _LargePush(NamedTuple):
 
     Attributes:
         site: Name of the site.
-        joint: Number of the joint, from 1 on.
+        joint: Number of the joint, counted from 1.
         torque_nm: The torque.
         limit_nm: Torque limit of the joint.
     """

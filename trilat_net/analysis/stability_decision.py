@@ -108,7 +108,7 @@ def _list_obstacles(run: RunFindings) -> tuple[Obstacle, ...]:
     analyses, and roots that show growth.
 
     Args:
-        run: What the analyses found about the run.
+        run: Findings of the analyses on the run.
     """
     obstacles: list[Obstacle] = []
     if run.end.doubts:
@@ -253,7 +253,7 @@ def _has_settled(run: RunFindings) -> bool:
     pushes, but on no proof.
 
     Args:
-        run: What the analyses found about the run.
+        run: Findings of the analyses on the run.
     """
     end = run.end
     twins = run.twins
@@ -274,7 +274,7 @@ def _explain_open(run: RunFindings) -> Obstacle:
     disagree with the run to an end of the run that does not decide.
 
     Args:
-        run: What the analyses found about the run.
+        run: Findings of the analyses on the run.
     """
     if run.has_proof:
         return "disputed proof"

@@ -1,4 +1,4 @@
-"""Lists what happened in a run over time: commands, network delays, modes of the arms, alarms.
+"""Lists the events of a run over time: commands, network delays, modes of the arms, alarms.
 
 For example, a command may change a delay at 5 s, or stop all arms at 8 s. A reader of a figure
 or of a judgement needs these times. The mode of an arm is what its controller does: it follows

@@ -1,12 +1,12 @@
-"""Writes the report of a recorded run: a web page, and a file with the figures of the run.
+"""Writes the report of a recorded run: a web page, and a file with the key numbers of the run.
 
-`write_report` computes the key figures of the run from its log, draws the figures that explain
+`write_report` computes the key numbers of the run from its log, draws the figures that explain
 whether the run was stable, and writes two files:
 
 - `report.html`, a page for readers. `render_report` fills the template `templates/report.html`.
   Each section of the page comes from one of the modules `page_...`. Interactive charts are
   drawn in the browser by scripts, from data that `charts.ChartBuilder` computes.
-- `summary.json`, the same figures for programs.
+- `summary.json`, the same numbers for programs.
 
 Invariant:
     - The page is a single file that contains its images, styles and scripts. It loads nothing
@@ -54,7 +54,7 @@ def write_report(
 ) -> list[Path]:
     """Writes the report of a run, report.html and summary.json, into a folder.
 
-    The page shows the results of a run to readers, and the JSON file contains the same figures
+    The page shows the results of a run to readers, and the JSON file contains the same numbers
     for programs.
 
     Args:
@@ -108,7 +108,7 @@ def render_report(
         log: Log of the run.
         twin: Log of the same run without operators, or `None`, see `write_report`.
         verdicts: Results of the checks of the log.
-        facts: Key figures of the run, from `summarise_run`.
+        facts: Key numbers of the run, from `summarise_run`.
         verdict: HTML of the judgement about stability, with which the page begins. Empty for
             none.
         reasons: HTML of the section that explains the judgement. Empty for no such section.

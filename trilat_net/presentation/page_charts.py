@@ -29,11 +29,12 @@ from .page_leaders import describe_leads, render_lead_bars
 _TEXTS: dict[str, dict[str, Any]] = tomllib.loads(
     (resources.files("trilat_net.presentation") / "assets" / "report.toml").read_text("utf-8")
 )
-"""Heading and note of each section of charts, by place and section, and other notes."""
+"""Heading and note of each section of charts, by part of the page and section, and other notes.
+"""
 _OPEN_SECTIONS = ("torques", "errors", "positions")
 """Sections of charts that may be unfolded at first."""
 _MOST_OPEN_CHARTS = 10
-"""Largest number of charts of a place that are unfolded at first."""
+"""Largest number of charts in a part of the page that are unfolded at first."""
 _MOST_HALF_CHARTS = 2
 """Largest number of charts in a group that takes half of the width of the page."""
 _NO_VALUE = "the log has no value to draw"
@@ -85,7 +86,8 @@ def render_chart_groups(
 
     Args:
         log: Log of the run.
-        place: Place on the page, a table of `report.toml`, such as "motion" or "links".
+        place: Part of the page, which is the name of a table in `report.toml`, such as "motion"
+            or "links".
         charts: Charts of the page.
         missing: Titles of the charts for which the log has no value, by section.
     """

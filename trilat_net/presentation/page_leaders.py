@@ -203,8 +203,9 @@ def _describe_constant_lead(scenario: Scenario, lead: _Lead) -> str:
 
 
 def describe_phases(lead: _Lead) -> str:
-    """Returns who leads when, as in "0 to 10 s: m1 90 %, m2 10 %; from 12 s: m1 10 %, m2 90 %".
+    """Returns a text on who leads at which times.
 
+    An example is "0 to 10 s: m1 90 %, m2 10 %; from 12 s: m1 10 %, m2 90 %".
     Ramps between two spans are left out, because these spans show the weights before and after
     the ramp. If there are more than `_MAX_PHASES` spans, only the number of the remaining ones
     is stated.

@@ -75,7 +75,7 @@ _CLOCK_COLUMNS = {
     "rtt_min_us": ("round trip, min (µs)", "shortest time to the peer and back"),
     "faults": ("faults", "samples that arrived before they were sent"),
 }
-"""Header and meaning of each figure of a sender's clock, by its key in the summary."""
+"""Header and meaning of each value of a sender's clock, by its key in the summary."""
 
 
 def render_links(log: Log, facts: JsonObject, charts: Markup = Markup()) -> Markup:  # noqa: B008

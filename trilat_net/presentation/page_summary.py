@@ -278,7 +278,7 @@ def find_error_peak(log: Log, sites: Sequence[str] = ()) -> JointError | None:
 
     Args:
         log: Log of the run.
-        sites: Names of the sites that count. Empty for all sites.
+        sites: Names of the sites to consider. Empty for all sites.
 
     Returns:
         The first record with this error. `None` if no record has a finite error.

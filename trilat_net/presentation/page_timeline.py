@@ -48,8 +48,8 @@ _DID = {
     "fault": "stood still with a fault",
     "stopped": "stood by order",
 }
-"""Clause on what a site did in each mode. Other modes are described by their names in the
-records.
+"""Clause on the behaviour of a site in each mode. Other modes are described by their names in
+the records.
 """
 
 
@@ -233,7 +233,7 @@ def _find_spans(t_s: Array, acts: Bools) -> list[tuple[float, float]]:
 
 
 def _name_pusher(log: Log, site: str) -> str:
-    """Returns who may push the arm of a site: an operator, its environment, or both."""
+    """Returns a phrase for the possible sources of pushes, such as "An operator"."""
     spec = log.scenario.sites[site]
     if spec.hands and spec.environment:
         return "An operator or a wall"

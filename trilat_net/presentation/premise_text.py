@@ -326,14 +326,16 @@ def _describe_books(quantities: premise_quantities.BooksQuantities) -> str:
 def _describe_booked_torques(quantities: premise_quantities.BookedTorqueQuantities) -> str:
     if quantities.unbooked:
         sites = ", ".join(quantities.unbooked)
-        return f"cut off at {sites}: the law counts a different torque than the arm received"
+        return f"cut off at {sites}: the law uses a different torque than the arm received"
     if quantities.cut:
-        return f"cut off at {', '.join(quantities.cut)}, and counted as cut off"
+        return (
+            f"cut off at {', '.join(quantities.cut)}, and the law uses the torque after the cut"
+        )
     return "never cut off"
 
 
 def _describe_sampling(quantities: premise_quantities.SamplingQuantities) -> str:
-    energy = f"up to {quantities.leak_j:.3g} J more than its law counts"
+    energy = f"up to {quantities.leak_j:.3g} J more than its law accounts for"
     return f"the arm of {quantities.site} received {energy}, between ticks"
 
 

@@ -41,7 +41,7 @@ class Certificate(Result):
 
     Attributes:
         premises: The conditions of the stability theorem, each checked.
-        verdict: What the energy function V shows.
+        verdict: Result of examining the energy function V.
         end: The end of the run, judged from the errors e and the velocities qd alone.
         evidence: The number of records on which the certificate rests, and whether the log was
             changed.

@@ -213,9 +213,9 @@ class SiteEnergy:
     def _estimate_coupled_error(self) -> float:
         """Estimates the error of the energies that the trapezoid rule integrates, in J.
 
-        Within a period, both the filtered error r and the torques change. The product of both
-        changes is not contained in the mean of the powers at its ends. The estimate is an upper
-        bound for the error of the balance.
+        Within a period, both the filtered error r and the torques change. The mean of the
+        powers at the ends of the period does not include the product of both changes. The
+        estimate is an upper bound for the error of the balance.
         """
         records = self.motion.records
         ends = self.motion.ends
@@ -236,7 +236,7 @@ def _accumulate(amounts: Array, judged: Bools | None = None) -> Array:
 
     Args:
         amounts: Amount in each period, shape (K - 1,).
-        judged: True for each period that counts. `None` if all periods count.
+        judged: True for each period that is included. `None` to include all periods.
     """
     if judged is not None:
         amounts = np.where(judged, amounts, 0.0)
@@ -481,8 +481,8 @@ class EnergyBalance:
     def find_largest_rise(self, tolerance: float) -> FunctionalRise | None:
         """Finds the largest rise of the energy function V above an earlier minimum.
 
-        The work of operators and environments is subtracted before, because V may rise by it.
-        The sources of the remaining energy are also found.
+        The work of operators and environments is subtracted first, because V may rise by this
+        amount. The sources of the remaining energy are also found.
 
         Args:
             tolerance: Size that the rise must exceed, in J.

@@ -383,11 +383,11 @@ class SiteMotion:
 
     @property
     def rests(self) -> Bools:
-        """Marks the records in which the site brings its arm to rest, or did so, shape (K,).
+        """Marks the records in which the site brings its arm to rest, or did so shortly before.
 
         The site then adds a braking torque, for example because a peer is silent. The recorded
         torque may therefore differ from the torque of the control law, and must not be compared
-        with it.
+        with it. The shape is (K,).
         """
         records = self.records
         if records.rests.size:
@@ -756,17 +756,17 @@ def compute_dissipation(site: SiteMotion) -> dict[str, Increment]:
 
 
 def compute_transfer(site: SiteMotion, axes: Array) -> Increment:
-    """Computes the energy that a site gives to the sites which follow it, minus what it gets.
+    """Computes the net energy that a site gives to the sites that follow it.
 
-    In each tick period it is the integral of 1/2 qd_i'Kd qd_i - 1/2 sum_j alpha_ij qd_j'Kd
-    qd_j. Here qd_i is the velocity of the site and qd_j of its peer j, Kd is the damping gain,
-    and alpha_ij is the dominance factor: the weight with which site i follows peer j. In the
-    weighted sum over all sites these energies cancel.
+    It is the given energy minus the received energy: in each tick period the integral of 1/2
+    qd_i'Kd qd_i - 1/2 sum_j alpha_ij qd_j'Kd qd_j. Here qd_i is the velocity of the site and
+    qd_j of its peer j, Kd is the damping gain, and alpha_ij is the dominance factor: the weight
+    with which site i follows peer j. In the weighted sum over all sites these energies cancel.
 
     Args:
         site: Motion of the site.
-        axes: 1 for each of the m coordinates that counts, and 0 for each other one, shape (m,).
-            The shape () applies to all coordinates.
+        axes: 1 for each of the m coordinates to include, and 0 for each other coordinate, shape
+            (m,). The shape () applies to all coordinates.
     """
     dominance = site.dominance
     Kd_of_axes = axes * site.constants.Kd

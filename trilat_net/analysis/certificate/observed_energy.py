@@ -45,8 +45,8 @@ bound.
 ROUNDING_SHARE = 1e-12
 """Additional rounding error, as a share of the largest energy."""
 SAMPLING_SHARE = 1e-2
-"""Largest energy that an arm may receive and its law does not count, as a share of the largest
-energy.
+"""Largest energy that an arm may receive without its law accounting for it, as a share of the
+largest energy.
 """
 
 
@@ -78,12 +78,12 @@ _EnergyKind = Literal["line", "known", "store", "taken", "given"]
 class _EnergyCurve(NamedTuple):
     """One kind of energy over time that a control law declares, such as a stored energy.
 
-    Some laws also keep account of the energy that is on its way to another arm.
+    Some laws also keep account of the energy in transit to another arm.
 
     Attributes:
-        kind: "line" for the energy on the way from a peer to the site, "known" for the part of
-            it that the site knows, "store" for energy that the law stores, "taken" for energy
-            that the law dissipated, "given" for energy that the arm gave to the law.
+        kind: "line" for the energy in transit from a peer to the site, "known" for the part of
+            this energy that the site knows, "store" for energy that the law stores, "taken" for
+            energy that the law dissipated, "given" for energy that the arm gave to the law.
         site: Name of the site.
         peer: Name of the site at the other end of a line. Empty for other kinds.
         t_s: Times of the site's ticks, shape (K,), in s.
@@ -103,9 +103,9 @@ class _EnergyCurve(NamedTuple):
     def name(self) -> str:
         """Short name of the energy for reports.
 
-        With sites m and s, the energy on the way from m to s is named "line m->s". The part of
-        this energy that is known to s is named "known at s of m". The energy
-        stored at s is named "store of s".
+        With sites m and s, the energy in transit from m to s is named "line m->s". The part of
+        this energy that is known to s is named "known at s of m". The energy stored at s is
+        named "store of s".
         """
         return _name_energy(self.kind, self.site, self.peer)
 
@@ -164,8 +164,8 @@ class ObservedEnergy(NamedTuple):
         largest_j: Largest of all energies, in J.
         residual_j: Largest difference between the energy that a law dissipated and the sum of
             the other energies that it declares, in J.
-        sampling_j: Largest energy that an arm received and its law did not count, in J. Such
-            energy arises because the torque is constant between ticks.
+        sampling_j: Largest energy that an arm received and its law did not account for, in J.
+            Such energy arises because the torque is constant between ticks.
         curves: Every energy over time, and the energies that the arms gave to their laws.
         undeclared_sites: Sites whose laws declare no energies, although others do. The energies
             are then not judged.
@@ -257,7 +257,7 @@ class _SiteBooks(NamedTuple):
         port: Energy that the arm gave to the law, according to the law.
         taken: Energy that the law dissipated.
         residual: Part of the dissipated energy that the other declared energies do not explain.
-        leak: Energy that the arm received and the law does not count.
+        leak: Energy that the arm received and the law does not account for.
     """
 
     t_s: Array
@@ -365,7 +365,7 @@ def _read_law_records(
         log: The log of the run.
         site: Name of the site.
         law: The law.
-        count: Number of records, from the first one on.
+        count: Number of records, beginning with the first.
     """
     site_log = log[site]
     sent = {key: values[:count] for key, values in site_log.sent.items()}
@@ -395,7 +395,7 @@ def _read_law_memory(
         log: The log of the run.
         site: Name of the site, the process that controls the arm.
         law: The law. Its attribute `remembers` lists the names of these values.
-        count: Number of records to read, from the first one on.
+        count: Number of records to read, beginning with the first.
 
     Returns:
         For each name, the values in these records.
@@ -434,7 +434,7 @@ def _read_peer_records(
         site: Name of the site of the law.
         peer: Name of the peer.
         sent: Values that the law sent.
-        count: Number of records, from the first one on.
+        count: Number of records, beginning with the first.
     """
     tick = log[site].used[peer][:count]
     has_sample = tick[:, np.newaxis] >= 0
@@ -459,8 +459,8 @@ def _read_peer_records(
 def _find_curves(log: Log, accounts: Mapping[str, _SiteBooks]) -> Iterator[_EnergyCurve]:
     """Yields the energies over time that a passive control law never lets fall below zero.
 
-    They are the energy on the way between two arms (line), the part of it that the receiver
-    knows, stored energy, and the energy that a law dissipated.
+    These energies are the energy in transit between two arms (line), the part of it that the
+    receiver knows, the stored energy, and the energy that a law dissipated.
 
     Args:
         log: The log of the run.
@@ -572,8 +572,8 @@ def _check_books(log: Log, accounts: Mapping[str, _SiteBooks], scale_j: float) -
     """Checks the conditions under which the declared energies count as evidence.
 
     - books: the energies that each law declares add up;
-    - torque: each law counts the torque that the arm received, even if the torque was cut off;
-    - sampling: arms receive little energy between the ticks that their laws do not count.
+    - torque: each law uses the torque that the arm received, even if the torque was cut off;
+    - sampling: arms receive little energy between the ticks that their laws do not account for.
 
     Args:
         log: The log of the run.

@@ -136,7 +136,7 @@ class WallQuantities(NamedTuple):
 class DominanceQuantities(NamedTuple):
     """Evidence on whether the dominance factors are constant and determine weights for V.
 
-    A dominance factor is the weight with which an arm follows another one. The stability
+    A dominance factor is the weight with which an arm follows another arm. The stability
     theorem requires both. V is its energy function.
 
     Attributes:
@@ -429,14 +429,14 @@ class BooksQuantities(NamedTuple):
 
 
 class BookedTorqueQuantities(NamedTuple):
-    """Evidence for the condition that control laws count the torque that the arms received.
+    """Evidence for the condition that control laws use the torque that the arms received.
 
-    If a torque was cut off at the limit of a motor, a law that counts the demanded torque
+    If a torque was cut off at the limit of a motor, a law that uses the demanded torque
     declares wrong energies.
 
     Attributes:
         cut: Sites whose torque was cut off at the limit of their actuators.
-        unbooked: Sites among `cut` whose law counts a different torque than the arm received.
+        unbooked: Sites among `cut` whose law uses a different torque than the arm received.
     """
 
     cut: tuple[str, ...]
@@ -444,10 +444,11 @@ class BookedTorqueQuantities(NamedTuple):
 
 
 class SamplingQuantities(NamedTuple):
-    """Evidence for the condition that arms receive little energy that their laws do not count.
+    """Evidence for the condition that laws account for nearly all energy that arms receive.
 
     Between two control periods the torque is constant while the arm moves on. The law, which
-    sees the arm once per period only, does not count the energy that this supplies.
+    sees the arm only once per period, does not account for the energy that the torque supplies
+    meanwhile.
 
     Attributes:
         site: Site that received most of this energy.

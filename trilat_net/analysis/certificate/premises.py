@@ -142,8 +142,9 @@ class _RunFacts(NamedTuple):
         log: The log of the run.
         constants: Gains and limits of every site, the process that runs one arm, by name. Empty
             if V does not exist for some site.
-        functional: V over time, and what changed it. `None` if V cannot be computed.
-        unknown: The reason why V cannot be computed. `None` if it can.
+        functional: V over time, and the energies that changed it. `None` if V cannot be
+            computed.
+        unknown: The reason why V cannot be computed. `None` if V can be computed.
     """
 
     log: Log
@@ -153,7 +154,7 @@ class _RunFacts(NamedTuple):
 
 
 def gather_facts(log: Log) -> _RunFacts:
-    """Computes from a log what is needed to check the conditions of the stability theorem.
+    """Computes from a log the quantities for checking the conditions of the stability theorem.
 
     The theorem uses an energy function of all arms. This function does not exist for every
     control law. It cannot be computed if the records of the arms have too few times in common.

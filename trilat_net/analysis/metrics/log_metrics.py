@@ -251,7 +251,7 @@ class LogMetrics(Result):
 
 
 def _reduce_to_run(quantity: Quantity, values_by_subject: Mapping[str, Metric]) -> Metric:
-    """Reduces the numbers of a quantity to one number of the whole run.
+    """Reduces the values of a quantity to one value for the whole run.
 
     It is the largest number of all subjects (sites, links or walls), or their sum. Subjects to
     which the quantity does not apply are left out. If the number of any other subject is
@@ -473,8 +473,8 @@ def _impedance_to_json(metrics: LogMetrics, estimate: ImpedanceEstimate) -> _Jso
 def _name_axis(metrics: LogMetrics, entry: _JsonEntry) -> _JsonEntry:
     """Converts the entry of a joint to that of an axis, for arms that follow end effectors.
 
-    The key "joint" becomes "axis". Keys that end in a unit of torque or angle get the unit
-    along the axis, for example "force_nm" becomes "force_n".
+    The key "joint" becomes "axis". In keys that end in a unit of torque or angle, the unit is
+    replaced by that along the axis. For example, "force_nm" becomes "force_n".
     """
     number = entry.pop("joint")
     axis_entry = {"axis": metrics.label(number)}
@@ -519,5 +519,5 @@ def _replace_not_finite(value: Any) -> Any:
 
 
 def _values_to_json(metrics: MetricValues) -> dict[str, float | None]:
-    """Returns the numbers of metrics by key. Missing numbers are None."""
+    """Returns the values of metrics by key. Missing values are `None`."""
     return {key: metric.value for key, metric in metrics.items()}

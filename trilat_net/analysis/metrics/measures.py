@@ -1,4 +1,4 @@
-"""Lets a function register itself as a metric, so that tables and commands find it by name.
+"""Registers functions as metrics, so that tables and commands find them by name.
 
 A metric is a number that describes a run or a part of it, for example the RMS error of an arm.
 Each module of this folder contains functions that compute such numbers. The decorator
@@ -221,7 +221,7 @@ class Measure(NamedTuple):
         of: Kind of subject that is measured: "run", "site", "link" or "wall".
         group: Heading under which the quantities are shown.
         quantities: Definitions of the quantities.
-        measure: The function, which returns the numbers of one subject.
+        measure: The function, which returns the values for one subject.
     """
 
     of: str

@@ -64,7 +64,7 @@ _MAX_DISTANCE_PER_S = 1e6
 ZERO_SHARE = 1e-12
 """Largest singular value that counts as zero, relative to the largest one."""
 _LONGEST_CHAIN = 4
-"""Length of the longest Jordan chain of roots at zero that is searched."""
+"""Length of the longest Jordan chain of roots at zero that is considered."""
 NAMED_SHARE = 0.3
 """Smallest participation at which a state is named with a root, relative to the largest one."""
 _INITIAL_ORDER = 12

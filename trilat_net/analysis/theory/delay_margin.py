@@ -20,7 +20,7 @@ Sources:
       Ekvacioj 29 (1986).
 
 Invariant:
-    - Crossings of the imaginary axis are searched over frequency and not over delay, so that no
+    - Crossings of the imaginary axis are sought over frequency and not over delay, so that no
       crossing is missed between two delays.
 """
 
@@ -38,7 +38,7 @@ from . import characteristic_roots
 from .linear_loop import DelayedTerm, LinearLoop
 
 MAX_COMMON_DELAY_S = 10.0
-"""Longest common delay that is searched, in s."""
+"""Longest common delay that is examined, in s."""
 _LISTED_INTERVALS = 3
 """Largest number of intervals that the description lists one by one."""
 _POINTS = 600

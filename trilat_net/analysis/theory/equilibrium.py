@@ -144,9 +144,10 @@ def _select_loop_states(conditions: OperatingConditions, states: Sequence[Array]
 def _find_nearest_equilibrium(
     conditions: OperatingConditions, rest: Equilibrium
 ) -> Equilibrium:
-    """Finds the pose nearest to a given pose in which all arms rest.
+    """Finds the equilibrium, a pose in which all arms rest, that is nearest to a given pose.
 
-    Each Gauss-Newton step is the smallest step that solves the linearised equations of rest.
+    Each Gauss-Newton step is the smallest step that solves the linearised equilibrium
+    equations.
 
     Args:
         conditions: The sites (processes that each run one arm), gains and delays.
@@ -430,7 +431,7 @@ def add_limit_notes(conditions: OperatingConditions, rest: Equilibrium) -> Equil
 def predict_equilibrium(scenario: Scenario) -> Equilibrium:
     """Predicts where the arms come to rest, by linear analysis without simulating the motion.
 
-    They begin in the start poses of the scenario.
+    The arms begin in the start poses of the scenario.
 
     Args:
         scenario: The description of the experiment.

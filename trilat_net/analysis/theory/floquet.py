@@ -148,10 +148,11 @@ def _linearise_site_tick(site: SiteSetup, jacobian: SiteJacobian) -> _SiteTickMa
     Phi, Gamma = _discretise_arm(jacobian, h_s)
 
     def compute_control(arguments: Array) -> Array:
-        """Returns what the controller adds to the state of a site during one tick.
+        """Returns the contribution of the controller to the state of a site during one tick.
 
-        Its torque moves the arm, and its parameter estimates change. The torque of this tick is
-        kept for the next tick if the integration scheme needs it. All quantities are linear.
+        The torque of the controller moves the arm, and its parameter estimates change. The
+        torque of this tick is kept for the next tick if the integration scheme needs it. All
+        quantities are linear.
 
         Args:
             arguments: States and inputs of the site, in the order of `ArgumentLayout`, shape
@@ -466,7 +467,7 @@ def _plan_parts(
 
 
 class _PeerEffect(NamedTuple):
-    """Effect of one arm on another, and the message of it that the other arm uses at each tick.
+    """Effect of one arm on another, and the messages that the other arm uses at its ticks.
 
     A tick is a period of the control loop.
 
@@ -487,7 +488,8 @@ class _Tracks(NamedTuple):
     Each start state has its own column.
 
     Attributes:
-        states: States from the start of the span on, shape (1 + ticks, n_i, columns).
+        states: States after the start of the span, including the start, shape (1 + ticks, n_i,
+            columns).
         sent: Sent values of all ticks that are used, shape (past + 1 + ticks, r_i, columns).
             The first `past` rows are ticks before the start of the span.
     """
@@ -589,8 +591,8 @@ class _SpanMap:
     def build_constant_columns(self, X: Array) -> Array:
         """Returns columns of states for motions in which nothing has changed in the past.
 
-        Each column contains what all arms sent at their last ticks, as far back as it is used,
-        and their states.
+        Each column contains the values that all arms sent at their last ticks, as far back as
+        they are used, and the states of all arms.
 
         Args:
             X: The constant states, shape (n, columns), with the n states of all sites.
@@ -681,9 +683,9 @@ class _SpanMap:
             sizes: List to which the norm of each column after each part is appended.
 
         Returns:
-            The motions at the end of the span, shape (size, columns).
-            For each site i, its n_i states from the start of the span on, shape (ticks + 1,
-            n_i, columns).
+            The motions at the end of the span, shape (size, columns). For each site i, its n_i
+            states at the start of the span and at every tick after it, shape (ticks + 1, n_i,
+            columns).
         """
         tracks = self._build_tracks(V)
         for n, part in enumerate(self._parts):
@@ -942,7 +944,7 @@ class SampledLoop:
         Args:
             pose: The pose about which the loop is linearised.
             scale_per_s: Rate, in 1/s, that sets the accuracy: the error is at most about a
-                thousandth of it.
+                thousandth of this rate.
 
         Returns:
             The real part of the rightmost root, in 1/s. `None` if all roots are zero by
@@ -1045,8 +1047,8 @@ def _describe_modes(
 
     Args:
         s: Principal values of the roots, shape (K,), in 1/s.
-        tracks: States of each site from the start of the span on, with K columns of real parts
-            and then K of imaginary parts.
+        tracks: States of each site over the span, with K columns of real parts and then K
+            columns of imaginary parts.
         loop: The loop.
         rates_hz: Tick rate of each site.
     """

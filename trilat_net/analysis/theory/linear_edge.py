@@ -274,8 +274,7 @@ class _GrowthPoint(NamedTuple):
     def is_unstable(self) -> bool:
         """True if small motions of the arms grow at this value of the setting.
 
-        The limit of stability lies between two neighbouring values of which only one is
-        unstable.
+        The limit of stability lies between a stable and an unstable neighbouring value.
         """
         return self.growth_per_s > 0.0
 
@@ -406,9 +405,8 @@ class GrowthColumn(NamedTuple):
         """Computes how the growth of small motions depends on one setting of a scenario.
 
         For each value of the setting, the coupled arms are linearised about a pose of rest.
-        This pose is followed from one value to the next. Between two neighbouring values of
-        which exactly one gives an unstable loop, the value at which stability changes is
-        located.
+        This pose is followed from one value to the next. Between a stable and an unstable
+        neighbouring value, the value at which stability changes is located.
 
         Args:
             scenarios: The experiments, which differ in the setting only, by its rising value.

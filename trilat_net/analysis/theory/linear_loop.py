@@ -44,8 +44,8 @@ class SiteJacobian(NamedTuple):
     """Linear model of one site (a process that runs one arm) about a pose of rest.
 
     It contains the derivatives of the site's rates of change with respect to its states and to
-    what it receives from the other sites. States that small motions do not change, or that have
-    no effect on the motion, are left out.
+    the values that it receives from the other sites. States that small motions do not change,
+    or that have no effect on the motion, are left out.
 
     Attributes:
         layout: Assignment of the columns of the derivatives to quantities. There are no columns
@@ -157,9 +157,9 @@ def join_diagonal_blocks(blocks: Sequence[Array]) -> Array:
 def gather_site_arguments(conditions: OperatingConditions, rest: Equilibrium) -> list[Array]:
     """Collects the states and inputs of each site when all arms are at rest.
 
-    The states are joint angles, joint velocities and parameter estimates. The inputs are what a
-    site (process that runs one arm) receives from the other sites, and the external torque.
-    `ArgumentLayout` describes their order.
+    The states are joint angles, joint velocities and parameter estimates. The inputs are the
+    values that a site (process that runs one arm) receives from the other sites, and the
+    external torque. `ArgumentLayout` describes their order.
 
     Args:
         conditions: The sites, gains and delays of the coupled arms.

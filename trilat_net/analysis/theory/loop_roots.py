@@ -71,7 +71,7 @@ class _EndLoop(NamedTuple):
     Attributes:
         scenario: The scenario up to the end of the run. Delays that only the run shows are
             replaced by their mean.
-        conditions: The numbers from which the loop is built.
+        conditions: The data from which the loop is built.
         rest: The equilibrium nearest to the end of the run.
         uses: The samples in use in the last quarter of the run, if delays are random or
             measured. `None` if the scenario determines all delays.
@@ -420,7 +420,7 @@ def _has_same_sign(loop: SampledLoop, at_rest: Spectrum, last_pose: Equilibrium)
 
 
 def _summarise_roots(spectrum: Spectrum, span: str, *, exact: bool) -> LoopRoots:
-    """Returns the fastest growing root, and what it says about the stability of the run.
+    """Returns the fastest growing root, and its verdict on the stability of the run.
 
     Args:
         spectrum: The roots at the end pose.

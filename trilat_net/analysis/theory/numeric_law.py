@@ -46,8 +46,8 @@ from ...errors import ScenarioError
 from ..arm_rows import Numbers
 
 _TICK = 1_000_000
-"""Number of the tick that is evaluated. It is so late that no start-up action of a law is in
-force.
+"""Number of the tick that is evaluated. This tick is so late that no start-up action of a law
+is active.
 """
 _STEP = 1e-5
 """Half the step of a central difference, relative to the argument's size or to 1.

@@ -53,7 +53,7 @@ _BATCH = 512
 _CIRCLE_POINTS = 64
 """Number of points of the circle around zero on which the response is evaluated."""
 _HIGHEST_POWER = 6
-"""Highest order of a pole at zero that is searched."""
+"""Highest order of a pole at zero that is considered."""
 _NEGLIGIBLE = 1e-3
 """Largest part of the response that counts as zero, as a share of its size."""
 
@@ -493,7 +493,7 @@ class Transparency(NamedTuple):
     Attributes:
         operator_site: Site of the operator.
         other_site: Site that is free or clamped.
-        joint: Number of the joint of the operator's site, from 1 on.
+        joint: Number of the joint of the operator's site, counted from 1.
         w_rad_s: Frequencies, shape (F,), in rad/s.
         free: Impedance with the other site free, shape (F,), in N m s/rad.
         clamped: Impedance with the other site clamped, shape (F,), in N m s/rad.

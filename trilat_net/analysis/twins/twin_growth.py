@@ -416,8 +416,8 @@ def judge_twins(
     Args:
         scenario: The description of the experiment.
         twins: The twins.
-        counts_from_s: Time from which the run counts, in s. The second half of the time after
-            it is judged.
+        counts_from_s: Time after which the run is considered, in s. The second half of the time
+            after it is judged.
         quiet_from_s: Time after which no operator acts on the run and its control loop does not
             change, in s. Departures from rest are searched for after this time.
     """
@@ -489,7 +489,7 @@ def _fit_to_period(counts_from_s: float, end_s: float, period_s: float | None) -
     Otherwise the judgement would depend on the part of the period in which the run ends.
 
     Args:
-        counts_from_s: Start of the part that counts, in s.
+        counts_from_s: Start of the part to consider, in s.
         end_s: End of the part, in s.
         period_s: Period of the delays, in s. `None` if they are constant or never repeat.
 
@@ -513,7 +513,7 @@ def measure_amplitude(path: TwinPath, group: Sequence[int]) -> Array:
 
     Args:
         path: The twin's difference from its run at K times.
-        group: Indices of the joints that count.
+        group: Indices of the joints to consider.
 
     Returns:
         log A, shape (K,), with A in rad/s. It is -inf where the difference is zero. It is never
@@ -624,7 +624,7 @@ def _judge_push(
     Args:
         path: The difference of the pushed repetition (twin) from the run.
         amplitude: Logarithm of the amplitude of the difference, shape (K,).
-        joints: Indices of the joints that count.
+        joints: Indices of the joints to consider.
         part: Rows whose second half is judged.
         joint_names: Names of all joints.
     """
@@ -684,7 +684,7 @@ def _judge_worst_joint(
     Args:
         path: The twin's difference from its run.
         amplitude: Logarithm of the amplitude of the difference of all joints, shape (K,).
-        joints: Indices of the joints that count.
+        joints: Indices of the joints to consider.
         part: Rows of the judged part, and of the part before it.
         joint_names: Names of all joints.
     """
@@ -737,7 +737,7 @@ def _find_departures(
     Args:
         twins: The run and its twins.
         amplitudes: Logarithm of the amplitude of each twin's difference, shape (K,) each.
-        joints: Indices of the joints that count.
+        joints: Indices of the joints to consider.
         quiet: Rows in which no operator acts on the run.
     """
     t_s = twins.paths[0].t_s

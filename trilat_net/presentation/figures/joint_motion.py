@@ -286,7 +286,7 @@ def draw_operation(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
 def choose_height_in(log: Log, two_joints_in: float) -> float:
     """Returns the height of a figure with panels per joint, in inches.
 
-    More than two joints have a row each, see `add_joint_rows`.
+    If arms have more than two joints, each joint has a row of panels, see `add_joint_rows`.
 
     Args:
         log: Log of the run.
@@ -717,7 +717,7 @@ def thin_path(path: Array) -> Array:
 def list_sites_with_changing_dominance(log: Log) -> list[str]:
     """Lists the arms whose dominance factors change during the run, in scenario order.
 
-    A dominance factor is the weight with which an arm follows another one.
+    A dominance factor is the weight with which an arm follows another arm.
 
     Args:
         log: Log of the run.
