@@ -125,8 +125,8 @@ class AlignedRecords(NamedTuple):
     def t_s(self) -> Array:
         """Nominal time of every row, tick / rate_hz, shape (K,), in s.
 
-        A tick is a period of the control loop. If it was computed late, its nominal time is the
-        same.
+        A tick is a period of the control loop. A tick that was computed late has the same
+        nominal time.
         """
         return self._ticks / self.rate_hz
 
@@ -426,11 +426,12 @@ class PeerTrajectory:
         self._squares: Array = np.vstack([start, running_sums])
 
     def evaluate(self, t_s: Array) -> _PeerMotion:
-        """Returns the site's motion at the given times, which at its ticks equals its records.
+        """Returns the site's motion at the given times, interpolated between its records.
 
-        Between two records, q is the cubic polynomial that has the recorded angles and
-        velocities at both ends (Hermite interpolation), and qd is linear. The integral of qd
-        squared is computed by the trapezoid rule.
+        At the site's ticks the motion equals the records. Between two records, q is the cubic
+        polynomial that has the recorded angles and velocities at both ends (Hermite
+        interpolation), and qd is linear. The integral of qd squared is computed by the
+        trapezoid rule.
 
         Args:
             t_s: Times after the start of the session, shape (K,), in s.

@@ -133,8 +133,8 @@ class _DelayPeriod(NamedTuple):
 
     Attributes:
         true_s: The period, in s. `None` if some delay never repeats.
-        span_s: A period that can be analysed, in s: the true one, or a shorter one after which
-            the delays repeat to within half a tick. `None` if there is neither.
+        span_s: A period that can be analysed, in s: the true period, or a shorter time after
+            which the delays repeat to within half a tick. `None` if there is neither.
     """
 
     true_s: float | None
@@ -142,9 +142,9 @@ class _DelayPeriod(NamedTuple):
 
     @property
     def is_exact(self) -> bool:
-        """True if the analysed period is the true one, and results for it hold forever.
+        """True if the analysed period is the true period, so that results hold for all time.
 
-        False if the analysed period is only nearly the true one, or if there is none.
+        False if the analysed period is only an approximation, or if there is no period.
         """
         return self.span_s is not None and self.span_s == self.true_s
 
@@ -153,8 +153,9 @@ def find_delay_period(links: Sequence[LinkBase], rates_hz: Sequence[int]) -> _De
     """Finds the period after which the delays of links and the ticks of sites repeat.
 
     A tick is one period of a site's control loop. The true period is the least common multiple
-    of the ticks and of the periods of all delays. If it is longer than `MAX_PERIOD_TICKS`, the
-    function looks for a shorter time after which the delays nearly repeat.
+    of the ticks and of the periods of all delays. If the true period is longer than
+    `MAX_PERIOD_TICKS`, the function looks for a shorter time after which the delays nearly
+    repeat.
 
     Args:
         links: Delay models of the links.

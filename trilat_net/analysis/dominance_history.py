@@ -104,9 +104,9 @@ def trace_dominance(log: Log, site: str, t_s: Array) -> DominanceHistory:
 def list_ramps(log: Log, site: str) -> tuple[Array, list[DominanceRamp]]:
     """Lists the planned and commanded changes of the weights with which a site follows others.
 
-    A site is the process that runs one arm. It follows each of its P peers with a weight, the
-    dominance factor. Every change is a ramp from the old to the new factors. A sudden change is
-    a ramp without length.
+    A site is the process that runs one arm. A site follows each of its P peers with a weight,
+    the dominance factor. Every change is a ramp from the old to the new factors. A sudden
+    change is a ramp without length.
 
     Args:
         log: The log of the run.
@@ -477,8 +477,8 @@ KD_SHAPE_TOLERANCE = 1e-9
 class _LyapunovWeights(NamedTuple):
     """Weights beta of the N arms in the energy function V of the stability proof.
 
-    With these weights the energies that arms transfer to each other cancel in V. They follow
-    from the matrix alpha of the dominance factors and from the damping gains Kd.
+    With these weights the energies that arms transfer to each other cancel in V. The weights
+    follow from the matrix alpha of the dominance factors and from the damping gains Kd.
 
     Attributes:
         beta: Weight of each site, shape (N,), with the sum N. With equal dominance factors each

@@ -396,8 +396,8 @@ _LAST_EPOCH_NS = 253_402_300_799 * NS_PER_S
 def _describe_session(log: Log) -> JsonObject:
     """Collects the facts about the session of a log that `trilat log info` shows.
 
-    They are the start time, the length, how each site ended, the scenario, and the versions of
-    the programs that made the log.
+    The facts are the start time, the length, the end of each site, the scenario, and the
+    versions of the programs that wrote the log.
 
     Args:
         log: The log.

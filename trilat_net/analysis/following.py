@@ -92,8 +92,8 @@ class JointFollowing(NamedTuple):
         The velocity is -Lambda e, with the error e of the joints and the gain Lambda, in 1/s.
 
         Args:
-            rows: Rows of the records. They have no effect, because the result depends on no
-                pose.
+            rows: Rows of the records. They have no effect, because the result does not depend
+                on the pose.
             e: Differences between the joint angles and the angles that the arm follows, shape
                 (K, n), in rad.
             ed: Derivatives of the errors, shape (K, n), in rad/s.
@@ -110,7 +110,8 @@ class JointFollowing(NamedTuple):
         The error e jumps by de. As r = qd + Lambda e, the jump is Lambda de, shape (K, n).
 
         Args:
-            rows: Rows of the records. Not needed here, as the result depends on no pose.
+            rows: Rows of the records. Not needed here, because the result does not depend on
+                the pose.
             de: Jumps of e, shape (K, n), in rad.
         """
         return self.Lambda * de
@@ -121,7 +122,8 @@ class JointFollowing(NamedTuple):
         The shared coordinates are the joint angles here. Therefore the force is the torque.
 
         Args:
-            rows: Rows of the records. Not needed here, as the result depends on no pose.
+            rows: Rows of the records. Not needed here, because the result does not depend on
+                the pose.
             force: Generalised force, shape (K, n), in N m.
         """
         return force
@@ -325,7 +327,8 @@ def build_following(
     An arm follows either joint by joint or with its end effector (tip).
 
     Args:
-        arm: The arm. If it has a task for its end effector, it follows with the end effector.
+        arm: The arm. If the arm has a task for its end effector, it follows with the end
+            effector.
         q: Joint angles in K records, shape (K, n) for n joints, in rad.
         qd: Joint velocities, shape (K, n), in rad/s.
         Lambda: Gain of the error in 1/s, shape (n,). If the arm follows with its end effector,

@@ -38,8 +38,8 @@ from .twins.twin_growth import TwinGrowth
 def list_law_proofs(scenario: Scenario) -> list[str]:
     """Lists the stability conditions of control laws that prove that all motions die away.
 
-    They are evaluated for the delays and dominance factors (the weights with which arms follow
-    each other) at the end of the scenario.
+    The conditions are evaluated for the delays and dominance factors (the weights with which
+    arms follow each other) at the end of the scenario.
 
     Args:
         scenario: Description of the experiment.

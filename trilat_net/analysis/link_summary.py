@@ -68,7 +68,8 @@ class _PredictedDelivery(NamedTuple):
         """Delays that the delay model of the scenario adds to the samples, in ms.
 
         Samples that the model loses, and samples that have only the delay of the real network,
-        are left out. Duplicates, reordering and the play-out buffer do not count.
+        are left out. The effects of duplicates, reordering and the play-out buffer are not
+        included.
         """
         delivered = ~self.lost & ~self.measured
         return (self.drawn_ns[delivered] - self.stamp_ns[delivered]) / 1e6
@@ -95,7 +96,7 @@ def predict_delivery(
     site: str,
     count: int,
 ) -> _PredictedDelivery:
-    """Computes when each message of another arm comes into use, as the scenario defines.
+    """Computes when each message of another arm comes into use, as defined by the scenario.
 
     The scenario delays the messages (samples) in a repeatable way to emulate a network.
 

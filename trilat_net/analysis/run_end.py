@@ -489,7 +489,7 @@ def _split_buckets(scenario: Scenario, trace: RunTrace) -> list[Array]:
 def _choose_judged_part(t_s: Array, acted_s: float) -> tuple[int, bool]:
     """Chooses the part of a run whose second half is judged.
 
-    Normally this is the whole run. If an operator acts in the second half of the run, the part
+    Normally the whole run is used. If an operator acts in the second half of the run, the part
     starts later, so that the judged half begins after the action. If too little time follows
     the action, the whole run is judged nevertheless.
 

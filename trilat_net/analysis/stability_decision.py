@@ -104,8 +104,8 @@ def is_decided_by_roots(run: RunFindings) -> bool:
 def _list_obstacles(run: RunFindings) -> tuple[Obstacle, ...]:
     """Lists the findings that prevent the judgements "stable" and "settled", in order.
 
-    They are the end of the run, missing records, runs with small pushes, doubts of other
-    analyses, and roots that show growth.
+    Such findings concern the end of the run, missing records, runs with small pushes, doubts of
+    other analyses, and roots that show growth.
 
     Args:
         run: Findings of the analyses on the run.
@@ -169,12 +169,12 @@ def _decide_by_roots(
 
 
 def _find_refutation(run: RunFindings) -> Basis | None:
-    """Returns the evidence that small motions grow. `None` if there is none.
+    """Returns the evidence that small motions grow. `None` if there is no evidence.
 
     Unstable exact roots of a distant pose of rest are evidence if the run is shorter than the
     period of its delays, because such a run does not show where its motion ends. The growth of
-    pushes is no evidence if the run slows down, because the run then approaches its twins, or
-    if exact roots are stable.
+    pushes is not evidence in two cases: if the run slows down, because the run then approaches
+    its twins, and if exact roots are stable.
     """
     end = run.end
     twins = run.twins

@@ -78,8 +78,8 @@ class _AppliedChange(NamedTuple):
         site: The site that carried it out.
         taken_at_tick: Tick of the record that names the change. `None` for a change that was
             planned in the scenario.
-        sentence: A sentence for users. It names the person or program that ordered the change,
-            if known.
+        sentence: A sentence for users. The sentence names the person or program that ordered
+            the change, if known.
     """
 
     change: Change
@@ -156,8 +156,8 @@ class StatedModel(NamedTuple):
 def list_changes(log: Log) -> list[_AppliedChange]:
     """Lists all changes before the end of a run, in the order in which they took effect.
 
-    The records also name ticks that a site had to skip. They are included only if the site
-    skipped so many ticks that it held its position.
+    The records also name ticks that a site had to skip. Skipped ticks are included only if the
+    site skipped so many ticks that it held its position.
 
     Args:
         log: The log of the run.

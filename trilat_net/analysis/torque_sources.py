@@ -516,7 +516,7 @@ class WallEnergy(NamedTuple):
 
     The force F_k of a sampled wall is computed once per tick and held for the tick period h. It
     does the work F_k (x_{k+1} - x_k), where x is the depth. Together with the energy K x^2 / 2
-    of its spring, the wall generates K (x_{k+1} - x_k)^2 / 2 in every tick of a contact, less
+    of its spring, the wall generates K (x_{k+1} - x_k)^2 / 2 in every tick of a contact, minus
     the energy that its damping B dissipates. A damper b of the arm itself dissipates all of
     this energy if b > K h / 2 + B: Colgate and Schenkel, "Passivity of a class of sampled-data
     systems", J. Robotic Systems 14 (1997).

@@ -62,7 +62,7 @@ class FigureSize(NamedTuple):
     def narrow(self) -> bool:
         """True if the figure is narrower than 5 in: too narrow for two panels side by side.
 
-        Figures then put their panels, parts with axes of their own, below each other, or show
+        Such figures place their panels (parts with their own axes) below each other, or show
         fewer labels.
         """
         return self.width_in < 5.0

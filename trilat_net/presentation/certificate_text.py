@@ -69,7 +69,7 @@ _HOLDS = {True: "holds", False: "fails", None: "undecided"}
 def compose_certificate(certificate: Certificate) -> Iterator[Block]:
     """Yields the text of a stability certificate: judgement, reasons, and tables.
 
-    The tables have the premises (conditions of the stability theorem) and the energies.
+    The tables contain the premises (conditions of the stability theorem) and the energies.
 
     Args:
         certificate: Judgement whether a run was stable, with its reasons.
@@ -517,7 +517,7 @@ def _describe_balance(balance: EnergyBalance) -> str:
     """Returns a sentence about how well the energy balance of a run closes.
 
     V is the energy function of the stability proof, in J. Its change should equal the work that
-    was done on the arms less the dissipated energy. The difference is the residual. One cause
+    was done on the arms minus the dissipated energy. The difference is the residual. One cause
     is that the controller acts only once per tick (period of the control loop), while the proof
     assumes continuous time. The work of this sampling is computed. The sentence therefore also
     says how small the residual is without this work.

@@ -1,9 +1,9 @@
 """Builds the layout in which Foxglove and Lichtblick, viewers for robot data, show a log.
 
 A layout is a JSON file that a user imports into the viewer. The file states which panels are
-shown, and which values of which topics they draw. The layout has the plots of the layout for
-Rerun (`rerun_viewer.build_plot_layout`), the modes of the arms' controllers, the events, and
-the arms in space.
+shown, and which values of which topics they draw. The layout contains the plots of the layout
+for Rerun (`rerun_viewer.build_plot_layout`), the modes of the arms' controllers, the events,
+and the arms in space.
 
 The topics of the live bridge to ROS 2 and of exported bags differ from those of logs. The
 layout of a log therefore has two tabs: one for the log itself, and one for a running session of

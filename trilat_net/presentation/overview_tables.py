@@ -151,7 +151,7 @@ def _compose_sites(sites: Mapping[str, JsonObject]) -> Iterator[Block]:
 def _compose_links(links: Mapping[str, JsonObject]) -> Iterator[Block]:
     """Yields a table of the network connections (links) between the arms.
 
-    The table has the ages of the used messages. Further columns contain one-way delays and
+    The table contains the ages of the used messages. Further columns contain one-way delays and
     clock differences if they were measured, and the numbers of late, lost and duplicate
     messages.
     """

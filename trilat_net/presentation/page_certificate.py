@@ -1,7 +1,7 @@
 """Renders the section of a report that explains whether the run was stable.
 
-The section has the sentences of `trilat certify`, and figures of V, the energy function of the
-stability proof.
+The section contains the sentences of `trilat certify`, and figures of V, the energy function of
+the stability proof.
 
 Invariant:
     - The sentences are those that `trilat certify` prints, with longer names of the checks.

@@ -111,7 +111,8 @@ _LOOP_COLUMNS = {
 def render_loops(log: Log, facts: JsonObject, charts: Markup = Markup()) -> Markup:  # noqa: B008
     """Renders the section of the report about the timing of each site's control loop.
 
-    It shows how punctual the ticks (control periods) were, and how long they took to compute.
+    The section shows how punctual the ticks (control periods) were, and how long they took to
+    compute.
 
     Args:
         log: Log of the run.

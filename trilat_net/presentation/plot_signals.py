@@ -4,7 +4,8 @@ A signal is an array with one row for each period of the control loop. A run of 
 kHz has 60 000 rows, too many for a plot. Therefore the rows are reduced: each bucket of records
 keeps the minimum and the maximum of each column, so that a spike of a single period remains
 visible. A gap in the records that is wider than a bucket becomes a row of NaN, so that no line
-is drawn across it. `analysis.site_signals` has the signals that metrics and summaries use too.
+is drawn across it. `analysis.site_signals` contains the signals that metrics and summaries also
+use.
 
 Invariant:
     - Empty logs give empty arrays.

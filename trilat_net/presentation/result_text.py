@@ -281,8 +281,8 @@ def _import_composer(
 ) -> Callable[[Result], Iterable[Block]]:
     """Imports the function that composes the text of a result, only when it is needed.
 
-    If all such modules were imported at the start, every command would be slow. A subclass of a
-    listed class has the function of the listed class.
+    If all such modules were imported at the start, every command would be slow. For a subclass
+    of a listed class, the function of the listed class is used.
 
     Args:
         result: The result.

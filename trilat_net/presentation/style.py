@@ -135,7 +135,7 @@ class _NotebookFigure(Figure):
 
 
 def add_panels(figure: Figure, rows: int, columns: int, **options: Any) -> AxesGrid:
-    """Adds a grid of panels, parts with axes of their own, to a figure.
+    """Adds a grid of panels (parts with their own axes) to a figure.
 
     Args:
         figure: The Matplotlib figure.

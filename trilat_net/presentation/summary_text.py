@@ -481,7 +481,7 @@ def _name_sample(tick: object) -> str:
 def _describe_site_effect(effect: SiteEffect, rate_hz: int) -> list[str]:
     """Returns lines about the differences between the log of an arm and its repeated execution.
 
-    They state the largest deviation of the joint angles, and the first value that differs.
+    The lines state the largest deviation of the joint angles, and the first value that differs.
 
     Args:
         effect: The differences.

@@ -87,8 +87,8 @@ def describe_push(twins: PushedTwins, pushed: PushGrowth) -> str:
 def _describe_worst_push(twins: PushedTwins) -> str:
     """Returns a sentence on the worst push, which grows most or dies away most slowly.
 
-    If the user asked for pushes of several sizes, the sentence says instead for which sizes the
-    effect is proportional to the size.
+    If the user requested pushes of several sizes, the sentence states instead for which sizes
+    the effect is proportional to the size.
     """
     if twins.linear is not None:
         return _describe_linear_sizes(twins)

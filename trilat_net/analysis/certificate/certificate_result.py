@@ -36,8 +36,9 @@ _REFUTING_FINDINGS = (ObservedFinding.NEGATIVE, ObservedFinding.BROKEN)
 class Certificate(Result):
     """Judgement whether a recorded run was stable, with every reason. `certify` creates it.
 
-    It combines several kinds of evidence: the energy function V of the stability proof, the end
-    of the motion, the roots of the linearised loop, and repeated runs with a small push.
+    A certificate combines several kinds of evidence: the energy function V of the stability
+    proof, the end of the motion, the roots of the linearised loop, and repeated runs with a
+    small push.
 
     Attributes:
         premises: The conditions of the stability theorem, each checked.
@@ -149,9 +150,9 @@ class Certificate(Result):
     def decision(self) -> StabilityDecision:
         """The decision whether the run is stable, with its evidence and the reasons against it.
 
-        It combines the motion at the end, the repetitions with small pushes, the characteristic
-        roots, the proofs and the doubts, by the rules of `stability_decision`. It is computed
-        at first use.
+        The decision combines the motion at the end, the repetitions with small pushes, the
+        characteristic roots, the proofs and the doubts, by the rules of `stability_decision`.
+        The property is computed at first use.
         """
         findings = RunFindings(
             end=self.end,
@@ -206,8 +207,9 @@ class Certificate(Result):
     def reasons(self) -> tuple[str, ...]:
         """Sentences on everything that speaks against calling the run stable.
 
-        They concern the end of the run, the energy V, the roots at the end pose, the energies
-        that control laws declare, and the completeness of the log. Empty for a stable run.
+        The sentences concern the end of the run, the energy V, the roots at the end pose, the
+        energies that control laws declare, and the completeness of the log. Empty for a stable
+        run.
         """
         return self.decision.reasons
 

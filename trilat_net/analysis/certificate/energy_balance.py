@@ -69,8 +69,8 @@ class SiteEnergy:
         motion: Motion of the site, from which its energies are computed.
         parts: The values of V_i, split into its parts.
         dissipation: Dissipated energy in each period, by kind, such as damping.
-        transfer: Energy in each period that the site gives to its followers, less the energy
-            that it gets from the sites that it follows.
+        transfer: Energy in each period that the site gives to its followers, minus the energy
+            that it receives from the sites that it follows.
         work: Work on the site in each period, by source, such as the operator.
         sampling: Work in each period that arises because the continuous control law is executed
             only once per tick.
@@ -527,7 +527,7 @@ class EnergyBalance:
 
         V is the energy function of the stability proof, from which the work of operators and
         environments is subtracted here. Two rules are checked. First, V must not end above its
-        beginning. Second, only the second half of the run is regarded: the rise from the
+        beginning. Second, only the second half of the run is considered: the rise from the
         minimum to the end must be at most half of the fall from the beginning of this half to
         the minimum.
 
@@ -741,11 +741,11 @@ def _trace_weights(
 
         Args:
             t_s: Times, shape (T,), in s.
-            ahead_s: Time by which the factors are taken later than `t_s`, in s.
+            ahead_s: Time, in s, that is added to `t_s` before the factors are evaluated.
 
         Returns:
-            The weights, shape (T, N) for N sites. All are 1 if the paper's weights are asked
-            for.
+            The weights, shape (T, N) for N sites. All are 1 if the paper's weights are
+            requested.
         """
         count = len(t_s)
         if paper_weights:

@@ -350,8 +350,8 @@ class SiteMotion:
         """Returns the torque that the control law would demand for given errors.
 
         Pose and parameter estimates are taken from the records. The errors may differ from the
-        recorded ones. This shows, for example, the torque just before a new sample of a peer
-        was used.
+        recorded ones. For example, this gives the torque just before a new sample of a peer was
+        used.
 
         Args:
             rows: Rows of the records whose pose and estimates are used, shape (K,).
@@ -625,8 +625,9 @@ class Increment(NamedTuple):
     def total(self) -> Array:
         """Change of the energy in each tick period, in J, as the sum of the three parts.
 
-        The parts are the contribution of the power at its start, that at its end, and the jump
-        there. K ticks bound K - 1 periods, so the shape is (K - 1,).
+        The parts are the contribution of the power at the start of the period, the contribution
+        at its end, and the jump at the end. K ticks bound K - 1 periods, so the shape is (K -
+        1,).
         """
         return self.left + self.right + self.jump
 

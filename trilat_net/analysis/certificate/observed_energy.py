@@ -88,8 +88,8 @@ class _EnergyCurve(NamedTuple):
         peer: Name of the site at the other end of a line. Empty for other kinds.
         t_s: Times of the site's ticks, shape (K,), in s.
         energy_j: The energy, summed over its parts, shape (K,), in J.
-        least_j: The smallest of the parts, shape (K,), in J. For "taken" it is the energy less
-            its largest earlier value, as a dissipated energy must not fall.
+        least_j: The smallest of the parts, shape (K,), in J. For "taken" it is the energy minus
+            its largest earlier value, because a dissipated energy must not fall.
     """
 
     kind: _EnergyKind
@@ -426,8 +426,8 @@ def _read_peer_records(
 ) -> PeerRecords:
     """Returns the recorded values that a control law exchanged with one other arm.
 
-    They are the values that the law received from this arm, and those that it sent to this arm
-    alone. A key such as `wave[s]` is a value for arm s alone.
+    These are the values that the law received from this arm, and the values that it sent to
+    this arm alone. A key such as `wave[s]` is a value for arm s alone.
 
     Args:
         log: The log of the run.
@@ -503,10 +503,10 @@ def _find_curves(log: Log, accounts: Mapping[str, _SiteBooks]) -> Iterator[_Ener
 
 
 def _judge_books(log: Log, accounts: Mapping[str, _SiteBooks]) -> ObservedEnergy:
-    """Judges the energies that control laws declare: contradictory, below zero, or passive.
+    """Judges whether the energies that laws declare are contradictory, negative or passive.
 
-    A control law may state how much energy it stores and dissipates. It is passive if it never
-    gives back more energy than it received, which is a sign of stability.
+    A control law may state how much energy it stores and dissipates. A law is passive if it
+    never gives back more energy than it received, which is a sign of stability.
 
     Args:
         log: The log of the run.

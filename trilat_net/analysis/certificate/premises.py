@@ -1,7 +1,7 @@
 """Checks whether a recorded run meets the conditions of the stability theorem.
 
 The theorem says that an energy function V of all arms never rises, unless an operator supplies
-energy. Its proof is in docs/theory/theorem.md. It has conditions, called premises:
+energy. Its proof is in docs/theory/theorem.md. The theorem has conditions, called premises:
 
 - The network delays are constant.
 - The dominance factors, the weights with which the arms follow each other, are constant. Every
@@ -157,8 +157,8 @@ def gather_facts(log: Log) -> _RunFacts:
     """Computes from a log the quantities for checking the conditions of the stability theorem.
 
     The theorem uses an energy function of all arms. This function does not exist for every
-    control law. It cannot be computed if the records of the arms have too few times in common.
-    The result then contains the reason.
+    control law. The function cannot be computed if the records of the arms have too few times
+    in common. The result then contains the reason.
 
     Args:
         log: The log of the run.
@@ -523,7 +523,7 @@ def _check_operators(run: FunctionalFacts) -> Premise:
 
     An operator is the person or program that moves an arm, and r is the filtered error of the
     proof. Operators are passive if they supply no more energy than they absorbed before. If
-    they do supply energy, the premise still holds for a run that ends with enough motion
+    operators do supply energy, the premise still holds for a run that ends with enough motion
     without operators: the theorem then applies to that motion.
     """
     energies = run.energies

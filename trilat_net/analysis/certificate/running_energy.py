@@ -244,7 +244,8 @@ class RecordWindow:
 class EnergyCourse(NamedTuple):
     """The energy function V of the stability proof, over a span of time of a running session.
 
-    A live display shows V and the energy that was supplied: V may rise only by the latter.
+    A live display shows V and the energy that was supplied: V may rise only by the supplied
+    energy.
 
     Attributes:
         t_s: Times of the ticks of the site with the highest tick rate, shape (T,), in s.

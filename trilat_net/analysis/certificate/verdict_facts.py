@@ -22,7 +22,7 @@ from .premise_quantities import MissingFunctional, PremiseQuantities
 class StabilityFinding(Enum):
     """Possible results of examining V, the energy function of the stability proof, over a run.
 
-    JSON output has the names of the members, in small letters, as values of `verdict`.
+    In JSON output, the values of `verdict` are the names of the members in lower case.
     """
 
     COVERED = auto()
@@ -81,7 +81,8 @@ class UnsuppliedGrowth(NamedTuple):
 class NoFunctional(NamedTuple):
     """Finding that the energy function V does not exist for some arms.
 
-    For example, V exists only for certain control laws. The run is then judged without V.
+    One reason is the control law, because V exists only for certain laws. Without V, the run is
+    judged by other evidence.
 
     Attributes:
         missing: Sites of these arms, grouped by the reason.
@@ -105,8 +106,8 @@ class RecordGap(Enum):
 class UnclosedBalance(NamedTuple):
     """Finding that the energy of an arm changed by more than the known causes explain.
 
-    The energies of a run that obeys the equations of the log add up. If they do not, the log or
-    the simulation is wrong, or the control period is too long.
+    The energies of a run that obeys the equations of the log add up. If the energies do not add
+    up, the log or the simulation is wrong, or the control period is too long.
 
     Attributes:
         site: Site with the largest error.

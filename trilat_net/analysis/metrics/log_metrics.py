@@ -102,7 +102,7 @@ class LogMetrics(Result):
     def label(self, number: int) -> str:
         """Returns the name of a joint or an axis for a table, such as "1", "3 elbow" or "x".
 
-        The name of a joint is added to its number if all arms name their joints alike.
+        The name of a joint is added to its number if all arms have the same joint names.
 
         Args:
             number: Number of the joint or axis, from 1.
@@ -253,7 +253,7 @@ class LogMetrics(Result):
 def _reduce_to_run(quantity: Quantity, values_by_subject: Mapping[str, Metric]) -> Metric:
     """Reduces the values of a quantity to one value for the whole run.
 
-    It is the largest number of all subjects (sites, links or walls), or their sum. Subjects to
+    The value is the largest of all subjects (sites, links or walls), or their sum. Subjects to
     which the quantity does not apply are left out. If the number of any other subject is
     missing, the number of the run is missing as well.
 

@@ -45,7 +45,7 @@ _NOT_FINITE = "the number is not finite"
 
 
 def metric(value: float | None, why: str = _NOT_FINITE) -> Metric:
-    """Wraps a number in a metric. A missing number, or one that is not finite, gets a reason.
+    """Wraps a number in a metric. If the number is missing or not finite, a reason is added.
 
     For example, metric(nan, "no contact") has the value `None` and the reason "no contact".
 

@@ -518,7 +518,7 @@ def _read_parameter_estimates(
 def read_all_estimates(view: RunView) -> dict[str, ParameterEstimates]:
     """Reads the parameter estimates that adaptive control laws learnt during a run.
 
-    The result compares first and last estimates of masses and inertias with the true ones.
+    The result contains the first, the last and the true values of masses and inertias.
 
     Args:
         view: The run.

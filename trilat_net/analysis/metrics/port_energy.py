@@ -230,8 +230,8 @@ def _measure_delay_energy(view: RunView, link: str) -> MetricValues:
         link: Name of the link, such as "m1->s" for the link from site m1 to site s.
 
     Returns:
-        The energy at the end of the run and its maximum, by key. If they are unknown, each
-        contains the reason.
+        The energy at the end of the run and its maximum, by key. If the energies are unknown,
+        each metric contains the reason.
     """
     runs = view.sites
     peer = view.links[link].peer

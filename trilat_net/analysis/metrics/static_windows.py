@@ -283,7 +283,7 @@ def _find_single_mover(before: _StaticWindow, after: _StaticWindow) -> str:
 
 
 class SharingRatio(NamedTuple):
-    """Measured force sharing at a joint: how much of a torque elsewhere one operator feels.
+    """Measured force sharing at a joint: how much of a torque on another arm an operator feels.
 
     It is measured while all arms rest, at a joint at which exactly two arms are loaded.
 
@@ -313,7 +313,7 @@ class SharingRatio(NamedTuple):
 
     @property
     def off(self) -> float | None:
-        """Deviation of the felt torque from the expected torque, relative to the latter.
+        """Relative deviation of the felt torque from the expected torque.
 
         For example, 0.1 means that the felt torque is 10 % larger or smaller. `None` if the
         expected torque is unknown or zero.

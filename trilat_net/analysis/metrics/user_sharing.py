@@ -209,8 +209,8 @@ def _measure_sharing(view: RunView, _run: str) -> MetricValues:
 
     Each user moves a master arm, and the slave follows the masters with weights. The user with
     the largest weight leads. A change of the leader is a takeover. The log states whether a
-    program moved the arm of a user. If no program did, the last user counts as the program. Any
-    other user who leads is then said to intervene.
+    program moved the arm of a user. If no program did, the last user counts as the program. If
+    any other user leads, this user is said to intervene.
 
     Args:
         view: The recorded run.

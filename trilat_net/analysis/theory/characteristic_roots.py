@@ -18,7 +18,8 @@ this module computes the rightmost ones, in two steps:
    "Algorithms for the nonlinear eigenvalue problem", SIAM J. Numerical Analysis 10 (1973).
 
 Invariant:
-    - A root solves the equation to rounding, for every discretisation that supplies its guess.
+    - A root solves the equation up to rounding errors, for every discretisation that supplies
+      its guess.
     - Some roots are zero for every delay, because the equations do not change if all arms are
       shifted, or if a parameter estimate changes that no motion affects. Such roots are
       counted, and never called the rightmost.
@@ -231,8 +232,8 @@ def extract_moving_part(pencil: Pencil, names: Sequence[str]) -> MovingPart:
 class CharacteristicRoot(NamedTuple):
     """A characteristic root s of the control loop: small motions may change like exp(s t).
 
-    They grow if the real part of s is positive. A complex root comes with its conjugate, which
-    is not listed.
+    The motions grow if the real part of s is positive. A complex root comes with its conjugate,
+    which is not listed.
 
     Attributes:
         s: The root with a non-negative imaginary part, in 1/s. Its real part is the growth
@@ -472,7 +473,7 @@ def _count_zero_roots(pencil: Pencil) -> tuple[int, int]:
     """Counts the roots that are zero by structure, and how many of them drift.
 
     The characteristic matrix has the Taylor series Delta(s) = D_0 + s D_1 + s^2 D_2 + .... A
-    root at zero can belong to a Jordan chain, a sequence of modes of which each drives the
+    root at zero can belong to a Jordan chain, a sequence of modes in which each mode drives the
     next. The number of null vectors of the block Toeplitz matrix of D_0 ... D_(m-1) is the
     number of roots at zero, where each chain counts up to length m. When this number no longer
     rises with m, all roots are counted. Roots in chains longer than 1 drift: their modes grow
@@ -622,8 +623,8 @@ def compute_delay_spectrum(loop: LinearLoop, wanted: int = 6) -> Spectrum:
 def _guess_roots(pencil: Pencil, order: int, zeros: int) -> Complex:
     """Returns approximations of the roots of the control loop, by falling real part.
 
-    They are eigenvalues of the discretised loop. The smallest are left out, as these
-    approximate the roots that are zero by structure.
+    The approximations are eigenvalues of the discretised loop. The smallest eigenvalues are
+    left out, because they approximate the roots that are zero by structure.
 
     Args:
         pencil: Matrices of the loop.

@@ -180,8 +180,8 @@ def find_delay_margin(loop: LinearLoop) -> DelayMargin:
 
     The delays that the loop itself contains are replaced by this common delay. The unstable
     characteristic roots are counted for a small delay, below the first delay at which roots
-    cross the imaginary axis. From there on, every crossing changes the count by the number of
-    roots that cross.
+    cross the imaginary axis. For larger delays, every crossing changes the count by the number
+    of roots that cross.
 
     Args:
         loop: Linear model of the coupled arms.
@@ -343,11 +343,11 @@ class _FrequencySweep:
     def build_grid(self) -> Array:
         """Returns the frequencies to evaluate, ascending, in rad/s.
 
-        They are evenly spaced on a logarithmic scale. Near the frequency of each oscillating
-        mode there are 13 more points, within three times the decay rate of the mode, because
-        sharp resonances would fall between the evenly spaced points. If a mode does not decay,
-        the response is infinite at its frequency, and the points lie on both sides of this
-        frequency.
+        The frequencies are evenly spaced on a logarithmic scale. Near the frequency of each
+        oscillating mode there are 13 more points, within three times the decay rate of the
+        mode, because sharp resonances would fall between the evenly spaced points. If a mode
+        does not decay, the response is infinite at its frequency, and the points lie on both
+        sides of this frequency.
         """
         lowest = _LOWEST * self._highest
         even = np.geomspace(lowest, self._highest, _POINTS)

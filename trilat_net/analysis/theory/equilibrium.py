@@ -2,10 +2,10 @@
 
 The linear stability analysis describes small motions about such a pose, an equilibrium. There
 may be infinitely many equilibria, because any pose on which all arms agree may be an
-equilibrium. Therefore `find_equilibrium` computes the one nearest to a given pose, for example
-to the last pose of a run. `predict_equilibrium` computes the one that the arms reach from their
-start poses according to their linear model. A simulated run may supply a pose to start from,
-but the equilibrium itself is found by solving the equations.
+equilibrium. Therefore `find_equilibrium` computes the equilibrium nearest to a given pose, for
+example to the last pose of a run. `predict_equilibrium` computes the equilibrium that the arms
+reach from their start poses according to their linear model. A simulated run may supply a pose
+to start from, but the equilibrium itself is found by solving the equations.
 
 Invariant:
     - The result solves the equations to 1e-10, or a note states that it does not.
@@ -392,7 +392,7 @@ def _project_on_zero_roots(loop: linear_loop.LinearLoop, deviation: Array) -> Ar
 def find_equilibrium(scenario: Scenario, pose: tuple[float, ...] | None = None) -> Equilibrium:
     """Finds a pose in which all arms of a scenario rest, as a base for linear analysis.
 
-    It is the pose nearest to the end of a run, or a pose that the user gives.
+    The result is the pose nearest to the end of a run, or a pose that the user gives.
 
     Args:
         scenario: Description of the experiment.
@@ -447,8 +447,9 @@ def follow_equilibrium(scenario: Scenario, rest: Equilibrium) -> Equilibrium:
     """Finds the equilibrium of a scenario that is nearest to a known equilibrium.
 
     The known equilibrium belongs to a similar scenario, so that an equilibrium can be followed
-    while a setting, such as a gain, changes in small steps. If it is also an equilibrium of
-    this scenario, it is returned, and only missing parameter estimates are added.
+    while a setting, such as a gain, changes in small steps. If the known equilibrium is also an
+    equilibrium of this scenario, it is returned, and only missing parameter estimates are
+    added.
 
     Args:
         scenario: Description of the experiment.
@@ -541,8 +542,8 @@ def settle_memories(conditions: OperatingConditions, state: Equilibrium) -> Equi
     """Returns a state in which the memories of imported laws are consistent with its pose.
 
     The memory of an imported law, a law that a user wrote, takes the position of its estimate.
-    It starts with its initial values, and the law is called in the pose of the state until the
-    memory is constant. The estimates of other laws stay unchanged.
+    The memory starts with its initial values, and the law is called in the pose of the state
+    until the memory is constant. The estimates of other laws stay unchanged.
 
     Args:
         conditions: The sites, gains and delays of the loop.
@@ -658,8 +659,8 @@ def find_mean_pose(scenario: Scenario) -> tuple[float, ...]:
 def _find_at_run_end(scenario: Scenario, conditions: OperatingConditions) -> Equilibrium:
     """Finds the pose of rest nearest to the end of a simulated run.
 
-    The run is extended until the arms rest, up to `MAX_PROLONGATION` times its duration. If it
-    diverges, the pose is predicted from the start poses.
+    The run is extended until the arms rest, up to `MAX_PROLONGATION` times its duration. If the
+    run diverges, the pose is predicted from the start poses.
     """
     ticks = sum(map(scenario.ticks, scenario.names))
     affordable_extension = _MAX_RUN_TICKS / ticks

@@ -103,8 +103,9 @@ class _SiteTickMap(NamedTuple):
             the stored parameter estimates, and, for the scheme `second_order`, the torque of
             the previous tick.
         Q: Effect of the received values, shape (n, inputs).
-        output: Matrix that computes the values for the other sites from X, shape (3 m, n). They
-            are the pose, its velocity and the reflected torque, with m numbers each.
+        output: Matrix that computes the values for the other sites from X, shape (3 m, n).
+            These values are the pose, its velocity and the reflected torque, with m entries
+            each.
         names: Names of the states.
     """
 
@@ -716,8 +717,8 @@ class _SpanMap:
         """Computes the states of one site over consecutive ticks, and what it sends.
 
         The effects of the peers are known before the first of these ticks, so they are added
-        for all ticks at once. The site's own states follow tick by tick, since each depends on
-        the one before.
+        for all ticks at once. The site's own states are computed tick by tick, since each
+        depends on the previous state.
 
         Args:
             tracks: Motion of each site over the span, filled in up to the first tick.
@@ -750,9 +751,9 @@ def _find_multipliers(
 
     The method applies the map again and again, each time to the block of columns that the last
     application added, and keeps an orthonormal basis of all columns so far. The eigenvalues of
-    the small matrix H, which is the map in this basis, approach the largest multipliers. It
-    ends when all wanted multipliers are exact, when no new direction is found, or when the
-    basis is full.
+    the small matrix H, which is the map in this basis, approach the largest multipliers. The
+    method ends when all wanted multipliers are exact, when no new direction is found, or when
+    the basis is full.
 
     Args:
         span: The map.
@@ -856,8 +857,8 @@ def compute_sampled_spectrum(
 class SampledLoop:
     """Linear model of coupled arms whose controllers act in ticks, for several poses of rest.
 
-    The modes about a first pose are a good start for the search of those about a second pose
-    nearby, which then takes half of the time.
+    The modes about a first pose are a good start for the search for the modes about a second
+    pose nearby, which then takes half of the time.
 
     Args:
         conditions: The sites (processes that each run one arm), gains and delays. All control

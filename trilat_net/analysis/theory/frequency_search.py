@@ -134,10 +134,10 @@ def find_resolved_hz(low_hz: float, high_hz: float, delay_s: float) -> float:
 
 
 def refine_frequencies(response: PortResponse, w_rad_s: Array) -> Array:
-    """Adds frequencies until a response changes little from one to the next.
+    """Adds frequencies until a response changes little from one frequency to the next.
 
-    The change is at most a tenth. The number of points is limited. At a pole on the imaginary
-    axis, refinement stops when two points differ by a millionth.
+    The relative change is at most a tenth. The number of points is limited. At a pole on the
+    imaginary axis, refinement stops when two points differ by a millionth.
 
     Args:
         response: The response as a function of frequency.

@@ -110,8 +110,9 @@ class LinearAnalysis(Result):
     def decisive(self) -> Spectrum:
         """The characteristic roots on which the verdict about stability is based.
 
-        They belong to the sampled loop, whose controllers compute once per tick. If a control
-        law can be linearised in continuous time only, they belong to the continuous loop.
+        These roots belong to the sampled loop, whose controllers compute once per tick. If a
+        control law can be linearised in continuous time only, the roots belong to the
+        continuous loop.
         """
         return self.continuous if self.sampled is None else self.sampled
 
@@ -136,8 +137,8 @@ class LinearAnalysis(Result):
     def notes(self) -> tuple[str, ...]:
         """Remarks for the user that qualify the verdict of the linear analysis.
 
-        They concern the analysed conditions (such as delays and operators), the pose of rest
-        about which the arms are linearised, and the characteristic roots.
+        The remarks concern the analysed conditions (such as delays and operators), the pose of
+        rest about which the arms are linearised, and the characteristic roots.
         """
         notes = [*self.conditions.notes, *self.rest.notes]
         if self.is_far_from_rest:

@@ -73,7 +73,8 @@ def find_rightmost_root(
 ) -> CharacteristicRoot | None:
     """Returns the fastest growing (rightmost) root of the control loop about a pose of rest.
 
-    Its real part is the growth rate of small motions. If it is negative, they die away.
+    The real part of this root is the growth rate of small motions. If the rate is negative, the
+    motions die away.
 
     Args:
         conditions: The gains, delays and weights of the loop.
@@ -227,7 +228,8 @@ def iterate_linear_edges(
         key: Key of the scenario, such as "control.d".
         low: Lower end of the range.
         high: Upper end of the range.
-        rest: Equilibrium of the scenario, if known. It is followed along the key.
+        rest: Equilibrium of the scenario, if known. The equilibrium is tracked as the key
+            varies.
         points: Number of values that the scan evaluates.
         sampled: True to analyse the loop with its ticks, False to analyse the continuous loop.
             `None` to choose as the module's docstring says.
@@ -405,7 +407,7 @@ class GrowthColumn(NamedTuple):
         """Computes how the growth of small motions depends on one setting of a scenario.
 
         For each value of the setting, the coupled arms are linearised about a pose of rest.
-        This pose is followed from one value to the next. Between a stable and an unstable
+        This pose is tracked from one value to the next. Between a stable and an unstable
         neighbouring value, the value at which stability changes is located.
 
         Args:
@@ -488,7 +490,7 @@ def _assume_equilibrium(
     """Returns an equilibrium of a scenario, without a simulation if possible.
 
     Adaptive sites without operators and environments have the mean start pose as their
-    equilibrium. Otherwise it is the equilibrium next to the previous one.
+    equilibrium. Otherwise the equilibrium nearest to the previous one is found.
 
     Args:
         scenario: The experiment.

@@ -220,9 +220,10 @@ def compute_shared_poses(conditions: OperatingConditions, rest: Equilibrium) -> 
 
 
 def compute_references(conditions: OperatingConditions, rest: Equilibrium) -> list[Array]:
-    """Computes the reference pose of each arm, which its control law tries to reach, at rest.
+    """Computes the pose at rest that the control law of each arm tries to reach.
 
-    It is the mean of the other arms' poses, weighted with the dominance factors.
+    This pose, the reference, is the mean of the other arms' poses, weighted with the dominance
+    factors.
 
     Args:
         conditions: The sites, gains and delays of the loop.
@@ -408,7 +409,7 @@ def _select_states(
     *,
     all_estimates: bool,
 ) -> SiteJacobian:
-    """Returns derivatives of an arm's motion with respect to the states that the model has.
+    """Returns the derivatives of an arm's motion with respect to the states of the model.
 
     Of the parameter estimates of a chain, only independent combinations that change the torque
     at rest are kept, see the module's docstring.
@@ -619,9 +620,10 @@ def _add_law_forms(
 ) -> LinearLoop:
     """Adds control laws that gains do not fully describe to a linear model of the arms.
 
-    These laws may have additional states, or send additional signals, such as waves. They state
-    their linear equations as a `LinearForm`. A sent signal becomes a state without a rate of
-    change: an algebraic equation determines it, and the receiver reacts to its delayed value.
+    These laws may have additional states, or send additional signals, such as waves. Such laws
+    state their linear equations as a `LinearForm`. A sent signal becomes a state without a rate
+    of change: an algebraic equation determines it, and the receiver reacts to its delayed
+    value.
 
     Args:
         conditions: The sites (processes that each run one arm), gains and delays.
@@ -764,7 +766,7 @@ def _add_form(
         """Returns the matrix through which delayed states of all arms act on the loop.
 
         The delay is the age of the samples (sent states) of site j when site i uses them. If no
-        matrix for this delay exists, one with zeros is added.
+        matrix for this delay exists, a zero matrix is added.
 
         Args:
             j: Index of the site that sends the samples.

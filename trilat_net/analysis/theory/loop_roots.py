@@ -15,8 +15,8 @@ Invariant:
       period, if the loop is analysed with its ticks (the periods of its controllers), and if
       the rightmost root has the same sign at the last pose and at the nearest pose of rest.
     - A command that sets a link or a dominance factor to its present value counts as no change.
-    - The code of imported control laws is executed only with permission. Without it, such a
-      loop has no roots.
+    - The code of imported control laws is executed only with permission. Without permission, no
+      roots are computed for such a loop.
     - With permission, unstable roots count as exact and stable ones do not, because the law may
       contain thresholds that its derivative at the pose does not show. The same rule applies to
       sampled walls, because an arm may oscillate at a wall although the pose of rest next to
@@ -551,8 +551,8 @@ def _choose_end_state(
 ) -> _EndState:
     """Chooses the joint angles and parameter estimates of all arms at the end of a run.
 
-    The angles of an arm at rest are the last ones. Those of an arm that still moves are the
-    mean over the last quarter of the run, in intervals of 50 ms.
+    For an arm at rest, the last angles are used. For an arm that still moves, the angles are
+    the mean over the last quarter of the run, in intervals of 50 ms.
 
     Args:
         scenario: Scenario of the run.
@@ -635,8 +635,8 @@ def _record_motions(scenario: Scenario) -> list[_SiteMotion]:
     """Simulates a scenario again, and returns the motion of each site.
 
     The judged run has kept only reduced data and its last records. The state of an arm that
-    chatters at a wall needs all records of the last quarter. They are read in batches, so that
-    a long run does not need memory for whole records.
+    chatters at a wall needs all records of the last quarter. The records are read in batches,
+    so that a long run does not need memory for whole records.
 
     Args:
         scenario: The scenario up to the end of the run.

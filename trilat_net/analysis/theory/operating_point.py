@@ -154,9 +154,9 @@ class OperatingConditions(NamedTuple):
     def coupled_pairs(self) -> list[tuple[int, int]]:
         """Pairs (i, j) of sites for which site i reacts to the states that site j sends.
 
-        A site is a process that runs one arm. It reacts if its dominance factor for site j, the
-        weight with which it follows site j, is not zero. The control law of a user reads the
-        states of all other sites and therefore reacts in any case.
+        A site is a process that runs one arm. Site i reacts if its dominance factor for site j,
+        the weight with which it follows site j, is not zero. The control law of a user reads
+        the states of all other sites and therefore reacts in any case.
         """
         pairs = []
         for i, site in enumerate(self.sites):
@@ -488,9 +488,9 @@ def compute_effective_delay(
 def has_lasting_delays(scenario: Scenario) -> bool:
     """Returns True if delays that are constant in a run remain constant after its end.
 
-    They do not if a sinusoid or a trace has other delays later. The ages of samples are
-    compared, because a play-out buffer may hide varying delays. Random and measured delays are
-    ignored: only records show them.
+    Delays do not remain constant if a sinusoid or a trace has other delays later. The ages of
+    samples are compared, because a play-out buffer may hide varying delays. Random and measured
+    delays are ignored: only records show them.
 
     Args:
         scenario: The experiment, with the duration of the run.

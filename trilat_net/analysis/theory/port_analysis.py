@@ -85,7 +85,7 @@ def linearise_teleoperator(conditions: OperatingConditions, rest: Equilibrium) -
     """Builds the linear model of the arms and their coupling, without operators and walls.
 
     Operators and walls act at the joints, which are the ports of the model, and are not part of
-    it.
+    the model.
 
     Args:
         conditions: The sites, gains and delays of the loop.

@@ -72,7 +72,7 @@ class Passivity(NamedTuple):
         minima: Least eigenvalue of Y + Y^H over frequency, in rad/s per N m, and the bands in
             which it is negative.
         size: Largest singular value of Y at these frequencies, shape (F,), in rad/s per N m.
-            The eigenvalues of Y + Y^H lie within twice that.
+            The eigenvalues of Y + Y^H lie within twice this value.
         lacking_nm_s_rad: Damping that would make the loop passive if each port had it, in N m
             s/rad. Infinite if it grows without bound towards the lowest frequencies.
     """
@@ -274,8 +274,8 @@ def check_passivity(
 ) -> Passivity:
     """Checks whether coupled arms are passive at the places (ports) where operators act.
 
-    They are passive if they never return more energy than they received. This is examined over
-    frequency, with additional frequencies near the minima.
+    The arms are passive if they never return more energy than they received. This is examined
+    over frequency, with additional frequencies near the minima.
 
     Args:
         response: Function that returns the response at given frequencies: usually the

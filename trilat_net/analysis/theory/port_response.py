@@ -332,11 +332,11 @@ def find_longest_delay_s(loop: LinearLoop) -> float:
 def find_pole_at_zero(loop: LinearLoop) -> PoleAtZero:
     """Finds whether constant torques make the velocities of coupled arms grow.
 
-    They grow if the response Y(s), velocity per torque, has a pole at zero. For example, a free
-    mass m has Y(s) = 1 / (m s). A characteristic root at zero alone is not sufficient. The arms
-    have many of these roots, because they can rest in several poses, and a resting arm has no
-    velocity. The pole is found by Cauchy's integral along a small circle around zero, with the
-    radius `ZERO_ROOT_RADIUS_PER_S`.
+    The velocities grow if the response Y(s), velocity per torque, has a pole at zero. For
+    example, a free mass m has Y(s) = 1 / (m s). A characteristic root at zero alone is not
+    sufficient. The arms have many of these roots, because they can rest in several poses, and a
+    resting arm has no velocity. The pole is found by Cauchy's integral along a small circle
+    around zero, with the radius `ZERO_ROOT_RADIUS_PER_S`.
 
     Args:
         loop: Linear model of the coupled arms.
@@ -555,7 +555,7 @@ class Transparency(NamedTuple):
     def interpolate_magnitudes(self, frequency_hz: float) -> tuple[float, float]:
         """Returns the magnitudes of the impedances that an operator feels at one frequency.
 
-        They are interpolated between the computed frequencies on logarithmic axes.
+        The magnitudes are interpolated between the computed frequencies on logarithmic axes.
 
         Args:
             frequency_hz: The frequency, in Hz.

@@ -750,8 +750,8 @@ class Following(NamedTuple):
     Attributes:
         x: Pose that other arms can follow, shape (m, ...).
         xd: Velocity of x, with an angular velocity for the orientation, shape (m, ...).
-        e: Error of the followed coordinates, x less the desired pose, shape (m, ...).
-        ed: Error of the velocities, xd less the desired velocity, shape (m, ...).
+        e: Error of the followed coordinates, x minus the desired pose, shape (m, ...).
+        ed: Error of the velocities, xd minus the desired velocity, shape (m, ...).
         v: Reference velocity of the joints, shape (n, ...), in rad/s.
         a: Reference acceleration of the joints, the derivative of v, shape (n, ...), in
             rad/s^2.

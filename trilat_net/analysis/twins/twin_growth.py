@@ -338,10 +338,10 @@ class TwinGrowth(NamedTuple):
     def text(self) -> str:
         """A sentence for the user that says whether small pushes of the run grow or die away.
 
-        It describes the push that grows most or dies away most slowly. If the arms left a
-        position of rest by themselves, the sentence describes that motion instead. If the run
-        was not repeated with pushes, the sentence gives the reason. The package `presentation`
-        writes it.
+        The sentence describes the push that grows most or dies away most slowly. If the arms
+        left a position of rest by themselves, the sentence describes that motion instead. If
+        the run was not repeated with pushes, the sentence gives the reason. The package
+        `presentation` writes it.
         """
         return str(find_hook("describe a finding")(self))
 
@@ -536,9 +536,9 @@ def measure_amplitude(path: TwinPath, group: Sequence[int]) -> Array:
 def _measure_interval(differences: Array, scale: Array, largest: Array) -> Array:
     """Returns log A between two pushes, where A is the size of the effect of a push.
 
-    The module's docstring defines A. Twins store their differences from the run scaled, because
-    these may become too small or too large for floating-point numbers. Therefore the
-    differences are first scaled by their largest value.
+    The module's docstring defines A. Twins store their differences from the run in scaled form,
+    because the differences may become too small or too large for floating-point numbers.
+    Therefore the differences are first scaled by their largest value.
 
     Args:
         differences: Scaled velocity differences of the joints, shape (K, n).
@@ -843,7 +843,7 @@ class PushedTwins(Result):
         """Returns a sentence for the user on how the pushes develop.
 
         It describes the worst push, which grows most or dies away most slowly. If the user
-        asked for pushes of several sizes, it says instead for which sizes the effect is
+        requested pushes of several sizes, it states instead for which sizes the effect is
         proportional to the size.
         """
         return str(find_hook("describe a finding")(self))

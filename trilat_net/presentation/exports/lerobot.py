@@ -1,10 +1,10 @@
 """Exports logs as a dataset of LeRobot, version 3.0, for learning from demonstrations.
 
 LeRobot trains programs to move robots as people did. A dataset is a sequence of frames at a
-fixed rate, divided into episodes. A frame has the state of the slave arm, the pose of every
-user's arm, the dominance factors of the users (the weights with which the slave follows them),
-the ages of the samples with which the sites follow each other, and, in a run with a program,
-whether a person intervened instead of the program.
+fixed rate, divided into episodes. A frame contains the state of the slave arm, the pose of
+every user's arm, the dominance factors of the users (the weights with which the slave follows
+them), the ages of the samples with which the sites follow each other, and, in a run with a
+program, whether a person intervened instead of the program.
 
 Invariant:
     - A frame has the newest record of every site at or before its time. A record is the stored
@@ -677,9 +677,9 @@ def _read_sample_ages(
     """Returns the ages of the messages with which the slave and its users follow each other.
 
     The age of a message (sample) is the delay that a control loop experiences. A trained
-    program may need it to judge how old its view of the other arm is. The feature `age_s` has
-    the ages at the slave, one per user. The feature `age_s.USER` has the age of the slave's
-    message at a user. Sites that do not follow each other have no such feature.
+    program may need it to judge how old its view of the other arm is. The feature `age_s`
+    contains the ages at the slave, one per user. The feature `age_s.USER` contains the age of
+    the slave's message at a user. Sites that do not follow each other have no such feature.
 
     Args:
         log: Log of the run that is exported.

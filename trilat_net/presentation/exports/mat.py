@@ -1,9 +1,10 @@
 """Exports a log as a MATLAB file (.mat) with a struct per arm and an array per column.
 
-For example, `m1.q1_rad` has the angle of the first joint of the arm m1 in each period of its
-control loop, and `m1.link.age_s_us` is a column of the statistics of its network connections.
-The struct `events` has the events of the session. The text `about_json` describes all columns,
-and the text `scenario_toml` is the scenario, the description of the experiment.
+For example, `m1.q1_rad` contains the angle of the first joint of the arm m1 in each period of
+its control loop, and `m1.link.age_s_us` is a column of the statistics of its network
+connections. The struct `events` contains the events of the session. The text `about_json`
+describes all columns, and the text `scenario_toml` is the scenario, the description of the
+experiment.
 """
 
 from pathlib import Path

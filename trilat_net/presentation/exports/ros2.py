@@ -210,8 +210,8 @@ class _SiteBag:
     def iterate_statistics(self) -> Iterator[TimedMessages]:
         """Yields the ROS messages about the delays and losses of the links to the site.
 
-        Each item has the time of arrival in the log and the time of publication, both in ns,
-        and the messages. The items are sorted by the time of arrival, which a bag needs.
+        Each item contains the time of arrival in the log and the time of publication, both in
+        ns, and the messages. The items are sorted by the time of arrival, which a bag needs.
         """
         timed = self._log.timed_link_stats(self._site)
         log_times_ns = timed.log_ns.tolist()

@@ -284,9 +284,10 @@ def _draw_residual(axes: Axes, balance: EnergyBalance, form: FigureSize) -> None
     """Draws the residual of the energy balance, which shows whether the log fits the model.
 
     The solid line is the residual: the change of the energy function V that neither dissipation
-    ("taken") nor the work on the arms ("given") explains. Some of it arises because the control
-    law is executed in ticks ("sampling"). The dotted line is the residual without this part.
-    The value axis is logarithmic, so that the residual can be compared with the largest energy.
+    ("taken") nor the work on the arms ("given") explains. Part of the residual arises because
+    the control law is executed in ticks ("sampling"). The dotted line is the residual without
+    this part. The value axis is logarithmic, so that the residual can be compared with the
+    largest energy.
 
     Args:
         axes: Panel of the figure, as Matplotlib axes.

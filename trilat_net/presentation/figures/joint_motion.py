@@ -465,7 +465,7 @@ def _has_changing_estimates(log: Log) -> bool:
 def draw_parameter_estimates(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
     """Draws the estimates of the arms' inertial parameters over time, with the true values.
 
-    Adaptive control laws estimate these parameters while the arm moves. The figure has the
+    Adaptive control laws estimate these parameters while the arm moves. The figure shows the
     estimates of all sites, whereas Fig. 6 of the paper shows only those of master 1. An arm in
     space (a chain) has a row of panels per link, or two rows per link in a narrow figure.
 
@@ -495,7 +495,7 @@ def _draw_link_estimates(log: Log, form: FigureSize) -> Figure:
     """Draws the estimates of the inertial parameters of arms in space, over time.
 
     A link has `LINK_PARAMETERS` parameters, such as its mass, and each has a panel. The panels
-    of a link fill one row, or two rows of a narrow figure. A panel has the estimates of all
+    of a link fill one row, or two rows of a narrow figure. A panel shows the estimates of all
     sites whose arms have that link.
 
     Args:

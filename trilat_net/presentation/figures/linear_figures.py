@@ -178,12 +178,12 @@ def _convert_to_hz(w_rad_s: Array) -> Array:
 def draw_port_passivity(ports: PortAnalysis, size: FigureSize = REPORT_SIZE) -> Figure:
     """Draws over frequency whether the loop is passive, and stable with any passive operators.
 
-    The upper panel has the smallest eigenvalue of Y + Y^H, divided by its bound 2 norm(Y),
+    The upper panel shows the smallest eigenvalue of Y + Y^H, divided by its bound 2 norm(Y),
     where Y is the admittance matrix of the ports: velocities over forces. A negative value
     means that the loop can generate energy. With the value -1 it returns all energy that an
     operator puts in.
 
-    The lower panel has the criterion for stability with any passive operators: for two sites
+    The lower panel shows the criterion for stability with any passive operators: for two sites
     Llewellyn's parameter of each joint, which must be at least 1; for more sites the margin
     under the best weights, which must be positive.
 
@@ -436,8 +436,8 @@ def _list_network_handles(
 def _plot_case(axes: Axes, x: float, row: Mapping[str, Any], transport: int) -> None:
     """Draws the delays of one transport in one case, and a cross if messages were lost.
 
-    A mark is the median. A thick line leads from there to the 99th percentile, and a thin line
-    to the largest delay.
+    A mark is the median. A thick line leads from the median to the 99th percentile, and a thin
+    line to the largest delay.
 
     Args:
         axes: Panel of the figure, as Matplotlib axes.

@@ -1,9 +1,9 @@
 """Draws how a small disturbance of a run grows or decays over time.
 
 The run was repeated with a small push at some time. Such a repetition is called a twin. The
-upper panel has the differences of the joint velocities between twin and run on a logarithmic
+upper panel shows the differences between the joint velocities of twin and run on a logarithmic
 axis, on which exponential growth is a straight line. The slope of a dashed line next to them is
-the growth rate that the headline states. The lower panel has the joint speeds of the run
+the growth rate that the headline states. The lower panel shows the joint speeds of the run
 itself.
 
 Invariant:
