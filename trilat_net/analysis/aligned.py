@@ -320,7 +320,7 @@ def _fill_tick_grid(
 ) -> AlignedRecords:
     """Returns a site's records with one row for every tick. Missing records are interpolated.
 
-    Values that cannot be interpolated, such as modes, are those of the last record before.
+    Values that cannot be interpolated, such as modes, are those of the previous record.
 
     Args:
         scenario: Scenario of the run.
@@ -387,8 +387,8 @@ def _fill_tick_grid(
 class _PeerMotion(NamedTuple):
     """Motion of another arm (a peer) at K times, computed from its records.
 
-    Joint by joint, the motion has n coordinates, in rad. In task space it has the m coordinates
-    of the end effector, in m. Units below are for joints.
+    If arms follow joint by joint, the motion has n coordinates, in rad. In task space it has
+    the m coordinates of the end effector, in m. Units below are for joints.
 
     Attributes:
         q: Positions, shape (K, n) or (K, m), in rad.

@@ -191,7 +191,7 @@ def is_ending_trace(link: LinkBase) -> bool:
 def find_final_link(scenario: Scenario, name: str) -> LinkBase:
     """Returns the delay model of a link that is in force at the end of a scenario.
 
-    The linear analysis of a run belongs to this model, because it concerns the final pose.
+    The linear analysis of a run uses this model, because it concerns the final pose.
 
     Args:
         scenario: Description of the experiment. Its timeline may change the link.

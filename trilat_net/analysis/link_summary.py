@@ -234,7 +234,7 @@ def _mark_judged_samples(
     stamp_ns: Ints,
     arrivals: _Arrivals,
 ) -> Bools:
-    """Finds the "judged" samples: the log shows whether they arrived.
+    """Finds the judged samples, those for which the log shows whether they arrived.
 
     A sample that did not arrive counts as lost only if it could have arrived before the end of
     the run: it is older than the newest arrival, or it was sent so early that the slowest

@@ -232,7 +232,7 @@ class RunEnd(NamedTuple):
     def text(self) -> str:
         """A sentence for the user on how the motion ends, with the numbers that show it.
 
-        The sentence also has the reasons why the run cannot be called stable. The package
+        The sentence also contains the reasons why the run cannot be called stable. The package
         `presentation` writes it.
         """
         return str(find_hook("describe a finding")(self))
@@ -241,7 +241,7 @@ class RunEnd(NamedTuple):
     def reasons(self) -> tuple[str, ...]:
         """Sentences that say why the stability of the run remains open, one for each doubt.
 
-        Empty if it is decided. The package `presentation` writes the sentences.
+        Empty if the stability is decided. The package `presentation` writes the sentences.
         """
         return tuple(find_hook("list the sentences of a finding")(self))
 

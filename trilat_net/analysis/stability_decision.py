@@ -194,7 +194,7 @@ def _agrees_with_proof(run: RunFindings) -> bool:
     """Returns True if neither the end of a run nor its repetitions contradict a proof.
 
     A repetition, a twin, has a small push. A run that is shorter than the period of its delays
-    contradicts no proof, because its motion may be part of a beat.
+    does not contradict a proof, because its motion may be part of a beat.
     """
     end = run.end
     twins = run.twins
@@ -222,7 +222,7 @@ def _confirms_slowest_root(run: RunFindings) -> bool:
 
 
 def _is_end_excused(run: RunFindings) -> bool:
-    """Returns True if an end that looks unstable is no evidence, because of pushes or roots.
+    """Returns True if pushes or roots show that an unstable-looking end is no evidence.
 
     The cases are:
 
@@ -250,7 +250,7 @@ def _has_settled(run: RunFindings) -> bool:
     """Returns True if a run became slow, or was decaying, and every push died away.
 
     This judgement is weaker than stable: it rests on the recorded motion and on runs with small
-    pushes, but on no proof.
+    pushes, but not on a proof.
 
     Args:
         run: Findings of the analyses on the run.

@@ -484,7 +484,7 @@ def _list_words(lines: Sequence[_Line]) -> list[str]:
 
 
 def _read_numbers(column: Column, words: Sequence[str]) -> NDArray[np.float64]:
-    """Returns the values of a column as numbers to draw, shape (K,). NaN stands for no value.
+    """Returns the values of a column as numbers to draw, shape (K,). NaN marks a missing value.
 
     Texts, such as the mode of an arm, are replaced by their positions in a list of all texts.
 

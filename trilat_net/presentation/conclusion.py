@@ -107,7 +107,7 @@ class Conclusion(CheckReport):
     def to_dict(self) -> dict[str, Any]:
         """Converts the result to plain values, as `trilat report --json` prints them.
 
-        The entries have the outcome ("passed", "verdict"), its explanation for users
+        The entries contain the outcome ("passed", "verdict"), its explanation for users
         ("meaning", "notes"), the individual checks, and the paths of the files.
         """
         return {

@@ -41,7 +41,7 @@ _TRENDS = {
 def _describe_end(end: RunEnd) -> str:
     """Returns a sentence on how the motion of a run ends, with the numbers that show it.
 
-    The sentence also has the reasons why the run cannot be called stable.
+    The sentence also contains the reasons why the run cannot be called stable.
     """
     return "; ".join([_describe_behaviour(end), *_list_doubts(end)])
 

@@ -82,7 +82,7 @@ def describe_equilibrium(analysis: LinearAnalysis) -> Iterator[str]:
     """Yields lines about the pose of rest (equilibrium) about which the arms were linearised.
 
     The lines state how the equilibrium was computed, its residual, and the pose of each arm. If
-    all arms have the same joint angles, a single line states them.
+    all arms have the same joint angles, a single line states these angles.
 
     Args:
         analysis: The analysis.
@@ -145,7 +145,7 @@ def tabulate_roots(analysis: LinearAnalysis) -> TextTable:
 
     The roots are those of the continuous loop, whose controllers act in continuous time. If a
     root of the sampled loop, whose controllers compute once per tick, differs, two further
-    columns have the roots of the sampled loop. If the delays differ from tick to tick, the
+    columns contain the roots of the sampled loop. If the delays differ from tick to tick, the
     table has only the roots of the sampled loop over a span of ticks, because the continuous
     loop has only mean delays.
 

@@ -150,7 +150,7 @@ class TimeChart(msgspec.Struct, frozen=True, kw_only=True, tag="time", tag_field
 class HistogramChart(
     msgspec.Struct, frozen=True, kw_only=True, tag="histogram", tag_field="kind"
 ):
-    """A histogram on the page of a time per tick of each site, such as the lateness.
+    """A histogram of a duration that is measured in every tick, such as the lateness.
 
     The bins have equal width on a logarithmic axis.
 

@@ -84,7 +84,7 @@ def summarise_origin(log: Log) -> str:
 
 
 def describe_changes(scenario: Scenario) -> str:
-    """Returns how a scenario differs from the shipped scenario whose name and title it has.
+    """Returns how a scenario differs from the shipped scenario of the same name and title.
 
     The title and the description of a scenario state its original settings. A run with other
     settings, for example of `trilat rerun`, keeps title and description. The reader must

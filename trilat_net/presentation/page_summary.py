@@ -341,7 +341,7 @@ def _describe_undelayed_error(log: Log, slaves: Sequence[str]) -> list[_KeyNumbe
     """Returns a text on how far the slave arms were from the others at the same time.
 
     The tracking error compares a slave with states that the other arms sent some time ago. A
-    reader who sees the arms apart on the screen expects the distance at the same time.
+    reader who sees the arms apart on the screen looks for the distance at the same time.
 
     Args:
         log: Log of the run.

@@ -128,7 +128,7 @@ class _DecimatedTrace(NamedTuple):
 
 
 def extreme_rows(values: Array, buckets: int) -> Ints:
-    """Chooses the rows of some signals that a plot needs, so that no peak gets lost.
+    """Chooses the rows of some signals that a plot needs, so that no peak is lost.
 
     The rows are divided into buckets, intervals with equal numbers of rows. In each bucket the
     rows with the largest and the smallest value of each column are kept. The first and the last
@@ -175,7 +175,7 @@ def decimate(
     values: Array,
     buckets: int,
 ) -> _DecimatedTrace:
-    """Reduces signals to the points that a plot needs, so that no peak gets lost.
+    """Reduces signals to the points that a plot needs, so that no peak is lost.
 
     The time is divided into buckets. Each bucket keeps at most 2 C + 3 points for C columns,
     including the extremes of each column. One bucket per pixel of a plot is enough.

@@ -350,7 +350,7 @@ def _list_sent_rows(channels: Ros2Channels) -> tuple[_PlotRow, ...]:
     """Returns a row of plots for each quantity that control laws send to other arms.
 
     The rows are in the order in which the laws declare the quantities. The metadata of a
-    channel has the name and the unit of its quantity.
+    channel contains the name and the unit of its quantity.
     """
     rows = {}
     for topic, channel in channels.items():

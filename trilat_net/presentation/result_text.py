@@ -156,8 +156,8 @@ class TextTable(NamedTuple):
     def lines(self) -> list[str]:
         """Renders the table as plain lines, with columns aligned by spaces.
 
-        The first line has the headers, unless all headers are empty. Each column is as wide as
-        its longest cell.
+        The first line contains the headers, unless all headers are empty. Each column is as
+        wide as its longest cell.
         """
         table = list(self.rows)
         if any(self.titles):

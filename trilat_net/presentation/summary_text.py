@@ -126,8 +126,8 @@ def format_link_lines(log: Log) -> list[str]:
     """Returns a line for each network link whose delay varies or which loses messages.
 
     A link transmits the state of one arm to another, as a message (sample) per control period.
-    A line has the delay that the scenario states for the link, the measured one-way delay, the
-    age of the messages in use, and the losses.
+    A line contains the delay that the scenario states for the link, the measured one-way delay,
+    the age of the messages in use, and the losses.
 
     Args:
         log: Log of the run.
@@ -552,9 +552,9 @@ def compose_doctor(report: Result) -> Iterator[Block]:
 def compose_ping(report: Result) -> Iterator[Block]:
     """Yields tables of the round trip times in a session.
 
-    One table has the times to the members, the processes that take part in the session: sites
-    and recorders. The other has the times between sites. The second table exists only if the
-    sites have measured these times.
+    One table contains the times to the members, the processes that take part in the session:
+    sites and recorders. The other contains the times between sites. The second table exists
+    only if the sites have measured these times.
 
     Args:
         report: Result of the measurement.

@@ -232,7 +232,7 @@ class SiteEnergy:
 
 
 def _accumulate(amounts: Array, judged: Bools | None = None) -> Array:
-    """Sums amounts, such as energies per control period, up to each time, shape (K,), from 0.
+    """Returns the cumulative sum of amounts, such as energies per period, shape (K,), from 0.
 
     Args:
         amounts: Amount in each period, shape (K - 1,).
@@ -421,9 +421,9 @@ class EnergyBalance:
     def unsupplied(self) -> Array:
         """The energy V without the work of operators and environments, shape (T,), in J.
 
-        It starts at V(0). From then on, only changes in judged periods count, and the work of
-        operators, environments and the stops of joints is subtracted. If the conditions of the
-        stability theorem hold, it never rises.
+        The result starts at V(0). From then on, only changes in judged periods count, and the
+        work of operators, environments and the stops of joints is subtracted. If the conditions
+        of the stability theorem hold, it never rises.
         """
         rise = self._accumulate_judged(self.V - self.external_work)
         unsupplied: Array = self.V[0] + rise
@@ -848,8 +848,8 @@ def find_dominance_matrices(energies: Mapping[str, SiteEnergy]) -> Array:
 def rise_above_minimum(values: Array) -> Array:
     """Returns how far a quantity is above its smallest earlier value, at each time.
 
-    For example, the values 3, 1, 2, 0 give 0, 0, 1, 0. An energy that first falls and then
-    rises must not hide the rise behind the fall.
+    For example, the values 3, 1, 2, 0 give 0, 0, 1, 0. In this way, an earlier fall of an
+    energy does not hide a later rise.
 
     Args:
         values: Values of the quantity over time, shape (T,).

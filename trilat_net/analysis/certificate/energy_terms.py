@@ -732,7 +732,7 @@ def compute_dissipation(site: SiteMotion) -> dict[str, Increment]:
         return _dot_rows(r, torque)
 
     def friction_power(r: Array, qd: Array) -> Array:
-        """Returns the power that friction takes beyond what the law compensates, in W."""
+        """Returns the power that uncompensated friction dissipates, in W."""
         friction = c.arm.friction(qd)
         torque = friction - c.arm.friction(qd - r)
         return _dot_rows(r, torque)
@@ -1003,7 +1003,9 @@ def _unknown_friction_work(site: SiteMotion) -> Increment:
     uncompensated_share = 1.0 - c.friction
 
     def power(r: Array, qd: Array) -> Array:
-        """Returns the power of the friction that the law does not know, shape (rows,), in W."""
+        """Returns the power of the friction that the law does not compensate, shape (rows,), in
+        W.
+        """
         friction = c.arm.friction(qd - r)
         return -_dot_rows(r * uncompensated_share, friction)
 

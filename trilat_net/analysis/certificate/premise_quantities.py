@@ -334,7 +334,7 @@ class Supply(NamedTuple):
 class OperatorQuantities(NamedTuple):
     """Evidence for the premise that operators and environments are passive.
 
-    A passive operator never returns more energy than it received. V may otherwise rise.
+    A passive operator never returns more energy than it received. Otherwise V may rise.
 
     Attributes:
         unmeasured: Sites with external arms whose external torque is not recorded.

@@ -570,7 +570,7 @@ def _check_records(run: FunctionalFacts) -> Premise:
     """Checks that the log has all records of all arms while their processes were present.
 
     Missing records leave the condition undecided, because the energy function V of the
-    stability proof is unknown there.
+    stability proof is unknown at these times.
     """
     quantities = RecordQuantities(
         unjudged_s=tuple(run.unjudged),
@@ -651,7 +651,7 @@ FUNCTIONAL_CHECKS = (
 
 
 def _find_joints(run: FunctionalFacts, site: str, is_affected: Bools) -> tuple[str, ...]:
-    """Returns the names of the joints that an effect, such as a torque limit, concerned.
+    """Returns the names of the joints that are affected, for example by a torque limit.
 
     Args:
         run: Facts of the run.
@@ -727,7 +727,7 @@ def find_unjudged_spans(balance: EnergyBalance) -> list[tuple[float, float]]:
 
 
 def collect_evidence(run: _RunFacts, min_coverage: float) -> Evidence:
-    """Collects how complete the records of a run are, and whether its log was changed.
+    """Collects evidence on how complete a run's records are and whether its log was changed.
 
     A run with too few records is not called stable, see `Evidence.reasons`.
 

@@ -344,7 +344,7 @@ class RunningEnergy:
         return self._compute_span(begin_s, end_s)
 
     def _compute_span(self, begin_s: float, end_s: float) -> EnergyCourse | None:
-        """Returns the energy function V over a span of time. `None` if V is not known there.
+        """Returns the energy function V over a span of time. `None` if V is not known.
 
         Changes of the dominance factors that ended long before the span are removed, so that a
         long session needs bounded memory.
@@ -392,8 +392,8 @@ class RunningEnergy:
         """Computes the energies of all sites over a span of ticks, as the records arrive.
 
         A site uses samples that its peers sent earlier. Therefore the records of each peer are
-        needed from the oldest sample in use on, and two ticks more, because the motion between
-        samples is interpolated.
+        needed from the oldest sample in use, with two additional ticks, because the motion
+        between samples is interpolated.
 
         Args:
             tick_spans: First and last tick of the span, by site.

@@ -181,8 +181,8 @@ class FunctionalCourse(NamedTuple):
         failed: Names of the premises that fail. The theorem does not apply if there are any.
         undecided: Quantities of the premises on which the log does not decide.
         external: Names of operators and environments that did work, as in "hands".
-        from_s: First time of V, in s.
-        to_s: Last time of V, in s.
+        from_s: First time at which V is known, in s.
+        to_s: Last time at which V is known, in s.
         first_j: V at the first time, in J. 0 if V is a rounding error.
         last_j: V at the last time, in J. 0 if V is a rounding error.
         largest_j: Largest V, in J.

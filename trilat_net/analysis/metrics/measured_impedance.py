@@ -385,9 +385,10 @@ def _find_still_rows(
     *,
     alone: bool,
 ) -> Bools | None:
-    """Finds the ticks (control periods) at which no operator moves an arm as planned.
+    """Finds the ticks (control periods) at which no operator makes a planned motion.
 
-    Impedance is measured only there, because other operators would disturb the measurement.
+    Impedance is measured only at these ticks, because other operators would disturb the
+    measurement.
 
     Args:
         runs: All sites with records.

@@ -65,7 +65,7 @@ def unavailable(
     of: str = "",
     applies: bool = True,
 ) -> MetricValues:
-    """Returns metrics without values, with a common reason, for all quantities of one heading.
+    """Returns metrics without values, with a common reason, for all quantities under a heading.
 
     For example, a function that measures tracking returns them if an arm has no records.
 

@@ -646,7 +646,8 @@ def _compute_parameter_energy(
     """Returns the energy of parameter errors, which is a part of the energy function V.
 
     The energy of the errors d is d' Gamma^-1 d / 2 with the adaptation gains Gamma. Base
-    parameters learn with the gain B Gamma B', where B is the matrix of their combinations.
+    parameters are adapted with the gain B Gamma B', where B is the matrix of their
+    combinations.
 
     Args:
         arm: The arm.

@@ -58,7 +58,8 @@ MIN_LOAD_SHARE = 0.02
 class _StaticWindow(NamedTuple):
     """Interval of time in which all arms rest, with mean torques and angles of each arm.
 
-    Stiffness and force sharing are measured in such intervals, because no inertia acts there.
+    Stiffness and force sharing are measured in such intervals, because inertia has no effect at
+    rest.
 
     Attributes:
         from_s: Time of the first tick, in s.

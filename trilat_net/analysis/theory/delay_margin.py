@@ -317,7 +317,7 @@ class _FrequencySweep:
     """Eigenvalues of the open-loop frequency response G(j w) over the frequency w.
 
     `_find_axis_crossings` searches them for the frequencies at which a modulus is 1, because
-    the loop can become unstable only there.
+    the loop can become unstable only at these frequencies.
 
     Args:
         pencil: Matrices of the loop, with a single delay.

@@ -96,7 +96,7 @@ class _SiteTickMap(NamedTuple):
     """Linear model of one arm over one tick (control period): X' = P X + Q w.
 
     X contains the n states of the arm at a tick, and X' the states at the next tick. w contains
-    what the arm receives from the other arms.
+    the values that the arm receives from the other arms.
 
     Attributes:
         P: Effect of the states, shape (n, n). The states are the joint angles and velocities,
@@ -426,7 +426,7 @@ def _plan_parts(
     used: Mapping[tuple[int, int], IntArray],
     count: int,
 ) -> list[_SpanPart]:
-    """Plans in which order the ticks of all sites are computed, and where the span is divided.
+    """Plans the order in which the ticks of all sites are computed, and divides the span.
 
     A tick can be computed only after all samples that it uses. The plan collects as many
     consecutive ticks of a site as possible, because their effects are then computed together.
@@ -707,7 +707,7 @@ class _SpanMap:
         return V, [site_tracks.states for site_tracks in tracks]
 
     def _send_present(self, tracks: Sequence[_Tracks], stops: Sequence[int]) -> None:
-        """Computes the sent values of the present states, after these were changed."""
+        """Recomputes the values that the arms send, after their present states were changed."""
         for site_tracks, sent, past, stop in zip(
             tracks, self._sent, self._past, stops, strict=True
         ):
@@ -969,7 +969,7 @@ class SampledLoop:
 
 
 def _draw_start(span: _SpanMap, n: int) -> Array:
-    """Returns random start columns for the search of eigenvectors, equal in every run.
+    """Returns random start columns for the search for eigenvectors, equal in every run.
 
     A fixed seed makes results repeatable.
 

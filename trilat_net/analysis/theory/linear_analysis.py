@@ -297,7 +297,7 @@ def _find_end_loop(scenario: Scenario, log: Log | None) -> _AnalysedLoop:
     """Finds the control loop at the end of a run, which the linear analysis examines.
 
     A stability certificate states the roots of the same loop. If the arms have no equilibrium
-    near the end, that of a longer run or a prediction is used.
+    near the end, the equilibrium of a longer run or a prediction is used.
 
     Args:
         scenario: The scenario of the run.

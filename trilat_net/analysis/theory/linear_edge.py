@@ -94,8 +94,8 @@ def find_rightmost_root(
 def find_deepest_contact(scenario: Scenario, q: Array) -> int | None:
     """Finds the state of a run in which an end effector has penetrated a wall most deeply.
 
-    The linear analysis then includes the stiffness of the wall. Only sampled walls count, which
-    compute their force once per tick (period of the control loop).
+    The linear analysis then includes the stiffness of the wall. Only sampled walls are
+    considered, which compute their force once per tick (period of the control loop).
 
     Args:
         scenario: Description of the experiment.

@@ -148,7 +148,8 @@ def find_log_loop(log: Log, *, own_laws: bool = False) -> _EndLoop:
         own_laws: True if the code of imported control laws may be executed.
 
     Raises:
-        ScenarioError: The loop cannot be linearised, or the run ended without a rest.
+        ScenarioError: The loop cannot be linearised, or the run did not end near a pose of
+            rest.
     """
     site_logs = [log[site] for site in log.sites]
     if not all(map(len, site_logs)):
@@ -202,7 +203,8 @@ def find_run_loop(scenario: Scenario, run: FusedRun) -> _EndLoop:
         run: Its run in the fused loop.
 
     Raises:
-        ScenarioError: The loop cannot be linearised, or the run ended without a rest.
+        ScenarioError: The loop cannot be linearised, or the run did not end near a pose of
+            rest.
     """
     if run.diverged_s is not None:
         _check_mode(scenario.names[0], "diverged", scenario.name)
@@ -349,7 +351,8 @@ def _build_end_loop(
 def _compute_roots(loop: _EndLoop) -> LoopRoots:
     """Computes the fastest growing (rightmost) roots of the loop at the end of a run.
 
-    A root is the complex growth rate of a small motion. A certificate of stability states them.
+    A root is the complex growth rate of a small motion. A stability certificate states these
+    roots.
 
     Args:
         loop: The loop at the end of a run.

@@ -284,7 +284,7 @@ def _describe_laws(scenario: Scenario) -> list[str]:
     """Returns remarks for the user on how the control laws of a scenario are linearised.
 
     Laws of the user's own code are differentiated numerically, which is less exact than the
-    derivatives of the shipped laws. Some shipped laws state a remark of their own.
+    derivatives of the shipped laws. Some shipped laws provide their own remark.
 
     Args:
         scenario: The experiment.
@@ -413,7 +413,7 @@ def _find_final_link(scenario: Scenario, name: str, notes: list[str]) -> LinkBas
 
 
 def _has_long_period(link: LinkBase, rate_hz: int) -> bool:
-    """Returns True if the period of a link's delay is too long to be computed, in ticks."""
+    """Returns True if a link's delay repeats only after more ticks than can be analysed."""
     period_s = find_link_period_s(link)
     return period_s is not None and period_s * rate_hz > MAX_PERIOD_TICKS
 

@@ -351,7 +351,7 @@ def llewellyn_parameter(Y: Complex) -> Array:
 def llewellyn_rounding(Y: Complex) -> Array:
     """Returns the rounding error of Llewellyn's stability parameter at each frequency.
 
-    If the parameter is closer to the limit than this error, the criterion decides nothing. The
+    If the parameter is closer to the limit than this error, the criterion does not decide. The
     error is large if almost nothing is transmitted from one joint to the other.
 
     Args:
@@ -531,8 +531,9 @@ def _evaluate_margin(
 ) -> tuple[Array, Array]:
     """Returns the least eigenvalue under weights, and its gradient with respect to their logs.
 
-    With the eigenvector v and the projection P_i on the ports of site i, the derivative of
-    v^H (e^{x/2} Y e^{-x/2} + its Hermitian) v with respect to x_i is Re v^H (P_i Y - Y P_i) v.
+    With the eigenvector v and the projection P_i on the ports of site i, the derivative of v^H
+    (e^{x/2} Y e^{-x/2} + its conjugate transpose) v with respect to x_i is Re v^H (P_i Y - Y
+    P_i) v.
 
     Args:
         Y: Response, shape (F, p, p).

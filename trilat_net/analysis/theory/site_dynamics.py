@@ -235,7 +235,7 @@ def evaluate_site_rates(site: SiteSetup, x: Numbers) -> SiteRates:
     """Computes how fast the states of a site change, and the torques that act on its arm.
 
     A site is a process that runs one arm. Its states are joint angles, joint velocities and
-    parameter estimates. Operators and environments, such as walls, act as they do in the setup.
+    parameter estimates. Operators and environments, such as walls, act as defined in the setup.
     The equations are those of the site's control law and of the dynamics of its arm
     (docs/reference/laws.md).
 

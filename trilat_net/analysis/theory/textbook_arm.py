@@ -13,7 +13,7 @@ of the link's own frame. The following symbols are used:
 - q, qd: joint angles and their velocities.
 - v, a: reference velocities and accelerations of the joints, from the control law.
 - J_i, I_i: Jacobian and spatial inertia of link i. V_i = J_i qd and W_i = J_i v are velocities.
-- X, S: transformation from the frame of the link before, and axis of the joint.
+- X, S: transformation from the frame of the previous link, and axis of the joint.
 - x, x*: cross products of spatial motions and of spatial forces.
 
 The acceleration of link i includes gravity and follows from the acceleration A_p of the link
@@ -146,7 +146,7 @@ class _PlacedLink(NamedTuple):
     combines a linear and an angular velocity.
 
     Attributes:
-        X: Transformation of spatial velocities from the frame of the link before into this
+        X: Transformation of spatial velocities from the frame of the previous link into this
             link's frame, shape (6, 6, ...).
         S: Spatial velocity of the link's joint at speed 1, shape (6,).
         J: Jacobian that maps joint velocities to the link's spatial velocity, shape (6, n,
@@ -494,7 +494,7 @@ def _transform_velocities(R: Numbers, p: Numbers) -> Numbers:
     A spatial velocity has six components, three of rotation and three of translation.
 
     Args:
-        R: Orientation of the link in the frame of the link before, shape (3, 3, ...).
+        R: Orientation of the link in the frame of the previous link, shape (3, 3, ...).
         p: Origin of the link in that frame, shape (3, ...), in m.
     """
     R_transposed = _transpose(R)
@@ -518,7 +518,7 @@ def _find_joint_axis(joint: ChainJoint) -> Array:
 
 
 def _place_joint(joint: ChainJoint, q: Numbers) -> tuple[Numbers, Numbers]:
-    """Returns a link's orientation and origin in the frame of the link before.
+    """Returns a link's orientation and origin in the frame of the previous link.
 
     A revolute joint turns by Rodrigues' formula, R = R_0 (1 + sin q K + (1 - cos q) K^2) with
     the cross matrix K of the axis.

@@ -13,7 +13,7 @@ def add_matrix_products(states: Array, matrix: Array, track: Array, rows: IntArr
     """Adds to the states of consecutive ticks a matrix times earlier states.
 
     It computes states[k] += matrix @ track[rows[k]] for k = 0, 1, .... `states` may be a part
-    of `track`: a tick may then use the states of the tick before, which are complete.
+    of `track`: a tick may then use the states of the previous tick, which are complete.
 
     Args:
         states: States of K ticks, shape (K, n, columns), with one motion per column. They are

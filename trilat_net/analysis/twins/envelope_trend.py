@@ -152,8 +152,8 @@ def _find_window_maxima(
 ) -> Array | None:
     """Returns the maximum amplitude in each of several equal windows of time.
 
-    Maxima of windows remove the oscillation. Only the second half of the run counts, after the
-    first transients.
+    Maxima of windows remove the oscillation. Only the second half of the run is considered,
+    after the first transients.
 
     Args:
         t_s: Ascending times, shape (K,), in s.

@@ -13,8 +13,8 @@ Invariant:
       and also older than the period of the frames. In that case the episode ends, and the next
       episode begins after the gap.
     - Observations and actions are states of a site at the time of the frame, from the site's
-      own records. Link delays therefore do not affect them, but only the samples of peers. The
-      features `age_s` are the ages of these samples.
+      own records. Link delays therefore affect only the samples of peers. The features `age_s`
+      are the ages of these samples.
     - Numbers are float32. An orientation consists of six numbers, which never jump (see
       `trilat_net.log.orientations`).
     - With the setting `actions`, actions have the names and units of `action_features` of the
@@ -146,7 +146,7 @@ class _Feature(NamedTuple):
 class _Attempt(NamedTuple):
     """A part of a run that becomes an episode of the dataset: one attempt at a task.
 
-    Marks of a program, `session.episode`, enclose the part.
+    Marks that a program sets with `session.episode` enclose the part.
 
     Attributes:
         name: Name of the episode. Empty for a run without marks.
@@ -503,7 +503,7 @@ def _choose_frames(log: Log, fps: int, attempts: list[_Attempt]) -> _Frames:
     """Chooses the times of the frames of a log, and the records of each frame.
 
     The first frame is at the first time for which every site has a record. Records of a site
-    that has diverged do not count.
+    that has diverged are not used.
 
     Args:
         log: Log of the run that is exported.

@@ -66,7 +66,7 @@ def export_ros2(
 
     Topics of sites are `/<session>/<site>/joint_states` and others. Topics of the session are
     `/<session>/events`, `/<session>/log`, `/tf` and `/diagnostics`. The metadata of the
-    channels have units, names and representations of orientations. An existing file is
+    channels contain units, names and representations of orientations. An existing file is
     replaced.
 
     Args:

@@ -365,7 +365,7 @@ def choose_bin_edges_us(log: Log) -> Array:
 def bin_loop_times(times_us: Ints, edges_us: Array) -> Ints:
     """Counts how many times lie in each bin of a histogram of control loop timing.
 
-    Times below 1 us count in the first bin.
+    Times below 1 us are counted in the first bin.
 
     Args:
         times_us: Times in us, shape (K,).

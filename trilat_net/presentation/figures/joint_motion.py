@@ -582,8 +582,8 @@ def _draw_estimate(
 def draw_phase_portrait(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
     """Draws the tracking errors of each joint against their rates of change (phase portrait).
 
-    Each joint has a panel. The horizontal axis has the error q - q_des, the actual minus the
-    desired joint angle. The vertical axis has the velocity error qd - qd_des. A stable motion
+    Each joint has a panel. The horizontal axis shows the error q - q_des, the actual minus the
+    desired joint angle. The vertical axis shows the velocity error qd - qd_des. A stable motion
     spirals to the origin. A ring marks the start of a site's motion, and a disc its end.
 
     Args:
@@ -734,8 +734,8 @@ def list_sites_with_changing_dominance(log: Log) -> list[str]:
 def draw_authority(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
     """Draws how the authority over the arms changes during a run, and how the arms move.
 
-    The upper panels have the dominance factors: the weights with which a site follows each of
-    the other sites. The lower panels have the displacements of the joints from the start, in
+    The upper panels show the dominance factors: the weights with which a site follows each of
+    the other sites. The lower panels show the displacements of the joints from the start, in
     rad. A reader sees whether the arms move smoothly while the authority passes from one
     operator to another.
 
@@ -792,7 +792,7 @@ def _list_sites_with_walls(log: Log) -> list[str]:
 def draw_contact(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
     """Draws the force and the depth of the contact between the arms and the virtual walls.
 
-    The panels have the normal force of every wall, in N, and the depth to which the end
+    The panels show the normal force of every wall, in N, and the depth to which the end
     effector has entered the wall, in mm.
 
     Args:

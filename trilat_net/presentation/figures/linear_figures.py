@@ -181,7 +181,7 @@ def draw_port_passivity(ports: PortAnalysis, size: FigureSize = REPORT_SIZE) -> 
     The upper panel shows the smallest eigenvalue of Y + Y^H, divided by its bound 2 norm(Y),
     where Y is the admittance matrix of the ports: velocities over forces. A negative value
     means that the loop can generate energy. With the value -1 it returns all energy that an
-    operator puts in.
+    operator supplies.
 
     The lower panel shows the criterion for stability with any passive operators: for two sites
     Llewellyn's parameter of each joint, which must be at least 1; for more sites the margin

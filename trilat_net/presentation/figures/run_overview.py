@@ -102,7 +102,7 @@ _PANELS = (
 def draw_overview(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
     """Draws the most important quantities of one run in four panels, with a line per arm.
 
-    The title has the judgement whether the run was stable, and the settling time.
+    The title contains the judgement on whether the run was stable, and the settling time.
 
     Args:
         log: Log of the run.
