@@ -176,7 +176,8 @@ class _Arrivals(NamedTuple):
 def _read_arrivals(log: Log, site: str) -> dict[str, _Arrivals]:
     """Reads from a log which messages of other arms arrived at an arm, and when.
 
-    Such a message, called a sample, has the state that an arm sends in every control period.
+    Such a message, called a sample, contains the state that an arm sends in every control
+    period.
 
     Args:
         log: The log of the run.
@@ -403,7 +404,7 @@ def summarise_clock(log: Log, peer: str, site: str) -> ClockSummary | None:
 class SampleCounts(NamedTuple):
     """Counts of sent, used, lost and late messages of a network link, from the receiver's log.
 
-    Such a message, called a sample, has the state of an arm in one control period.
+    Such a message, called a sample, contains the state of an arm in one control period.
     docs/reference/metrics.md defines these counts under `samples.*`.
 
     Attributes:

@@ -9,7 +9,7 @@ Invariant:
       meaning of a judgement and remarks about the run are not counted.
     - Each line is also printed with --all, or contains the largest of the values that --all
       prints.
-    - The judgement comes first, and a line that speaks against stability is never left out.
+    - The judgement comes first, and a line that contradicts stability is never left out.
 """
 
 from collections.abc import Iterator
@@ -84,7 +84,7 @@ def compose_key_reasons(certificate: Certificate) -> Iterator[Block]:
 def _choose_lines(lines: list[CertificateLine]) -> list[CertificateLine]:
     """Selects the most important lines of a stability certificate, in their original order.
 
-    Lines that speak against stability are more important than lines that confirm it.
+    Lines that contradict stability are more important than lines that confirm it.
 
     Args:
         lines: All lines of the certificate, of which the first is the judgement.

@@ -26,7 +26,7 @@ LAYOUT_SUFFIX = ".foxglove.json"
 def write_foxglove_layout(log: Path, *, force: bool = False) -> Path:
     """Writes the layout of a log or a bag for the viewers Foxglove and Lichtblick.
 
-    With the layout, the viewer shows plots of all sites without any arrangement by hand.
+    With the layout, the viewer shows plots of all sites without manual arrangement.
 
     Args:
         log: File of the log or bag.

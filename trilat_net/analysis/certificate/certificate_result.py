@@ -205,7 +205,7 @@ class Certificate(Result):
 
     @property
     def reasons(self) -> tuple[str, ...]:
-        """Sentences on everything that speaks against calling the run stable.
+        """Sentences on all findings that prevent the judgement "stable".
 
         The sentences concern the end of the run, the energy V, the roots at the end pose, the
         energies that control laws declare, and the completeness of the log. Empty for a stable

@@ -727,7 +727,7 @@ def compute_dissipation(site: SiteMotion) -> dict[str, Increment]:
         right = right + half_alpha_right * squared_right
 
     def damping_power(r: Array) -> Array:
-        """Returns the power that the damping of the control law takes, in W."""
+        """Returns the power that the damping of the control law dissipates, in W."""
         torque = c.Kp * r + c.robust_torque(r)
         return _dot_rows(r, torque)
 
@@ -1003,9 +1003,7 @@ def _unknown_friction_work(site: SiteMotion) -> Increment:
     uncompensated_share = 1.0 - c.friction
 
     def power(r: Array, qd: Array) -> Array:
-        """Returns the power of the friction that the law does not compensate, shape (rows,), in
-        W.
-        """
+        """Returns the power of the uncompensated friction, shape (rows,), in W."""
         friction = c.arm.friction(qd - r)
         return -_dot_rows(r * uncompensated_share, friction)
 

@@ -133,7 +133,7 @@ def _select_loop_states(conditions: OperatingConditions, states: Sequence[Array]
     """Joins the states of all sites to one vector, without states that never change.
 
     The states of a site that are not part of the linear loop are the parameters of a law that
-    learns nothing.
+    does not learn.
     """
     masks = linear_loop.mask_loop_states(conditions)
     pairs = zip(states, masks, strict=True)
@@ -505,8 +505,8 @@ def _complete_estimates(
     Args:
         conditions: The gains, delays and weights of the loop.
         theta_hat: Known estimates, shape (N, P). If `None`, the true parameters are used, or
-            for an imported law its initial memory. Laws that learn nothing have their assumed
-            parameters.
+            for an imported law its initial memory. For laws that do not learn, the assumed
+            parameters are used.
     """
     rows = []
     for index, site in enumerate(conditions.sites):

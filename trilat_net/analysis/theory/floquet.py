@@ -190,7 +190,7 @@ def _linearise_site_tick(site: SiteSetup, jacobian: SiteJacobian) -> _SiteTickMa
 def _discretise_arm(jacobian: SiteJacobian, h_s: float) -> tuple[Array, Array]:
     """Returns the matrices of an arm over a tick in which the torque is held.
 
-    The controller computes its torque once per tick, but the arm moves all the time. The free
+    The controller computes its torque once per tick, but the arm moves continuously. The free
     arm moves by its own dynamics, and by environments that act continuously.
 
     Args:
@@ -714,7 +714,7 @@ class _SpanMap:
             site_tracks.sent[past + stop] = sent @ site_tracks.states[stop]
 
     def _run_ticks(self, tracks: Sequence[_Tracks], run: _TickRun) -> None:
-        """Computes the states of one site over consecutive ticks, and what it sends.
+        """Computes the states of one site over consecutive ticks, and the values that it sends.
 
         The effects of the peers are known before the first of these ticks, so they are added
         for all ticks at once. The site's own states are computed tick by tick, since each
