@@ -939,7 +939,8 @@ def _compose_impedance(metrics: LogMetrics) -> Iterator[Block]:
 def _list_response_cells(ratio: FrequencyResponse) -> list[str]:
     """Returns the table cells of one frequency: frequency, gain, phase, coherence and error.
 
-    If the ratio could not be estimated, the last cell has the reason, and the others are empty.
+    If the ratio could not be estimated, the last cell contains the reason, and the others are
+    empty.
     """
     if ratio.gain is None:
         return ["", "", "", "", ratio.why]

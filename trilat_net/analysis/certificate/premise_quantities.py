@@ -294,8 +294,8 @@ class AxisQuantities(NamedTuple):
 class SingularPoseQuantities(NamedTuple):
     """Evidence on whether any arm came near a singular pose, such as a stretched arm.
 
-    The end effector cannot move in every direction there, however fast the joints turn. The
-    stability theorem does not cover such poses.
+    In such a pose the end effector cannot move in every direction, however fast the joints
+    turn. The stability theorem does not cover such poses.
 
     Attributes:
         near_s: Time from which the arm of a site was near a singular pose, in s, by site.

@@ -13,8 +13,8 @@ literature.
 Invariant:
     - A ratio is given at the frequency with the strongest drive, and at all frequencies whose
       drive is at least 0.55 times as strong.
-    - A ratio counts only if at least `MIN_SEGMENTS` independent segments of the run excite the
-      frequency, and if both signals have a coherence of at least `MIN_COHERENCE` with the
+    - A ratio is accepted only if at least `MIN_SEGMENTS` independent segments of the run excite
+      the frequency, and if both signals have a coherence of at least `MIN_COHERENCE` with the
       drive. These two limits keep its relative random error to at most 17.2 %.
     - Otherwise the reason is given instead of the ratio.
 """
