@@ -297,7 +297,7 @@ def test_skipped_ticks_count_as_missing_nowhere(tmp_path: Path) -> None:
 
     late = rewrite_log(log, change=delay)
     page = render_loops(late, summarise_run(late))
-    assert "; 4 ticks began a period or more late and were made all the same; " in page
+    assert "; 4 ticks began a period or more late and were executed nevertheless; " in page
     assert f"{skipped} ticks were skipped." in page
 
 
