@@ -62,13 +62,13 @@ LOW_FREE_BYTES = 2 << 30
 CLOCK_TEST_NS = 100_000_000
 """Time for which the monotonic clock and the time of day are compared, in ns."""
 MAX_CLOCK_STEP_NS = 1_000_000
-"""Largest change of the difference between the clocks in that time, in ns."""
+"""Largest permitted change of the difference between the clocks in `CLOCK_TEST_NS`, in ns."""
 MAX_BOUND_US = 1_000
 """Largest error bound of a clock offset without a warning, in us."""
 PINGS = 20
 """Number of pings to each member of a session."""
 RATES_HZ = (1000, 500, 200, 100)
-"""Tick rates that are tried, in Hz, until one of them is achieved."""
+"""Tick rates in Hz, which are tried in this order until one of them is achieved."""
 REHEARSAL_S = 1.0
 """Duration of the trial of each rate, in s."""
 MAX_LATE_PERIODS = 0.5
@@ -104,7 +104,7 @@ def examine_machine(
 ) -> Iterator[DoctorFinding]:
     """Checks whether this machine can run a session, and yields each result at once.
 
-    Some checks take seconds, so that the user sees progress.
+    Some checks take seconds. The user sees each result as soon as it is known.
 
     Args:
         connection: Endpoints at which this machine would listen, or to which it would connect.
@@ -132,9 +132,9 @@ def examine_machine(
 
 
 def examine_keys(folder: Path | None) -> Generator[DoctorFinding, None, MemberKeys | None]:
-    """Checks if a member's keys are valid, for how long, and if other users can read them.
+    """Checks whether a member's keys are valid, for how long, and whether others can read them.
 
-    Keys encrypt the connections of a session, and prove which process a message comes from.
+    Keys encrypt the connections of a session, and prove which process has sent a message.
 
     Args:
         folder: Folder of a member's keys. None if there is none.
@@ -173,7 +173,7 @@ def examine_keys(folder: Path | None) -> Generator[DoctorFinding, None, MemberKe
             "keys", "warn", f"others can look into {folder}: chmod 700 {folder}"
         )
 
-    # With the key of the authority, anybody could create keys for further members.
+    # Anybody who has the key of the authority could create keys for further members.
     authority = folder.resolve().parent / "authority" / PRIVATE_KEY
     if authority.exists():
         description = (
@@ -190,7 +190,7 @@ def examine_links(
     *,
     insecure: bool,
 ) -> Iterator[DoctorFinding]:
-    """Checks if each network endpoint can be opened or reached, and if it is encrypted.
+    """Checks whether each network endpoint can be opened or reached, and is encrypted.
 
     An endpoint is an address with a protocol, such as "tls/[::1]:7447".
 
@@ -202,8 +202,8 @@ def examine_links(
             trusted.
 
     Yields:
-        The findings about the endpoints. There is a single one if no endpoint can be used at
-        all.
+        The findings about the endpoints. There is a single finding if no endpoint can be used
+        at all.
     """
     try:
         secured = connection.secure(member_keys, insecure=insecure)
@@ -240,7 +240,7 @@ def _describe_untried(endpoint: str) -> DoctorFinding:
 
 
 def _examine_listening(endpoint: str, address: tuple[str, int]) -> DoctorFinding:
-    """Checks if this machine can listen at a network endpoint, by listening for a moment.
+    """Checks whether this machine can listen at a network endpoint, by listening for a moment.
 
     The port may be in use already. An endpoint without encryption causes a warning.
 
@@ -274,7 +274,7 @@ def _examine_listening(endpoint: str, address: tuple[str, int]) -> DoctorFinding
 def _examine_reaching(
     endpoint: str, address: tuple[str, int], folder: Path | None
 ) -> DoctorFinding:
-    """Checks if another process of a session answers at a TCP or TLS endpoint.
+    """Checks whether another process of a session answers at a TCP or TLS endpoint.
 
     The user learns before a session whether its processes can reach each other, and whether the
     connection is encrypted.
@@ -282,8 +282,8 @@ def _examine_reaching(
     Args:
         endpoint: The endpoint.
         address: Its host and port.
-        folder: Folder of this member's keys. None if they cannot be used: then only the
-            connection is tried, and not the certificate.
+        folder: Folder of this member's keys. `None` if they cannot be used. Only the connection
+            is then tried, and not the certificate.
     """
     try:
         with socket.create_connection(address, CONNECT_S) as tcp_link:
@@ -309,7 +309,7 @@ def _examine_reaching(
 
 
 def _examine_quic(endpoint: str, member_keys: MemberKeys | None) -> DoctorFinding:
-    """Checks if another member of the session answers over QUIC, by connecting to it.
+    """Checks whether another member of the session answers over QUIC, by connecting to it.
 
     Python has no QUIC client in its standard library. Therefore the connection uses Zenoh, the
     network library of the sessions.
@@ -337,7 +337,7 @@ def _tls_context(folder: Path | None) -> ssl.SSLContext:
     """Returns the settings of an encrypted (TLS) test connection to another machine.
 
     Args:
-        folder: Folder of this member's keys. None accepts any certificate.
+        folder: Folder of this member's keys. If `None`, any certificate is accepted.
     """
     if folder is None:
         # Only the connection is tried. No data is sent.
@@ -373,7 +373,7 @@ def _split_address(endpoint: str) -> tuple[str, int] | None:
 
 
 def examine_clock(clock: Clock) -> Iterator[DoctorFinding]:
-    """Checks for `CLOCK_TEST_NS` if the clocks of this machine run steadily.
+    """Checks for `CLOCK_TEST_NS` whether the clocks of this machine run steadily.
 
     The monotonic clock must not go back. The time of day must not step relative to the
     monotonic clock. The finding also states the longest time between two readings, which shows
@@ -419,7 +419,7 @@ def _examine_offsets(
 ) -> Iterator[DoctorFinding]:
     """Compares the clock of this machine with the clocks of a session's other processes.
 
-    Measured delays of messages are only as accurate as the offset between the clocks is known.
+    Measured delays of messages are only as accurate as the known offset between the clocks.
 
     Args:
         connection: Endpoints of the session, and keys.
@@ -487,17 +487,17 @@ def _run_in_process(code: str) -> Any:
 _RIGHTS_CODE = (
     "import json; from sites.realtime import prepare; print(json.dumps(prepare(None)))"
 )
-"""Program that requests the real-time settings of a site, and prints the obtained ones."""
+"""Program that requests the real-time settings of a site, and prints the granted settings."""
 
 
 def examine_rights() -> Iterator[DoctorFinding]:
     """Checks which real-time settings the operating system grants to a site.
 
-    A site needs for example a high priority, so that its control loop is not interrupted by
+    For example, a site needs a high priority, so that its control loop is not interrupted by
     other programs.
 
     Yields:
-        One finding per setting. A single warning if the settings could not be tried.
+        One finding per setting, or a single warning if the settings could not be tried.
     """
     try:
         obtained_settings: dict[str, str] = _run_in_process(_RIGHTS_CODE)
@@ -561,7 +561,7 @@ def rehearse_rates(clock: Clock) -> list[tuple[int, int, int]]:
 
 
 def is_held(rate_hz: int, late_us: int) -> bool:
-    """Returns True if a machine achieves a control rate, judged by how late its periods begin.
+    """Returns True if a machine achieves a tick rate, judged by how late its ticks begin.
 
     The rate is achieved if the lateness is at most `MAX_LATE_PERIODS` periods of the rate.
 
@@ -584,8 +584,8 @@ _RATES_CODE = (
 def examine_rate() -> DoctorFinding:
     """Measures the highest rate at which a control loop is punctual on this machine.
 
-    Each rate of `RATES_HZ` is tried for `REHEARSAL_S`, until the loop begins its periods on
-    time. An example is 1000 Hz.
+    Each rate of `RATES_HZ`, such as 1000 Hz, is tried for `REHEARSAL_S`. The trials end with
+    the first rate at which the loop begins its periods on time.
     """
     if not is_core_cached():
         return DoctorFinding(
@@ -671,7 +671,7 @@ class DoctorReport(Result):
     findings: list[DoctorFinding]
 
     def headline(self) -> str:
-        """Returns the numbers of checks by result, for example "0 fail, 2 warn, 9 ok"."""
+        """Returns the number of checks with each result, for example "0 fail, 2 warn, 9 ok"."""
         states = [finding.state for finding in self.findings]
         return (
             f"{states.count('fail')} fail, {states.count('warn')} warn, {states.count('ok')} ok"
@@ -694,8 +694,8 @@ class DoctorReport(Result):
     def blocks(self) -> Iterator[Any]:
         """Returns the lines that `trilat doctor` prints, one per finding with its mark.
 
-        The module that composes the lines is imported inside this method, because its import is
-        of no use to a program that only reads the findings.
+        The module that composes the lines is imported inside this method, because a program
+        that only reads the findings does not need it.
         """
         from ..presentation import compose_doctor
 

@@ -56,18 +56,18 @@ def describe_site(
 ) -> SiteRow:
     """Composes the table row of one arm: mode, joint angles, torque and so on, as texts.
 
-    The texts follow from the newest record and statistics of the arm's process, its site.
+    The texts are composed from the newest record and statistics of the arm's process, its site.
 
     Args:
         scenario: Scenario of the session.
         name: Name of the site.
-        record: Result of the site's newest tick. None if none has arrived.
-        stats: Newest statistics of the site. None if none have arrived.
+        record: Result of the site's newest tick. `None` if no record has arrived.
+        stats: Newest statistics of the site. `None` if no statistics have arrived.
         ended: True if the site has published its end.
-        silent_s: Time since a message of the site arrived, in s. 0 if one has just arrived.
+        silent_s: Time since the last message of the site arrived, in s.
 
     Returns:
-        The texts by the headings of the columns. Unknown ones are empty.
+        The texts by the headings of the columns. The text of an unknown value is empty.
     """
     row = dict.fromkeys(HEADS, "") | {"site": name, "mode": "braked"}
     if stats is not None:
@@ -95,7 +95,7 @@ def describe_site(
 
 
 def _describe_record(scenario: Scenario, name: str, record: State) -> SiteRow:
-    """Returns the texts of an arm's table row that follow from its newest record.
+    """Returns those texts of an arm's table row that describe its newest record.
 
     The display of `trilat demo` and `trilat watch` has one row per arm.
 
@@ -131,7 +131,7 @@ def _describe_record(scenario: Scenario, name: str, record: State) -> SiteRow:
 def _describe_hold(hand: HandInForce | None) -> str:
     """Returns the table text that says whether a person or a program moves the arm.
 
-    It stands in the column "held".
+    The text stands in the column "held".
 
     Args:
         hand: State of the operator in the record. None if nobody may move the arm during the
@@ -165,8 +165,8 @@ def describe_angles(q: Sequence[float]) -> str:
 def describe_row(row: SiteRow) -> str:
     """Returns the state of one arm in a session as a line of text.
 
-    Outputs that cannot show a table, such as a file, use it. The line contains only the most
-    important columns.
+    It is used for outputs that cannot show a table, such as a file. The line contains only the
+    most important columns.
 
     Args:
         row: The texts of the row, by the headings of the columns.
@@ -237,8 +237,8 @@ class SessionDisplay:
     def due(self) -> bool:
         """True if enough time has passed since the last update of the display.
 
-        A table in a terminal is updated more often than lines in a file. Drawing takes time,
-        and no reader could follow faster changes.
+        A table in a terminal is updated more often than lines in a file. The rate is limited,
+        because drawing takes time and no reader could follow faster changes.
         """
         period_ns = TABLE_NS if self._live else LINES_NS
         return self._clock.monotonic_ns() - self._updated_ns >= period_ns
@@ -246,7 +246,7 @@ class SessionDisplay:
     def say(self, text: str) -> None:
         """Prints a line, such as an event, that stays in the terminal above the table of arms.
 
-        The table below is refreshed all the time.
+        The table below the line is refreshed repeatedly.
 
         Args:
             text: The line.
@@ -316,7 +316,7 @@ class SessionMonitor:
         self._display = display
         self._links = bus.inbox(topics.key(session, "*", topics.LINK), 256)
         self._events = bus.inbox(topics.key(session, "*", topics.EVENT), 256)
-        # Only the newest record of a site is shown, so that an inbox holds a single message.
+        # Only the newest record of a site is shown, so an inbox for a single message suffices.
         self._states = {}
         for name in scenario.names:
             self._states[name] = bus.inbox(topics.key(session, name, topics.STATE), 1)

@@ -40,7 +40,7 @@ _PACKAGES = ("numpy", "numba", "scipy")
 
 
 def _import_distributed() -> Any:
-    """Imports `distributed`, the package of Dask that runs work on a cluster of machines.
+    """Imports `distributed`, the Dask package that runs work on a cluster of machines.
 
     Raises:
         UsageError: The package is not installed.
@@ -94,8 +94,8 @@ class WorkerRequirements(NamedTuple):
 
     Attributes:
         identity: Properties that the worker must have.
-        laws: Name of each imported control law, such as "mylaws:Spring", with the SHA-256 of
-            its file, which the worker must have.
+        laws: Pairs of an imported control law, such as "mylaws:Spring", and the SHA-256 of the
+            law's file. The worker must have this file.
     """
 
     identity: WorkerIdentity
@@ -143,7 +143,7 @@ def explain_unfit_worker(
 
 
 def _list_properties(identity: WorkerIdentity, names: Sequence[str]) -> str:
-    """Returns some properties of a worker as a string for an error message."""
+    """Formats some properties of a worker as text for an error message."""
     return ", ".join(f"{name} {identity.get(name, 'unknown')}" for name in names)
 
 
@@ -167,9 +167,9 @@ def find_missing_laws(laws: Sequence[tuple[str, str]]) -> list[str]:
 
 
 def check_this_worker(required: WorkerRequirements) -> None:
-    """Checks in a worker of a cluster that it would compute the same results as the study.
+    """Checks that this worker of a cluster would compute the same results as the study.
 
-    A worker that joins during the study has not been checked before. Results from different
+    A worker that joins during the study must check itself, because the results of different
     program versions must not be mixed.
 
     Args:

@@ -119,7 +119,7 @@ def scenario_new_command(
 
 
 def _print_skeleton(kind: str, written: list[Path], key: str, checks: Sequence[str]) -> None:
-    """Prints which files were written for a new law, hand or plant, and how to run it.
+    """Prints which files were written for a new law, hand or plant, and how to run them.
 
     A skeleton is a working example that a user changes: a control law, a program that acts as
     an operator (hand), or a model of an arm (plant).
@@ -157,7 +157,8 @@ def new_law_command(
     """Creates a working, commented control law to start from, and its test."""
     from ...scenario import new_law
 
-    # A law of a user is settled at best, which is exit code 1 unless it is accepted.
+    # A run with a user's law is at best judged settled, which gives exit code 1 without
+    # --accept.
     checks = ("certify {log} --law {file} --accept settled", "report {log} --law {file}")
     _print_skeleton("law", new_law(file, force=force), "control.law={}", checks)
 

@@ -212,7 +212,7 @@ def log_view_command(
         bool,
         typer.Option(
             "--rviz",
-            help="Write a configuration of RViz next to FILE instead, for its ROS 2 topics.",
+            help="Write an RViz configuration for the log's ROS 2 topics next to FILE instead.",
         ),
     ] = False,
     viewer: Annotated[

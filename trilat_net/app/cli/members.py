@@ -84,7 +84,8 @@ def site_command(
     find_site(chosen, name)
     session_name = options.check_session_name(session or chosen.name)
 
-    # By default each site connects to those before it, so that each pair has one connection.
+    # By default each site connects to the sites before it, so that each pair has one
+    # connection.
     endpoints = default_endpoints(session_name, chosen.names, encrypted=ways.keys is not None)
     earlier_sites = chosen.names[: chosen.names.index(name)]
     earlier_endpoints = [endpoints[site] for site in earlier_sites]
@@ -106,7 +107,7 @@ def site_command(
 
 
 def _check_without(scenario: "Scenario", name: str, without: list[str]) -> tuple[str, ...]:
-    """Checks which arms may be absent at the start of a session, as an option names them.
+    """Checks the sites that --without permits to be absent at the start of a session.
 
     Arms that join later are permitted only if all arms glide back to each other after a break.
     Only the first site (process of an arm) decides about the start of a session.
@@ -252,8 +253,8 @@ def _choose_path(output: Path | None, session: str, *, concluded: bool) -> Path:
     """Chooses the file of a session's log, and creates the folder for it and its report.
 
     Args:
-        output: Path from --out. None uses SESSION.mcap, or run.mcap in a new folder if there
-            will be a report.
+        output: Path from --out. If `None`, the log is SESSION.mcap, or run.mcap in a new folder
+            if there will be a report.
         session: Name of the session.
         concluded: True if a report is written into the folder of the log.
     """
@@ -431,12 +432,13 @@ def _announce_playback(
 ) -> None:
     """Prints which arms of a log are replayed, as which session, and how fast.
 
-    A note warns if the messages have another version than those of this program.
+    A note warns if the version of the messages differs from the version of this program's
+    messages.
 
     Args:
         header: Description of the recorded session.
         name: Name of the session that the replay opens.
-        rate: Speed relative to the recording. Infinity for as fast as possible.
+        rate: Speed relative to the recording. Infinity means as fast as possible.
         print_line: Function that prints a line.
     """
     from ...net import VERSION
@@ -502,8 +504,8 @@ def _describe_playback(outcome: "PlaybackSummary", rate: float) -> dict[str, Any
 
     Args:
         outcome: The outcome.
-        rate: Speed relative to the recording. Infinity, which becomes None, for as fast as
-            possible.
+        rate: Speed relative to the recording. Infinity means as fast as possible, and becomes
+            `None`.
 
     Returns:
         The values by key. Comments in the function explain the keys.
@@ -528,7 +530,7 @@ def _describe_playback(outcome: "PlaybackSummary", rate: float) -> dict[str, Any
         "held_s": round(outcome.held_s, 3),
         # How often a receiver was disconnected, because it accepted no message for 5 s.
         "cut": outcome.cut,
-        # Number of messages whose place in the file was too far from their turn.
+        # Number of messages whose position in the file was too far from their turn.
         "strays": outcome.strays,
         # Number of recorders after the last message, and whether they stored all messages.
         "recorders": outcome.recorders,
@@ -581,7 +583,7 @@ def _warn_torn(torn: dict[Path, str]) -> None:
     """Warns the user of log files that were cut off, for example by a power failure.
 
     Args:
-        torn: For each file the problem.
+        torn: Description of the damage, by file.
     """
     for path, text in torn.items():
         terminal.print_note(
