@@ -5,7 +5,7 @@ once per random seed. This module turns the finished runs into a CSV table with 
 It also combines the runs of a cell, prints a summary, and finds the command that repeats a run.
 
 Invariant:
-    - The bytes of the result files depend on the runs alone, and not on the time or the number
+    - The bytes of the result files depend only on the runs, and not on the time or the number
       of worker processes.
     - Reading the CSV table restores all numbers bit for bit.
     - Running the scenario of a row again reproduces the row.
@@ -130,7 +130,7 @@ def iterate_cells(
 ) -> Iterator[list[CellRun]]:
     """Yields the finished runs of each cell, ordered by cell and then by seed.
 
-    Worker processes finish in any order, and the results must not depend on it.
+    Worker processes finish in any order, on which the results must not depend.
 
     Args:
         plan: The sweep: its scenario, axes, control laws and seeds.
@@ -159,7 +159,7 @@ def build_cell_rows(plan: SweepPlan, runs: Sequence[CellRun]) -> Iterator[Result
 def _build_row(plan: SweepPlan, entry: CellRun, log: str) -> ResultRow:
     """Returns the table row of a finished simulation, with the command that repeats it.
 
-    It has the parameter values (cell) and the results.
+    The row has the parameter values (cell) and the results.
 
     Args:
         plan: The sweep: its scenario, axes, control laws and seeds.
@@ -200,7 +200,8 @@ def build_sim_command(
 
     Args:
         plan: The sweep: its scenario, axes, control laws and seeds.
-        overrides: Overrides KEY=VALUE that turn the swept scenario into that of the run.
+        overrides: Overrides KEY=VALUE that turn the swept scenario into the scenario of the
+            run.
         seed: Seed of the run.
         duration_s: Duration of the run, in s.
         log: Name of the log.
@@ -220,9 +221,9 @@ def build_sim_command(
 def reproduction_duration_s(plan: SweepPlan, outcome: CellResult) -> float:
     """Returns the duration with which a run must be started to reproduce its row, in s.
 
-    A run that diverged, that is, left the limits of its arms, ended before its planned
-    duration. It is started with the planned duration, and will end early again. Every
-    extension of an undecided run doubles the planned duration.
+    A run that diverged, which means that an arm left its limits, ended before its planned
+    duration. It is started with the planned duration, and will end early again. Every extension
+    of an undecided run doubles the planned duration.
 
     Args:
         plan: The sweep: its scenario, axes, control laws and seeds.
@@ -277,7 +278,7 @@ class GridPoint(NamedTuple):
         counts: Number of runs of each class, such as converged or diverged, in the order of
             `RUN_CLASSES`.
         means: Mean, with its 95 % interval, of each quantity of `list_totals`, over the runs
-            that stayed within the limits of their arms. None for fewer than two such runs.
+            that stayed within the limits of their arms. `None` for fewer than two such runs.
     """
 
     cell: int
@@ -297,7 +298,7 @@ class GridPoint(NamedTuple):
 
     @property
     def stable(self) -> int:
-        """Number of simulations of a combination that were judged stable, at most `decided`."""
+        """Number of simulations of a combination that were judged stable."""
         classes = zip(self.counts, RUN_CLASSES, strict=True)
         return sum(count for count, verdict in classes if verdict.stable)
 
@@ -305,7 +306,8 @@ class GridPoint(NamedTuple):
     def doubtful(self) -> bool:
         """True if the cell is stable with some seeds and not stable with others.
 
-        Chance then decides the result, and more seeds are needed to know how often.
+        The result then depends on chance, and more seeds are needed to estimate the
+        probabilities.
         """
         return 0 < self.stable < self.decided
 
@@ -313,17 +315,17 @@ class GridPoint(NamedTuple):
     def interval(self) -> tuple[float, float]:
         """95 % confidence interval of the probability that a decided simulation is stable.
 
-        The method is Wilson's. Also if 10 runs of 10 are stable, the lower end is below 1,
+        The method is Wilson's. Even if 10 of 10 runs are stable, the lower end is below 1,
         because other seeds might give another result.
         """
         return wilson_interval(self.stable, self.decided)
 
 
 def list_totals(plan: SweepPlan) -> list[str]:
-    """Lists the measured quantities of which a sweep computes means over the seeds.
+    """Lists the measured quantities whose means over the seeds a sweep computes.
 
-    They are the totals that every run computes, such as its RMS error, and the metrics that the
-    sweep requested.
+    These are the totals of every run, such as the RMS error, and the metrics that the sweep
+    requested.
 
     Args:
         plan: The sweep: its scenario, axes, control laws and seeds.
@@ -349,10 +351,10 @@ def collect_grid_points(results: SweepResults) -> list[GridPoint]:
 def iterate_grid_points(results: SweepResults) -> Iterator[GridPoint]:
     """Yields the summary of each combination of swept parameters.
 
-    `collect_grid_points` returns the same as a list.
+    `collect_grid_points` returns the same summaries as a list.
 
     Args:
-        results: Results of the sweep, in which the rows of a cell stand together.
+        results: Results of the sweep, in which the rows of a cell are consecutive.
     """
     totals = list_totals(results.plan)
     groups = groupby(results.rows, key=lambda row: (row["cell"], row["law"]))
@@ -401,7 +403,7 @@ def encode_grid_points(plan: SweepPlan, points: Iterable[GridPoint]) -> Iterator
         """Returns the texts of one line of the CSV table, by column, for one grid point."""
         decided = point.decided
         stable_share = point.stable / decided if decided else None
-        # The values must stand in the order of the columns above.
+        # The values must be in the order of the columns above.
         values: list[Any] = [point.cell, *point.values, point.law]
         values += [sum(point.counts), *point.counts]
         values += [stable_share, *point.interval]
@@ -430,7 +432,7 @@ _MAX_CELLS_SHOWN = 8
 
 
 def describe_sweep_plan(plan: SweepPlan) -> list[str]:
-    """Tells the user how many simulations a sweep has, and over which values, as lines.
+    """Returns lines that tell the user the number of simulations and the values of a sweep.
 
     Args:
         plan: The sweep: its scenario, axes, control laws and seeds.
@@ -550,9 +552,9 @@ class _ValueRange:
         self.high = -math.inf
 
     def add(self, value: float | None) -> None:
-        """Updates the smallest and the largest value by the value of one simulation.
+        """Updates the smallest and the largest value with the value of one simulation.
 
-        A value of None, for a simulation that lacks the quantity, changes nothing.
+        `None`, for a simulation that lacks the quantity, changes nothing.
         """
         if value is None:
             return
@@ -571,12 +573,12 @@ class _RowTally:
     Attributes:
         counts: Number of runs of each class.
         extended: Number of runs that were extended.
-        longest_s: Duration of the longest of these, in s.
+        longest_s: Duration of the longest extended run, in s.
         within_limits: Number of runs whose arms stayed within their limits.
-        ranges: Range of each quantity over these runs.
+        ranges: Range of each quantity over the runs within their limits.
         exponents: Range of the growth exponents of all runs.
         not_random: Number of runs in which nothing is random.
-        refusals: Lines on the first cells that are not valid scenarios.
+        refusals: Lines about the first cells that are not valid scenarios.
     """
 
     def __init__(self, quantities: Iterable[str]) -> None:
