@@ -1,4 +1,4 @@
-"""Runs side by side in lanes against the same runs one after the other: ratio of processor times, interleaved."""
+"""Compares runs side by side in lanes with the same runs one after the other, by interleaved processor times."""
 
 import statistics
 import time
@@ -66,7 +66,7 @@ def run() -> list[str]:
 
 
 def _compare(case: Case, width: int) -> str:
-    """Times the runs of one scenario both ways, in turn."""
+    """Measures the runs of one scenario alternately with both methods."""
     cells = [
         load_scenario(case.name, {"duration_s": 20.0, **case.settings, case.key: float(number)})
         for number in np.linspace(case.least, case.largest, width)
@@ -90,7 +90,7 @@ def _compare(case: Case, width: int) -> str:
 
 
 def _compare_twins() -> list[str]:
-    """Times the twins of a certificate, and the certificate, both ways in turn."""
+    """Measures the twins of a certificate, and the certificate, alternately with both methods."""
     log = tn.simulate("paper", duration_s=20)
     pushes = twins.Push.choose(log.scenario)
     least_runs = twin_lanes.LEAST_RUNS

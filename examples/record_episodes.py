@@ -2,9 +2,10 @@
 
 A program leads master m1 to a place around its start, waits there, and judges by the distance
 whether it arrived. With `--alone`, lead m1 yourself with the mouse on the page: an episode then
-succeeds if m1 ends near the place that the terminal names. A second hand leads master m2 where
-m1 is, as `lerobot-record` does, because a policy at m2 will hold it too: a log in which nobody
-holds m2 has forces of zero there, for which LeRobot cannot find a scale. Run two terminals:
+succeeds if m1 ends near the place that the terminal names. A second hand moves master m2 to the
+position of m1, as `lerobot-record` does, because a policy will also hold m2. In a log in which
+nobody holds m2, its forces are zero, and LeRobot cannot find a scale for them. Run two
+terminals:
 
     trilat demo play --duration 60 -o reach-log
     python examples/record_episodes.py play
