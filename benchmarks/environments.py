@@ -1,4 +1,4 @@
-"""Compares environments that advance side by side with one environment, by interleaved processor times."""
+"""Compares the processor times of environments that advance side by side and of one environment, in turn."""
 
 import statistics
 import time

@@ -1,4 +1,4 @@
-"""Compares runs side by side in lanes with the same runs one after the other, by interleaved processor times."""
+"""Compares the processor times of runs side by side in lanes and of the same runs one after the other, in turn."""
 
 import statistics
 import time

@@ -38,8 +38,8 @@ def hold(
 
     Args:
         switch: the dead-man switch of an arm.
-        read: waits for one period, and returns the keys that arrived. Empty if there are none,
-            and `None` at the end of the input.
+        read: waits for one period, and returns the keys that arrived. Empty if there are no
+            keys, and `None` at the end of the input.
         now_s: returns the present time, in s.
         gap_s: time without keys after which the switch is released, in s.
     """

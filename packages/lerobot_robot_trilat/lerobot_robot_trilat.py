@@ -400,7 +400,9 @@ def main() -> None:
     parser.add_argument("--site", default="m2", help="master that the policy drives")
     parser.add_argument("--slave", default="s", help="slave that the policy observes")
     parser.add_argument("--session", default="play", help="name of the session")
-    parser.add_argument("--scenario", default="", help="scenario, if its name is another one")
+    parser.add_argument(
+        "--scenario", default="", help="scenario; default: the name of the session"
+    )
     parser.add_argument("--connect", action="append", default=[], help="endpoint; repeatable")
     parser.add_argument("--keys", default="", help="folder of the operator's keys")
     parser.add_argument("--duration", type=float, default=30.0, help="duration, s")

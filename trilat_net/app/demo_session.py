@@ -7,8 +7,8 @@ Python programs.
 
 All processes are copies (forks) of one process, the starter, which has imported all modules and
 compiled the control code. A copy starts in a tenth of the time that a Python interpreter takes.
-The starter has no network connection, no threads of its own, and none of the user's code,
-because these cannot be copied safely.
+The starter has no network connection, no threads of its own and no code of the user, because
+these cannot be copied safely.
 
 Invariant:
     - The recorder always ends last, so that it receives the last messages of the sites.
@@ -98,8 +98,8 @@ class SessionProcess:
     Attributes:
         name: Name of the process: the name of its site, or "recorder".
         output: File with everything that the process prints.
-        pid: Process number. None before the process has started.
-        code: Exit code. None before the process has ended.
+        pid: Process number. `None` before the process has started.
+        code: Exit code. `None` before the process has ended.
     """
 
     def __init__(self, starter: "ProcessStarter", name: str, output: Path) -> None:
@@ -127,7 +127,7 @@ class SessionProcess:
 
         Returns:
             A sentence with the exit code or signal, and the last line that the process printed.
-            None if the process has not failed: it is running, it ended with code 0, or it was
+            `None` if the process has not failed: it is running, it ended with code 0, or it was
             ended by a signal of this process.
         """
         exit_code = self.code
@@ -154,8 +154,8 @@ class SessionProcess:
 def create_file(path: Path) -> BinaryIO:
     """Creates the file to which a process of a session writes its output.
 
-    The user finds the errors of the process there. The file is not buffered, so that nothing is
-    lost in a crash. An earlier file of that name is deleted.
+    The user finds the errors of the process in this file. The file is not buffered, so that
+    nothing is lost in a crash. An earlier file of that name is deleted.
 
     Args:
         path: Path of the file.
@@ -201,7 +201,7 @@ class ProcessStarter:
     def start(self, name: str, arguments: Sequence[str]) -> SessionProcess:
         """Requests the start of a command of `trilat` as a child process.
 
-        The starter is a process that has imported all modules already, so that its copies start
+        The starter is a process that has already imported all modules, so its copies start
         quickly.
 
         Args:
@@ -578,7 +578,8 @@ def _end_group(
 ) -> None:
     """Sends the processes of a session a signal to end, and waits until all have ended.
 
-    A process that does not end within `END_TIMEOUT_NS` is killed, so that none is left running.
+    A process that does not end within `END_TIMEOUT_NS` is killed, so that no process is left
+    running.
 
     Args:
         starter: Starter of the processes.
@@ -614,7 +615,7 @@ def _end_group(
 def run_starter(number: int, scenario_file: str) -> list[str] | None:
     """Runs the starter process, which creates the processes of a session as copies of itself.
 
-    A copy has all modules imported and all code compiled, so that it starts quickly. As with
+    A copy starts quickly, because all modules are imported and all code is compiled. As with
     `os.fork`, the function returns in every process: in each copy, which then runs its command,
     and finally in the starter, after the requesting process has disappeared.
 
@@ -667,7 +668,7 @@ class _StarterProcess:
 
         Returns:
             The command and its arguments, if the method returns in a copy, which must now
-            execute the command. None, if it returns in the starter, after the requesting
+            execute the command. `None`, if it returns in the starter, after the requesting
             process has disappeared and all copies have ended.
         """
         arguments: list[str]
@@ -799,7 +800,7 @@ def run(
     result = run_demo(loaded_scenario, folder, Console(quiet=quiet))
     problems = ["interrupted"] if result.interrupted else result.problems
     if problems:
-        log_note = f"; {result.log} holds what there was" if result.log.exists() else ""
+        log_note = f"; {result.log} holds the records so far" if result.log.exists() else ""
         raise RunFailed("; ".join(problems) + log_note)
 
     log = open_log(result.log)

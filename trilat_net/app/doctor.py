@@ -84,7 +84,7 @@ class DoctorFinding(NamedTuple):
 
     Attributes:
         check: Subject of the check, such as "keys" or "disk".
-        state: "ok", "warn" for a possible problem, or "fail" for a certain one.
+        state: "ok", "warn" for a possible problem, or "fail" for a certain problem.
         text: Sentence about the result and, if there is a problem, its remedy.
     """
 
@@ -108,9 +108,9 @@ def examine_machine(
 
     Args:
         connection: Endpoints at which this machine would listen, or to which it would connect.
-        keys: Folder of a member's keys. None if there is none.
+        keys: Folder of a member's keys. `None` if there are no keys.
         folder: Folder where results would be stored.
-        session: Name of a running session with whose members the clocks are compared. None if
+        session: Name of a running session with whose members the clocks are compared. `None` if
             the comparison is not made.
         clock: Clock of this process.
         insecure: True to permit connections without keys, because everybody on the network is
@@ -137,17 +137,17 @@ def examine_keys(folder: Path | None) -> Generator[DoctorFinding, None, MemberKe
     Keys encrypt the connections of a session, and prove which process has sent a message.
 
     Args:
-        folder: Folder of a member's keys. None if there is none.
+        folder: Folder of a member's keys. `None` if there are no keys.
 
     Returns:
-        The keys. None if there are no keys, or if they cannot be used.
+        The keys. `None` if there are no keys, or if they cannot be used.
 
     Yields:
         The findings about the keys.
     """
     if folder is None:
         yield DoctorFinding(
-            "keys", "ok", "none given: without --keys a member listens on this machine alone"
+            "keys", "ok", "no keys given: without --keys a member listens only on this machine"
         )
         return None
 
@@ -159,25 +159,29 @@ def examine_keys(folder: Path | None) -> Generator[DoctorFinding, None, MemberKe
 
     names = ", ".join(member_keys.members)
     description = (
-        f"{member_keys.member} of {names}, until {member_keys.ends:%Y-%m-%d %H:%M} UTC"
+        f"keys of {member_keys.member} for {names}, "
+        f"valid until {member_keys.ends:%Y-%m-%d %H:%M} UTC"
     )
     if member_keys.ends - datetime.now(UTC) < ENDS_SOON:
         yield DoctorFinding(
-            "keys", "warn", f"{description}: soon; renew them with trilat keys renew"
+            "keys",
+            "warn",
+            f"{description}: they expire soon; renew them with trilat keys renew",
         )
     else:
         yield DoctorFinding("keys", "ok", description)
 
     if read_foreign_permissions(folder):
         yield DoctorFinding(
-            "keys", "warn", f"others can look into {folder}: chmod 700 {folder}"
+            "keys", "warn", f"other users can read {folder}; run: chmod 700 {folder}"
         )
 
     # Anybody who has the key of the authority could create keys for further members.
     authority = folder.resolve().parent / "authority" / PRIVATE_KEY
     if authority.exists():
         description = (
-            f"{authority} lies here too: with it anybody makes keys; keep it elsewhere"
+            f"the authority's key {authority} should not be on this machine, because it "
+            "can create keys for anybody; keep it elsewhere"
         )
         yield DoctorFinding("keys", "warn", description)
     return member_keys
@@ -196,8 +200,8 @@ def examine_links(
 
     Args:
         connection: Endpoints to listen at and to connect to.
-        folder: Folder of a member's keys. None if there is none.
-        member_keys: The keys. None if there are no keys, or if they cannot be used.
+        folder: Folder of a member's keys. `None` if there are no keys.
+        member_keys: The keys. `None` if there are no keys, or if they cannot be used.
         insecure: True to permit connections without keys, because everybody on the network is
             trusted.
 
@@ -229,13 +233,15 @@ def examine_links(
 
     if not secured.listen and not secured.connect:
         yield DoctorFinding(
-            "links", "ok", "no endpoints given: --listen and --connect are tried if given"
+            "links",
+            "ok",
+            "no endpoints given; --listen and --connect are tried if they are given",
         )
 
 
 def _describe_untried(endpoint: str) -> DoctorFinding:
     """Returns the finding about an endpoint of a kind that this module cannot check."""
-    text = f"{endpoint} was not tried: not an address of TCP or QUIC"
+    text = f"{endpoint} was not tried, because it is not an address of TCP or QUIC"
     return DoctorFinding("links", "warn", text)
 
 
@@ -316,11 +322,14 @@ def _examine_quic(endpoint: str, member_keys: MemberKeys | None) -> DoctorFindin
 
     Args:
         endpoint: The endpoint.
-        member_keys: Keys of this member. None if there are no keys, or if they cannot be used.
+        member_keys: Keys of this member. `None` if there are no keys, or if they cannot be
+            used.
     """
     if member_keys is None:
         return DoctorFinding(
-            "links", "warn", f"{endpoint} was not tried: QUIC asks for the keys of a member"
+            "links",
+            "warn",
+            f"{endpoint} was not tried, because QUIC needs the keys of a member",
         )
 
     try:
@@ -358,7 +367,7 @@ def _split_address(endpoint: str) -> tuple[str, int] | None:
         endpoint: The endpoint, such as "tls/[::1]:7447".
 
     Returns:
-        The host and the port. None for other endpoints, such as socket files.
+        The host and the port. `None` for other endpoints, such as socket files.
     """
     # protocol / host or [IPv6 address] : port, with optional Zenoh settings after ? or #
     pattern = r"(?:tcp|tls|quic)/(\[[^\]]+\]|[^:/]+):(\d{1,5})(?:[?#].*)?"
@@ -451,7 +460,9 @@ def _examine_offsets(
         else:
             offset_s = member_row["offset_ns"] / 1e9
             bound_us = member_row["bound_us"]
-            text = f"{member} is {offset_s:+.6f} s, known to {bound_us:.0f} us"
+            text = (
+                f"the clock of {member} is {offset_s:+.6f} s ahead, known to {bound_us:.0f} us"
+            )
             state: FindingState = "ok" if bound_us <= MAX_BOUND_US else "warn"
             yield DoctorFinding("clock", state, text)
 
@@ -459,7 +470,8 @@ def _examine_offsets(
 def _run_in_process(code: str) -> Any:
     """Runs Python code in a new process, and returns the value that it prints.
 
-    Some checks change the settings of their process, and must therefore not run in this one.
+    Some checks change the settings of their process, and must therefore not run in this
+    process.
 
     Args:
         code: The code.
@@ -502,7 +514,7 @@ def examine_rights() -> Iterator[DoctorFinding]:
     try:
         obtained_settings: dict[str, str] = _run_in_process(_RIGHTS_CODE)
     except ChildProcessError as error:
-        text = f"could not be tried, the process that tries them failed ({error})"
+        text = f"the settings could not be tried: the process that tries them failed ({error})"
         yield DoctorFinding("rights", "warn", text)
         return
 
@@ -520,15 +532,16 @@ def examine_system() -> DoctorFinding:
     """Reports which parts of the program work on this operating system.
 
     Returns:
-        A single finding. It is "ok" on Linux. On other systems, it names what is missing.
+        A single finding. It is "ok" on Linux. On other systems, it names the missing parts.
     """
     name = {"Darwin": "macOS"}.get(platform.system(), platform.system())
     if name == "Linux":
         return DoctorFinding(
-            "system", "ok", "Linux: live sessions and studies are both promised"
+            "system", "ok", "on Linux, live sessions and studies are both supported"
         )
     text = (
-        f"live sessions are promised on Linux alone; on {name} simulation, logs and studies are"
+        f"live sessions are supported only on Linux; on {name}, only simulation, logs and "
+        "studies are supported"
     )
     return DoctorFinding("system", "warn", text)
 
@@ -589,13 +602,15 @@ def examine_rate() -> DoctorFinding:
     """
     if not is_core_cached():
         return DoctorFinding(
-            "rate", "warn", "not measured: the core is not yet compiled, see below"
+            "rate",
+            "warn",
+            "the rate was not measured, because the core is not compiled yet; see below",
         )
 
     try:
         results: list[tuple[int, int, int]] = _run_in_process(_RATES_CODE)
     except ChildProcessError as error:
-        text = f"could not be measured, the process that measures it failed ({error})"
+        text = f"the rate could not be measured: the process that measures it failed ({error})"
         return DoctorFinding("rate", "warn", text)
 
     # All rates before the last one were not achieved.
@@ -608,13 +623,16 @@ def examine_rate() -> DoctorFinding:
     )
 
     if not is_held(rate_hz, late_us):
-        text = f"a site alone holds not even {rate_hz} Hz: {text}; end other programs"
+        text = f"a single site does not even achieve {rate_hz} Hz: {text}; end other programs"
         return DoctorFinding("rate", "fail", text)
 
-    text = f"a site alone holds {rate_hz} Hz: {text} ({share_text} must within half a period)"
+    text = (
+        f"a single site achieves {rate_hz} Hz: {text} ({share_text} must begin within half a "
+        "period)"
+    )
     if missed_rates:
         missed_hz, missed_us, _ = missed_rates[-1]
-        text += f"; at {missed_hz} Hz within {missed_us / 1e3:.2f} ms: lower rate_hz"
+        text += f"; at {missed_hz} Hz, within {missed_us / 1e3:.2f} ms: lower rate_hz"
     return DoctorFinding("rate", "warn" if missed_rates else "ok", text)
 
 
@@ -721,7 +739,7 @@ def doctor(
         listen: Endpoints at which this machine would listen.
         connect: Endpoints to which this machine would connect.
         router: Endpoints of routers that this machine would connect to.
-        keys: Folder of a member's keys. None if there is none.
+        keys: Folder of a member's keys. `None` if there are no keys.
         session: Name of a running session with whose members the clocks are compared.
         folder: Folder where results would be stored.
         insecure: True to permit connections without keys, because everybody on the network is

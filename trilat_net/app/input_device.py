@@ -64,8 +64,8 @@ class Device(Protocol):
         The method is called `rate_hz` times a second.
 
         Raises:
-            OSError: The device is silent or gone. The caller then leaves the `with` block of
-                the device, and connects again.
+            OSError: The device does not respond, or was disconnected. The caller then leaves
+                the `with` block of the device, and connects again.
         """
 
     def render(self, force_n: Vector) -> None:

@@ -134,7 +134,7 @@ def _describe_hold(hand: HandInForce | None) -> str:
     The text stands in the column "held".
 
     Args:
-        hand: State of the operator in the record. None if nobody may move the arm during the
+        hand: State of the operator in the record. `None` if nobody may move the arm during the
             run.
 
     Returns:

@@ -7,8 +7,9 @@ that the scenario tolerates. The command is `trilat ping --benchmark`. The two p
 called the near end and the far end.
 
 Invariant:
-    - The benchmark measures what a session would experience. Its messages have the size, rate,
-      priority and network settings of samples, the states that the arms send to each other.
+    - The benchmark measures the network as a session would use it. Its messages have the size,
+      rate, priority and network settings of samples, the states that the arms send to each
+      other.
     - The benchmark disturbs no session, because it uses a session name of its own.
 """
 
@@ -116,7 +117,7 @@ def answer_benchmarks(bus: Bus, member: str) -> None:
 class NearEnd:
     """Sends messages to the far end, and measures when they come back.
 
-    The far end sends each message back at once, so that the near end measures round trip times
+    The far end sends each message back at once, so the near end can measure round trip times
     with its own clock.
 
     Args:
@@ -342,8 +343,8 @@ def _run_local_far_end(duration_s: float) -> Iterator[tuple[list[str], Path]]:
 class _ScenarioNeeds(NamedTuple):
     """Demands of a scenario on the network: message size, message rate and largest delay.
 
-    The demands follow from the rate of the control loops, and from the delays for which they
-    are stable.
+    The demands are computed from the rate of the control loops, and from the delays for which
+    they are stable.
 
     Attributes:
         sample_bytes: Size of a sample of the largest arm, in bytes.
@@ -356,7 +357,7 @@ class _ScenarioNeeds(NamedTuple):
         in_use_ms: Part of the age of the samples in use that the scenario's links cause. `None`
             if the linear theory does not cover the scenario.
         stable_ms: Intervals of the delay of all links for which the control loop is stable.
-            None if the linear theory does not cover the scenario.
+            `None` if the linear theory does not cover the scenario.
         words: Sentence for the user about these intervals, or the reason why the theory does
             not cover the scenario.
     """
@@ -398,7 +399,7 @@ def find_needs(scenario: Scenario) -> _ScenarioNeeds:
 
         loop = analyse_linear_loop(load_scenario(scenario, overrides))
     except (ScenarioError, RunFailed, UsageError) as error:
-        description = f"theory does not know its delay margin: {error}"
+        description = f"the linear theory does not cover its delay margin: {error}"
     else:
         description = loop.margin.description
         stable_ms = [
@@ -455,8 +456,8 @@ def judge_network(needs: _ScenarioNeeds, row: Mapping[str, Any]) -> dict[str, An
         row: Measurement at the scenario's own message size and rate.
 
     Returns:
-        The fields of a verdict, as `trilat ping --benchmark --json` prints them. Times are None
-        if no message came back.
+        The fields of a verdict, as `trilat ping --benchmark --json` prints them. Times are
+        `None` if no message came back.
     """
     fields = {
         "transport": row["transport"],
@@ -505,7 +506,7 @@ class NetworkBenchmark(Result):
         rows: Measurements, one row per message size, message rate and transport.
         judged: Verdict for each transport on whether it is good enough, see `judge_network`.
         connect: Endpoints of the far end on another machine. Empty if both ends ran on this
-            machine, so that no network was measured.
+            machine, and no network was measured.
     """
 
     scenario: str
@@ -543,7 +544,7 @@ class NetworkBenchmark(Result):
     def to_rows(self) -> list[dict[str, Any]]:
         """Returns one table row per message size, message rate and transport, with times in us.
 
-        The one-way times are in the columns "p50_us", "p99_us" and "max_us". They are None if
+        The one-way times are in the columns "p50_us", "p99_us" and "max_us". They are `None` if
         no message came back.
         """
         flat_rows = []
@@ -632,7 +633,7 @@ def _measure_endpoint(
 
     Args:
         endpoint: Endpoint of the far end.
-        keys: Keys of this end. None if the endpoint is not encrypted.
+        keys: Keys of this end. `None` if the endpoint is not encrypted.
         needs: Requirements of the scenario, which determine the sizes and rates.
         case_s: Duration of each measurement, in s.
 
@@ -677,7 +678,7 @@ def _summarise_trips(trips_s: Array) -> dict[str, float] | None:
         trips_s: Round trip times in s, NaN for lost messages.
 
     Returns:
-        The three values. None if all messages were lost.
+        The three values. `None` if all messages were lost.
     """
     arrived_s = trips_s[np.isfinite(trips_s)]
     one_way_us = arrived_s / 2 * 1e6

@@ -150,7 +150,7 @@ class RunningSession:
 
     Args:
         name: Name of the session.
-        connection: Endpoints of the session and keys of the member whose name is used.
+        connection: Endpoints of the session and keys of a member.
         bus: An open network connection to the session. If `None`, each call opens a connection.
         clock: Clock of this process. If `None`, a clock is created.
     """
@@ -634,8 +634,8 @@ class RunningSession:
             def receive() -> list[State]:
                 """Returns the records of all arms that have arrived since the last call.
 
-                A record contains what was measured and computed in one period of a control
-                loop. The list is empty if none has arrived.
+                A record contains the measurements and results of one period of a control loop.
+                The list is empty if no record has arrived.
                 """
                 return [record for inbox in inboxes for record in read_records(inbox)]
 
@@ -648,7 +648,7 @@ class RunningSession:
         A record is the result of one tick, a period of a site's control loop. With `as_site`,
         the records are those that the user of that site sees. They are the newest record of the
         site itself and, for each peer, the record of the sample that the site uses at present.
-        That sample is older than the newest one, because the link delays it, or because the
+        That sample is older than the newest sample, because the link delays it, or because the
         scenario delays the picture (`[sites.NAME.view]`). A peer is missing if this record was
         published before the subscription, or more than `STATES_KEPT` ticks ago.
 
@@ -948,7 +948,7 @@ def open_hand(
         scenario: Scenario of the session.
         source: Name of the program or person, which events of the session mention.
         repeats: True if a thread repeats the last message regularly, so that the site knows
-            that the program is still there, see `Hand`.
+            that the program is still running, see `Hand`.
 
     Raises:
         UsageError: The scenario does not permit a live operator at that arm.
@@ -986,7 +986,7 @@ def _read_replies(replies: Sequence[ChangeReply]) -> list[str]:
         The text of each reply.
 
     Raises:
-        RunFailed: A site has refused. The message lists the refusals first.
+        RunFailed: A site has refused the request. The message lists the refusals first.
     """
     accepted = [reply.text for reply in replies if reply.accepted]
     refused = [reply.text for reply in replies if not reply.accepted]

@@ -258,7 +258,7 @@ def ping_session(
         stopped: Function that returns True to end the measurement.
 
     Returns:
-        The results. None if `stopped` returned True.
+        The results. `None` if `stopped` returned True.
 
     Raises:
         RunFailed: No member replied.

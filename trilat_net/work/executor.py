@@ -77,7 +77,7 @@ class _BatchResult(NamedTuple):
     Attributes:
         results: Results of the items, up to the first error.
         wall_s: Duration of these items, in s.
-        error: First error. None if all items have a result.
+        error: First error. `None` if all items have a result.
     """
 
     results: list[Any]
@@ -100,8 +100,8 @@ def run_batch(
     Args:
         function: Function of one item that returns its result.
         items: The items, each of which is the argument of one call.
-        required: Requirements on the worker, such as the version of the program. None if there
-            are no requirements.
+        required: Requirements on the worker, such as the version of the program. `None` if
+            there are no requirements.
         allowed: Imported control laws that the user allowed to run.
         together: Function that replaces `function` if the batch has several items.
 
@@ -154,7 +154,7 @@ class _Feed(Generic[T]):
 
     Args:
         items: The items, each of which is the argument of one call.
-        count: Number of items. None if it is not known.
+        count: Number of items. `None` if it is not known.
         workers: Number of workers that take items from the queue.
         batch_s: Intended duration of a batch, in s.
         least: Smallest number of items in a batch, even if the batch then takes longer than
@@ -268,10 +268,10 @@ class WorkerPool:
     each result at once.
 
     Args:
-        executor: Executor that runs the batches. None if the items run in this process.
+        executor: Executor that runs the batches. `None` if the items run in this process.
         workers: Number of items that run at the same time.
-        restart: Function that returns a new executor after a dying worker broke the old one.
-            None if the executor cannot be replaced.
+        restart: Function that returns a new executor after a dying worker broke the old
+            executor. `None` if the executor cannot be replaced.
         cluster: Cluster to which the executor belongs, if any.
         required: Requirements on each worker of the cluster.
         hint: Advice for the user that follows the message about a dead worker.
@@ -308,14 +308,13 @@ class WorkerPool:
     ) -> Iterator[tuple[int, R]]:
         """Runs a function on each item with all workers, and yields each result as it arrives.
 
-        An item is an independent piece of work, such as one simulated run. The order of the
-        results may differ from that of the items, so that a study can store each result at
-        once.
+        An item is an independent piece of work, such as one simulated run. The results may come
+        in a different order from the items. A study can therefore store each result at once.
 
         Args:
             function: Function at module level, so that another process can import it.
             items: The items. Error messages name an item by its `str`.
-            lost: Function that returns the result of an item that killed its workers. None if
+            lost: Function that returns the result of an item that killed its workers. `None` if
                 such an item is an error.
             count: Number of items, if it is known.
             together: Function that replaces `function` for several items at once.
@@ -453,7 +452,7 @@ class WorkerPool:
                 `iterate_results`.
 
         Raises:
-            RunFailed: An item killed its workers, and `lost` is None.
+            RunFailed: An item killed its workers, and `lost` is `None`.
         """
         try:
             result = future.result()
@@ -485,7 +484,7 @@ class WorkerPool:
             yield number, lost(item)
 
     def _replace_executor(self, broken: Executor) -> None:
-        """Starts a new pool of worker processes in place of a broken one.
+        """Starts a new pool of worker processes in place of a broken pool.
 
         Several batches of the broken pool fail one after another. Only the first failure starts
         a new pool.
@@ -559,13 +558,13 @@ def open_worker_pool(
 
 
 def check_workers(jobs: int | None, on: Workers) -> None:
-    """Refuses the options --jobs and --on together, since --jobs has no effect on a cluster.
+    """Rejects the options --jobs and --on together, because --jobs has no effect on a cluster.
 
     The option --jobs sets the number of processes on this machine, and --on selects a cluster.
 
     Args:
-        jobs: Value of --jobs. None if it was not given.
-        on: Value of --on. None if it was not given.
+        jobs: Value of --jobs. `None` if it was not given.
+        on: Value of --on. `None` if it was not given.
 
     Raises:
         UsageError: Both options are given.

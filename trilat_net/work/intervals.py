@@ -44,8 +44,8 @@ def wilson_interval(successes: int, runs: int) -> tuple[float, float]:
 class MeanInterval(NamedTuple):
     """Mean of a quantity over several runs, with its 95 % confidence interval.
 
-    The interval follows from Student's t distribution. It shows how much the mean may change
-    with other random seeds.
+    The interval is computed from Student's t distribution. It shows how much the mean may
+    change with other random seeds.
 
     Attributes:
         mean: The mean.

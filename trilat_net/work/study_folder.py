@@ -67,7 +67,7 @@ def encode_csv(
 ) -> str:
     """Converts a table to CSV text.
 
-    None becomes an empty field.
+    `None` becomes an empty field.
 
     Args:
         rows: The rows, as values by column.

@@ -235,8 +235,8 @@ class DeviceHand:
         """Measures the round trip time from a position of the device to the rendered force.
 
         Each target was sent with a number. The newest record of the site states the number of
-        the target that the arm follows. The round trips of this target and of all earlier ones
-        end with the force that was just rendered.
+        the target that the arm follows. The round trips of this target and of all earlier
+        targets end with the force that was just rendered.
         """
         used_number = self._hand.number
         now_ns = self._clock.monotonic_ns()
@@ -261,13 +261,13 @@ class DeviceHand:
         """
         states = count_nouns(self.states, "state")
         jumps = count_nouns(self.jumps, "jump")
-        counts = f"{states} of the device, dropped {jumps}, {self.unreadable} unreadable"
+        counts = f"{states} of the device; dropped: {jumps}, {self.unreadable} unreadable"
         if not self.trips_ns:
             return counts
 
         median_ms, p99_ms = np.percentile(self.trips_ns, [50, 99]) / 1e6
         return (
-            f"{counts}; from its place to the force of it "
+            f"{counts}; round trip from device position to rendered force: "
             f"p50 {median_ms:.1f} ms, p99 {p99_ms:.1f} ms"
         )
 
@@ -289,13 +289,13 @@ class DeviceHand:
                         self.serve()
                         if not is_present:
                             button = repr(self._settings.clutch)
-                            say(f"the device is there: its button {button} takes hold")
+                            say(f"the device is connected; its button {button} holds the arm")
                         is_present = True
 
             except OSError as problem:
                 self.release()
                 if is_present is not False:
-                    say(f"{problem}; the arm is let go, and the device is tried again")
+                    say(f"{problem}; the arm is released, and the device is tried again")
                 is_present = False
                 self._clock.sleep_until(self._clock.monotonic_ns() + RETRY_NS)
 

@@ -44,7 +44,7 @@ def experiment_new_command(
     people = f"trilat experiment run {file} --live"
     models = f"trilat experiment run {file}"
     terminal.print_text(
-        f"{file}: a protocol; with people: {people}; with models of people: {models}"
+        f"{file} is a protocol; run it with people: {people}; with models of people: {models}"
     )
 
 

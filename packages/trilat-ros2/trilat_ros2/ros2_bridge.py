@@ -16,8 +16,8 @@ Invariant:
       The arm would otherwise move back and forth between two targets.
     - If no target arrives for 200 ms, the arm is released, because the program may have died.
     - A robot for which no valid torque is available receives its safe command repeatedly.
-    - A message that cannot be used does not end the bridge. It is refused, and counted by the
-      reason. The first refusal for each reason is printed.
+    - A message that cannot be used does not end the bridge. The message is refused, and counted
+      by reason. The first refusal for each reason is printed.
 """
 
 import math
@@ -799,7 +799,7 @@ class _Bridge:
         return False
 
     def _have_sites_left(self) -> bool:
-        """Returns True if sites were present and all have left, so that the bridge may end."""
+        """Returns True if sites were present and all have left. The bridge may then end."""
         return self._has_seen_site and not self._present
 
     def _publish_messages(self, rate_hz: float) -> bool:
@@ -1116,7 +1116,7 @@ def publish_session(
         say("; ".join([session_text, *input_clauses]))
         if rviz is not None:
             write_session_config(ends, scenario, rviz)
-            say(f"{rviz}: shows the arms: rviz2 -d {rviz}")
+            say(f"{rviz} shows the arms; open it with: rviz2 -d {rviz}")
         return bridge.run(rate_hz, stopped, say)
 
 

@@ -100,7 +100,7 @@ _EDGE_TOLERANCE = 1e-4
 _FITTING_STEP = 0.9
 """Smallest factor by which m is multiplied in one step."""
 _NO_ROOT_PER_S = -1e3
-"""Real part that stands for a loop without roots, in 1/s."""
+"""Real part that represents a loop without roots, in 1/s."""
 _DELAY = re.compile(r"(\d+\.?\d*|\.\d+) ?(us|ms|s|)")
 """A number with an optional unit, as in "40ms"."""
 _UNIT_MS = {"us": 1e-3, "ms": 1.0, "": 1.0, "s": 1e3}
@@ -380,7 +380,7 @@ def _build_loop(
 def _draw_poses(scenario: Scenario, count: int, seed: int) -> Array:
     """Draws random poses within the limits of the joints.
 
-    A joint without limits, or with wide ones, stays within half a turn or half a metre of the
+    A joint without limits, or with wide limits, stays within half a turn or half a metre of the
     position that is closest to 0.
 
     Args:

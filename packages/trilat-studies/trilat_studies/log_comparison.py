@@ -75,7 +75,7 @@ class _ComparisonRow(NamedTuple):
 
     @property
     def values(self) -> tuple[float | None, ...]:
-        """Value of one quantity in each of the compared logs. None if a log lacks it."""
+        """Value of one quantity in each of the compared logs. `None` if a log lacks it."""
         return tuple(entry.value for entry in self.entries)
 
 
@@ -477,7 +477,7 @@ def _average_repeats(
         metrics: Their metrics.
 
     Returns:
-        The mean of each row, or None if it cannot be computed. The list is empty if the logs
+        The mean of each row, or `None` if it cannot be computed. The list is empty if the logs
         differ in more than their seeds.
     """
     first = logs[0].scenario

@@ -199,7 +199,7 @@ def run_in_batches(
         receivers: For each site, the function that receives its batches.
 
     Returns:
-        The time at which the first site left the limits of its arm, in s, or None if no site
+        The time at which the first site left the limits of its arm, in s, or `None` if no site
         did; and the number of samples that arrived too late to be used as planned.
     """
     pending: dict[str, list[TickRecord]] = {name: [] for name in receivers}
@@ -779,8 +779,8 @@ class LinkAge(msgspec.Struct, frozen=True):
     that tick. Ticks before the first sample do not count.
 
     Attributes:
-        mean_ms: Mean age, in ms. None if the link never delivered a sample.
-        max_ms: Largest age, in ms. None if the link never delivered a sample.
+        mean_ms: Mean age, in ms. `None` if the link never delivered a sample.
+        max_ms: Largest age, in ms. `None` if the link never delivered a sample.
     """
 
     mean_ms: float | None
@@ -837,7 +837,7 @@ def _compute_run_metrics(
     Args:
         scenario: Scenario to run: arms, control laws, links and duration.
         site_stats: Statistics of each site, in the order of the scenario.
-        diverged_at_s: Time at which the first site left the limits of its arm, in s. None if
+        diverged_at_s: Time at which the first site left the limits of its arm, in s. `None` if
             no site did.
         late_samples: Number of samples (states that a site sent) that arrived too late.
         missing: Number of ticks without a record.
@@ -883,7 +883,7 @@ def _compute_run_metrics(
             name: Name of the statistic, an attribute of `SiteStats`.
 
         Returns:
-            The largest value. None if no site has recorded anything.
+            The largest value. `None` if no site has recorded anything.
         """
         values = [getattr(stats, name) for stats in with_records.values()]
         return max(values, default=None)
@@ -946,7 +946,7 @@ def _find_synchronisation_s(site_stats: Sequence[SiteStats]) -> float | None:
         site_stats: Statistics of all sites, each of which has records.
 
     Returns:
-        The time. None if a site is not synchronised in its last record.
+        The time. `None` if a site is not synchronised in its last record.
     """
     if any(stats.unsynchronised_ns == stats.last_ns for stats in site_stats):
         return None
@@ -961,8 +961,8 @@ def _merge_windows(windows: Sequence[WindowStats | None]) -> dict[str, Range]:
     quantities that can be compared between sites are kept, each with its largest value.
 
     Args:
-        windows: Statistics of each site within the window. None for a site to which the window
-            does not apply.
+        windows: Statistics of each site within the window. `None` for a site to which the
+            window does not apply.
 
     Returns:
         Ranges by the keys of a window of [expect].
@@ -994,8 +994,8 @@ def _compute_end_spread_rad(ends: Sequence[RecordBatch]) -> float | None:
         ends: Records of the last second, one batch per site.
 
     Returns:
-        The difference in rad. None if a site has no records in the last second, or if the arms
-        have different numbers of joints.
+        The difference in rad. `None` if a site has no records in the last second, or if the
+        arms have different numbers of joints.
     """
     if not all(len(end.t_ns) for end in ends):
         return None
@@ -1026,8 +1026,8 @@ NEEDS_LOG = "metrics that need a log"
 def measure_virtual_run(scenario: Scenario) -> RunMetrics:
     """Runs a scenario in virtual time and returns the metrics of the run.
 
-    The records are discarded as soon as their statistics are known, so that long runs need
-    little memory. All records are kept only if the scenario limits a metric of
+    The records are discarded as soon as their statistics are known, so long runs need little
+    memory. All records are kept only if the scenario limits a metric of
     `docs/reference/metrics.md`, because these metrics are computed from a complete log.
 
     Args:
@@ -1121,7 +1121,7 @@ class _MeasuredRun:
         scenario: Scenario to run.
 
     Attributes:
-        compiled: The run in the compiled loop. None if the loop cannot simulate it.
+        compiled: The run in the compiled loop. `None` if the loop cannot simulate it.
         obstacle: Reason why the compiled loop cannot simulate the run. Otherwise empty.
     """
 
@@ -1246,8 +1246,8 @@ class ExpectationResult(msgspec.Struct, frozen=True):
         limit: Limit as a string with its unit.
         margin: Distance of the measured value from the limit as a fraction of the limit,
             negative beyond the limit. `None` if the expectation is not about a number.
-        value: Measured number in the unit of the limit. None if the expectation is not about a
-            number.
+        value: Measured number in the unit of the limit. `None` if the expectation is not about
+            a number.
     """
 
     key: str
@@ -1322,12 +1322,12 @@ _LIMITS = tuple(key for key in field_names(Expect) if re.search("_(max|min|by)(_
 def _read_metric(key: str, metrics: RunMetrics) -> float | None:
     """Returns the metric that a key of [expect] limits.
 
-    The name of the metric follows from the key: "peak_error_max_rad" limits `peak_error_rad`,
-    and "synchronised_by_s" limits `synchronised_at_s`. Keys in ms limit the ages of samples
+    The key contains the name of the metric: "peak_error_max_rad" limits `peak_error_rad`, and
+    "synchronised_by_s" limits `synchronised_at_s`. Keys in ms limit the ages of samples
     (received states), and the worst link counts.
 
     Returns:
-        The metric. None if the run does not have it, or if a link never delivered a sample.
+        The metric. `None` if the run does not have it, or if a link never delivered a sample.
     """
     is_age = key.endswith("_ms")
     if not is_age:
@@ -1353,7 +1353,7 @@ def _compare_with_limit(key: str, measured: float | None, limit: float) -> Expec
 
     Args:
         key: Key of [expect]. It contains "_min_" for a smallest value, and ends in the unit.
-        measured: The metric. None if the run does not have it, which fails the expectation.
+        measured: The metric. `None` if the run does not have it, which fails the expectation.
         limit: The limit, in the same unit.
     """
     is_minimum = "_min_" in key
@@ -1458,8 +1458,8 @@ def _compare_with_range(
 
     Args:
         name: Name of the expectation.
-        measured: Smallest and largest value of the quantity. None if the run does not have it,
-            which fails the expectation.
+        measured: Smallest and largest value of the quantity. `None` if the run does not have
+            it, which fails the expectation.
         limits: Lower and upper limit.
         unit: Unit of the quantity.
         missing_text: Text in place of a missing value.

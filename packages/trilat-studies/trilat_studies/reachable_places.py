@@ -37,7 +37,7 @@ def can_reach(arm: ArmModel, start_rad: Sequence[float] | Array, position_m: Arr
     """Returns True if a pose was found in which the end effector of an arm is at a position.
 
     For an arm with two links, the lengths of the links decide. For a chain of more joints, the
-    function searches for a pose within the joint limits, and may miss one.
+    function searches for a pose within the joint limits, and may not find an existing pose.
 
     Args:
         arm: Model of the arm.

@@ -88,7 +88,7 @@ def test_command(
         )
     check_workers(jobs, on)
     if junit is not None and (junit.is_dir() or not os.access(junit.parent, os.W_OK)):
-        raise UsageError(f"{junit}: cannot be written")
+        raise UsageError(f"{junit} cannot be written")
     trials = _list_trials(scenarios or [], parse_seeds(seeds), overrides or [], live=live)
     began_unix_ns = SystemClock().unix_ns()
     with terminal.lines_aside(as_json):
@@ -104,7 +104,7 @@ def parse_seeds(text: str | None) -> list[int]:
     """Parses a list of random seeds, written as 1..20 or 1,5,9 or 1..3,8.
 
     Args:
-        text: The text. None if the user gave no seeds.
+        text: The text. `None` if the user gave no seeds.
 
     Returns:
         The seeds. Empty if there is no text.
@@ -363,7 +363,7 @@ def compare_command(
 )
 def tune_command(
     arm: Annotated[
-        Path, value("--arm", "URDF", "URDF file of the arm, or name of a shipped one.")
+        Path, value("--arm", "URDF", "URDF file of the arm, or name of a shipped URDF.")
     ],
     delay: Annotated[str, value("--delay", "40ms|measured:SESSION|CSV")],
     law: Annotated[

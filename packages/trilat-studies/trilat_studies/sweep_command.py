@@ -363,7 +363,7 @@ def sweep_command(
     used_options = options.list_used_options(context)
     if confirm is not None:
         raise UsageError(
-            "there is no --confirm any more: trilat sweep FOLDER --cell N prints the command "
+            "--confirm no longer exists: trilat sweep FOLDER --cell N prints the command "
             "of a cell, which runs live with trilat live in place of trilat sim"
         )
     _check_modes(used_options)
@@ -490,7 +490,7 @@ def parse_seed_count(text: str | None) -> int | list[int]:
     are lists of seeds.
 
     Args:
-        text: The text. None if the user did not use the option.
+        text: The text. `None` if the user did not use the option.
 
     Returns:
         The number of seeds, or the list of the seeds. 1 if there is no text.

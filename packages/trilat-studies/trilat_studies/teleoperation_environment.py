@@ -550,8 +550,8 @@ class TeleoperationEnv(gymnasium.Env[dict[str, Array], Array]):
         """Describes the present state of the episode, for the task and for observations.
 
         The joint angles, end effectors and bodies are the true state of the simulation. The
-        view is what the user's operator, the policy, sees: it contains the states of other
-        sites with their delay.
+        view belongs to the user's operator, the policy: it contains the states of other sites
+        with their delay.
 
         Returns:
             The state. The limit `draws` of attempts to draw a position depends on the arm of
@@ -630,7 +630,7 @@ class TeleoperationEnv(gymnasium.Env[dict[str, Array], Array]):
         return numbers.astype(np.float32)
 
     def _observe(self, scene: Scene) -> dict[str, Array]:
-        """Collects what an agent can observe of a state, as arrays by name.
+        """Collects an agent's observation of a state, as arrays by name.
 
         Parts that begin with "peer_", and `alpha` and `age_s`, have one row per peer (other
         arm).
@@ -888,7 +888,7 @@ class TeleoperationEnv(gymnasium.Env[dict[str, Array], Array]):
         """Draws a picture of the arms and the goal in their present state.
 
         Returns:
-            A picture of shape (height, width, 3). None if the environment has no render mode.
+            A picture of shape (height, width, 3). `None` if the environment has no render mode.
 
         Raises:
             EpisodeError: No episode has begun.

@@ -91,7 +91,7 @@ class TrialResult(NamedTuple):
 
     @property
     def failures(self) -> list[str]:
-        """Sentences about what went wrong. Empty if the run met all expectations.
+        """Sentences about the failures of the run. Empty if the run met all expectations.
 
         A sentence states an unmet expectation, or why the run has no result.
         """
@@ -849,7 +849,7 @@ def _build_count_attributes(results: Sequence[TrialResult]) -> dict[str, str]:
 
 
 def _add_case(suite: Xml.Element, result: TrialResult) -> None:
-    """Adds a run to its JUnit suite as a test case, with the problem of the run if it has one.
+    """Adds a run to its JUnit suite as a test case, with the run's problem if there is one.
 
     A run without a result is an error. Unmet expectations together are one failure, whose text
     has the commands that repeat the run.

@@ -71,7 +71,7 @@ class TeleoperationVectorEnv(SyncVectorEnv[Any, Any]):
         autoreset_mode: str = "NextStep",
     ) -> None:
         if isinstance(num_envs, bool) or not isinstance(num_envs, int) or num_envs < 1:
-            raise UsageError(f"num_envs must be a whole number from 1 on, not {num_envs!r}")
+            raise UsageError(f"num_envs must be a whole number of at least 1, not {num_envs!r}")
         modes = [mode.value for mode in AutoresetMode]
         if autoreset_mode not in modes:
             names = ", ".join(map(repr, modes))
@@ -604,7 +604,7 @@ class _LaneEnvs:
         return position_m
 
     def _describe(self, state: "_State", succeeded: Flags) -> dict[str, Any]:
-        """Returns the information of a step for all lanes, as `TeleoperationEnv` does for one.
+        """Returns the information of a step for all lanes, as in `TeleoperationEnv`.
 
         A teacher is a user other than the policy. If the site of the task follows a teacher
         more than the policy, the teacher intervenes.

@@ -111,7 +111,7 @@ class _Group(TyperGroup):
         word of another program or a typing error, the nearest command is suggested.
 
         Raises:
-            UsageError: There is no such command. The error suggests one.
+            UsageError: There is no such command. The error suggests a similar command.
         """
         name = args[0] if args else ""
         is_known = name.startswith("-") or self.get_command(ctx, name) is not None
@@ -174,7 +174,7 @@ class _Commands(_Group):
     def invoke(self, ctx: Any) -> Any:
         """Runs a command, and turns Ctrl-C into a line "interrupted" and an exit code.
 
-        The exit code is that of the signal, or 130, so that shell scripts stop as well.
+        The exit code is that of the signal, or 130, so that shell scripts also stop.
         """
         with Interrupt() as interrupt:
             try:
@@ -260,8 +260,8 @@ class _PackageCommand(TyperCommand):
         )
         if not hasattr(command_function, "examples"):
             raise UsageError(
-                f"trilat {self._command_line} is no command: its function lacks the decorator "
-                "trilat_net.extension.command"
+                f"trilat {self._command_line} is not a command: its function lacks the "
+                "decorator trilat_net.extension.command"
             )
 
         # Typer builds a command only as part of a group, so a temporary group is made for it.
@@ -452,8 +452,8 @@ def _add_commands() -> None:
 _add_commands()
 
 _TOO_LITTLE_MEMORY = (
-    "there is too little memory: 3 GiB of addresses suffice (ulimit -v), "
-    "and 1 GiB of memory itself"
+    "there is too little memory: the program needs up to 3 GiB of address space (ulimit -v) "
+    "and 1 GiB of memory"
 )
 _MEMORY_ERRORS = (
     "failed to map segment",

@@ -204,7 +204,7 @@ def record_command(
     # Problems of the output are reported now, before the recorder waits for the session.
     storage.find_first_part()
     if not os.access(path.parent, os.W_OK):
-        raise UsageError(f"{path}: cannot be written: {path.parent} is not a writable folder")
+        raise UsageError(f"{path} cannot be written: {path.parent} is not a writable folder")
 
     page = path.parent / "report.html"
     if concluded:
@@ -290,12 +290,12 @@ def _conclude(files: list[Path], *, png: bool) -> None:
 
     if conclusion.exit_code == CodeWithheld.exit_code:
         raise CodeWithheld(
-            f"{files[0]}: parts of this log were not checked, because code that the log names "
-            "may not run; check them with: trilat verify --law FILE"
+            f"{files[0]}: parts of this log were not checked, because you have not permitted "
+            "the code that the log names; check them with: trilat verify --law FILE"
         )
 
     if not conclusion.passed:
-        raise RunFailed(f"{files[0]}: failed a check")
+        raise RunFailed(f"the log {files[0]} failed a check")
 
     for event in log.events:
         if event.kind in ("diverged", "failed"):
@@ -448,9 +448,9 @@ def _announce_playback(
     print_line(f"playing {sites} as session {name}, {speed_text}; Ctrl-C ends it")
     if header.version != VERSION:
         print_line(
-            f"note: these messages are of schema version {header.version}: recorders and sites "
-            f"of today accept {VERSION} and count others as dropped; any other Zenoh "
-            "subscriber receives them"
+            f"note: these messages are of schema version {header.version}: present recorders "
+            f"and sites accept only {VERSION} and drop others; any other Zenoh subscriber "
+            "receives them"
         )
 
 
@@ -612,8 +612,8 @@ def _warn_about_playback(outcome: "PlaybackSummary", reported: set[Path]) -> Non
         )
     if outcome.strays:
         terminal.print_error(
-            f"{count_nouns(outcome.strays, 'message lies', 'messages lie')} more than a "
-            "minute from their position in the file, and were "
+            f"{count_nouns(outcome.strays, 'message is', 'messages are')} stored more than a "
+            "minute away from their chronological position in the file, and were "
             "played late; with a larger --preload they are played in order"
         )
 
@@ -709,11 +709,11 @@ def parse_split(option: str, unit: str, number: float | None, scale: int) -> int
     Args:
         option: Name of the option, for the error message.
         unit: Name of the option's unit, for the error message.
-        number: Value of the option. None if the option is absent.
+        number: Value of the option. `None` if the option is absent.
         scale: Bytes or ns per unit.
 
     Returns:
-        The limit in bytes or ns. None if the option is absent.
+        The limit in bytes or ns. `None` if the option is absent.
 
     Raises:
         UsageError: The number is not from 1 to 1e6.

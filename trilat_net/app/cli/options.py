@@ -52,7 +52,7 @@ def check_range(
 
         Args:
             param: Declaration of the option, which contains its name.
-            value: The number. None if the option was not given.
+            value: The number. `None` if the option was not given.
 
         Raises:
             UsageError: The number is less than `low` or greater than `high`.
@@ -284,7 +284,7 @@ InsecureOption = Annotated[
 
 
 _BRACKETS = {"{": "}", "[": "]"}
-"""Closing brackets of tables and lists, by the opening ones."""
+"""Closing brackets of tables and lists, by the opening brackets."""
 
 
 def find_split_setting(args: Sequence[str]) -> str:
@@ -445,12 +445,12 @@ AllOption = Annotated[
 
 
 def check_picture(path: Path | None, *, force: bool) -> None:
-    """Refuses the path of a figure that cannot be written, before the figure is computed.
+    """Rejects the path of a figure that cannot be written, before the figure is computed.
 
     The computation may take long, and would be lost.
 
     Args:
-        path: Path of the figure. None if no figure was requested.
+        path: Path of the figure. `None` if no figure was requested.
         force: True to replace an existing file.
 
     Raises:
@@ -526,10 +526,10 @@ def _refuse_double_setting(
     For example, --duration 5 and --set duration_s=10 contradict each other.
 
     Args:
-        overrides: Texts of --set. None if the option is absent.
+        overrides: Texts of --set. `None` if the option is absent.
         key: Key of the scenario.
         option: Another option that sets this key.
-        given: Value of that option. None if the option is absent.
+        given: Value of that option. `None` if the option is absent.
 
     Raises:
         UsageError: The key is set by --set and by the other option.
@@ -554,8 +554,8 @@ def list_overrides(overrides: list[str] | None, duration: float | None) -> list[
     With these options a user can change an experiment for one run without editing its file.
 
     Args:
-        overrides: Texts of --set, such as "links.delay_ms=5". None if the option is absent.
-        duration: Value of --duration, in s. It becomes "duration_s=10.0". None if absent.
+        overrides: Texts of --set, such as "links.delay_ms=5". `None` if the option is absent.
+        duration: Value of --duration, in s. It becomes "duration_s=10.0". `None` if absent.
 
     Raises:
         UsageError: Both options set the duration.
@@ -615,8 +615,8 @@ class MemberOptions(NamedTuple):
         "tcp/192.168.0.5:7447".
 
         Args:
-            listen_else: Addresses at which to listen if the options state none.
-            connect_else: Addresses to which to connect if the options state none.
+            listen_else: Addresses at which to listen if the options state no address.
+            connect_else: Addresses to which to connect if the options state no address.
         """
         from ...net import Connection, read_zenoh_file
 
@@ -642,8 +642,8 @@ class MemberOptions(NamedTuple):
         A note for the user is printed if the keys expire soon.
 
         Args:
-            listen_else: Endpoints at which to listen if the options name none.
-            connect_else: Endpoints to which to connect if the options name none.
+            listen_else: Endpoints at which to listen if the options name no endpoint.
+            connect_else: Endpoints to which to connect if the options name no endpoint.
             stops: True if the connection only serves to stop arms. Expired keys are then
                 accepted, and no note is printed.
         """
@@ -679,7 +679,7 @@ class Reach(NamedTuple):
         If the session is encrypted, the option --keys names the keys of the command.
 
         Args:
-            operates: True if only the keys of the operator permit what the command does. Other
+            operates: True if only the keys of the operator permit the command's requests. Other
                 keys are then rejected.
             stops: True if the command only stops arms. Then expired keys are accepted too.
         """
@@ -740,8 +740,8 @@ class LawFiles(NamedTuple):
 class RunOptions(NamedTuple):
     """Options of a command that runs a session on this machine and reports on it.
 
-    The options override parts of the scenario (`load`), name the folder of the results, and say
-    what is written and printed.
+    The options override parts of the scenario (`load`), name the folder of the results, and
+    select the files and lines to write.
     """
 
     duration: DurationOption = None

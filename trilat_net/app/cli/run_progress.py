@@ -88,7 +88,8 @@ def show_progress(
 def run_in_own_folder(scenario: "Scenario", label: str, folder_name: str) -> "SessionResult":
     """Runs a scenario live, and stores its results in a new folder.
 
-    Commands that run several scenarios use it, so that results do not replace each other.
+    Commands that run several scenarios use this function, so that results do not replace each
+    other.
 
     Args:
         scenario: The scenario.

@@ -610,10 +610,10 @@ def _parse_pose(text: str | None) -> tuple[float, ...] | None:
     """Parses the joint angles that a user gave on the command line, such as "0.1,0.3".
 
     Args:
-        text: The text. None if the user gave no pose.
+        text: The text. `None` if the user gave no pose.
 
     Returns:
-        The angles in rad. None if there is no text.
+        The angles in rad. `None` if there is no text.
 
     Raises:
         UsageError: A part of the text is not a number.

@@ -41,7 +41,7 @@ def demo_command(
 class _SessionPage(Protocol):
     """A page in a browser that shows a session, and offers its results afterwards.
 
-    The package trilat-people provides one. The commands use only these two methods, so that
+    The package trilat-people provides such a page. The commands use only these two methods, so
     they also work without this package.
     """
 
@@ -476,7 +476,7 @@ def reset_command(
     *,
     reach: options.Reach,
 ) -> None:
-    """Clears the faults of sites, if the causes of the faults are gone.
+    """Clears the faults of sites if the causes of the faults have been removed.
 
     The sites then wait for the other sites. Each arm aligns with the other arms before it
     follows them.

@@ -184,7 +184,7 @@ class MessageBatch:
     def pieces(self, size: int = PIECE_BYTES) -> Iterator["MessageBatch"]:
         """Divides the messages into pieces of limited size, without copying their payloads.
 
-        A piece is sent at once, so that its size limits the memory.
+        A piece is sent at once, so its size limits the memory.
 
         Args:
             size: Approximate size of a piece, in bytes. A piece with one message may be larger.
@@ -271,7 +271,7 @@ class BatchBuilder:
 
         Returns:
             The sorted messages. The time of each message is its deadline: the time at which it
-            is due, so that no message is later than the next one of its channel.
+            is due, so that no message is later than the next message of its channel.
         """
         rows = np.array(self._rows, dtype=np.int64).reshape(-1, _COLUMNS)
         repeats = self._find_repeats(rows)

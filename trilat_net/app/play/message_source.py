@@ -87,7 +87,7 @@ class MessageSource:
     Args:
         header: Description of the files. The topics and damages that are found during reading
             are added to it.
-        batch: All messages of the log. None if they are too many for the memory. In this case
+        batch: All messages of the log. `None` if they are too many for the memory. In this case
             `start_reader` must be called.
 
     Attributes:
@@ -147,7 +147,8 @@ class MessageSource:
         damaged ("torn") files. `restart` begins the next round.
 
         Returns:
-            The messages. None if none are available now, or if the round has ended (`ended`).
+            The messages. `None` if no messages are available now, or if the round has ended
+            (`ended`).
 
         Raises:
             LogError: A file can no longer be read.
@@ -177,8 +178,8 @@ class MessageSource:
         the pipe and decoded. `poll` then returns the messages.
 
         Returns:
-            True if bytes were read. False if none are available now, or if enough messages have
-            been fetched in advance.
+            True if bytes were read. False if no bytes are available now, or if enough messages
+            have been fetched in advance.
 
         Raises:
             RuntimeFault: The process that reads the log has failed.
@@ -216,7 +217,7 @@ class MessageSource:
                 self._ahead_bytes += len(item.batch.data)
 
     def restart(self) -> None:
-        """Supplies the messages of the log again from the first one, for replaying in a loop.
+        """Supplies the messages of the log again from the start, for replaying in a loop.
 
         A log in memory is queued once more. For a long log, the reader process begins again on
         its own.

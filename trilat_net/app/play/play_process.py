@@ -6,7 +6,7 @@ late they were. To recorders and viewers, it looks like a running session.
 
 Invariant:
     - After the last message, the process stays on the network until its recorders have every
-      message, or send no more requests for missing ones.
+      message, or send no more requests for missing messages.
 """
 
 import math
@@ -71,7 +71,7 @@ class PlaybackSummary(NamedTuple):
     Attributes:
         counts: Number of published messages, by the topic in the file.
         rounds: Number of passes through the log that were started.
-        lateness: How late the messages were published after their deadlines. None if they had
+        lateness: How late the messages were published after their deadlines. `None` if they had
             no deadlines.
         took_s: Duration of the playback, in s.
         held_s: Time for which the player waited for slow receivers, in s.
@@ -280,7 +280,7 @@ def play_log(
         show: Function that shows the progress to the user.
 
     Returns:
-        The summary. None if the playback was stopped before it began.
+        The summary. `None` if the playback was stopped before it began.
 
     Raises:
         SessionError: A session of that name is running.

@@ -186,7 +186,7 @@ class LatenessHistogram:
         uses integers and is therefore exact.
 
         Returns:
-            Median, 99th percentile and maximum of the lateness, in us. None if no message was
+            Median, 99th percentile and maximum of the lateness, in us. `None` if no message was
             counted.
         """
         # The index of each entry is the lateness in us. The last entry is the overflow bin,
@@ -301,7 +301,7 @@ class Player:
         Messages that are read from the disk or decoded only when they are due would be late.
 
         Returns:
-            The time of the first message, in ns after the start of the recorded session. None
+            The time of the first message, in ns after the start of the recorded session. `None`
             if there is no message, or the playback was stopped.
         """
         self._first_batch = self._wait_for_batch()
@@ -314,7 +314,7 @@ class Player:
         """Plays all messages, until the end of the log or until the playback is stopped.
 
         A round is one pass through the log. The next round begins `LOOP_PAUSE_NS` after the
-        last message of the present one.
+        last message of the present round.
 
         Every message is stored in the history before it is played, because recorders may
         request it again. A log that is entirely in memory is stored once, in the first round.

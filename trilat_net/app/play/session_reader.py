@@ -52,9 +52,9 @@ class PlaySelection:
     Attributes:
         channels: Filter of the channels. If it includes no channel explicitly, the channels of
             the sites are played.
-        start_ns: Earliest time of a message, in ns after the start of the session. None if
+        start_ns: Earliest time of a message, in ns after the start of the session. `None` if
             there is no limit.
-        stop_ns: Latest time of a message, in ns after the start of the session. None if there
+        stop_ns: Latest time of a message, in ns after the start of the session. `None` if there
             is no limit.
         time: Whether the sending time or the arrival time of a message counts.
     """
@@ -109,9 +109,10 @@ def parse_selection(
     Args:
         include: Key expressions of `--include`.
         exclude: Key expressions of `--exclude`.
-        start_s: Value of `--start`, in s after the start of the session. None if it is absent.
+        start_s: Value of `--start`, in s after the start of the session. `None` if it is
+            absent.
         stop_s: Value of `--stop`, in s after the start of the session. `None` if it is absent.
-        duration_s: Value of `--duration`, in s, instead of `stop_s`. None if it is absent.
+        duration_s: Value of `--duration`, in s, instead of `stop_s`. `None` if it is absent.
         time: Value of `--time`, see `PlayTime`.
 
     Raises:
@@ -262,8 +263,8 @@ class _PlayedChannel:
         The messages of a channel are played in the order of their numbers. Three kinds of
         numbers make this order equal to the order of the original publication:
 
-        - Records and statistics of a site have the number that follows from their control
-          period (tick). A site that was started again continues these numbers.
+        - Records and statistics of a site are numbered by their control period (tick). A site
+          that was started again continues these numbers.
         - Events of a site are numbered from 0 in each start of the site. To distinguish the
           starts, a multiple of `NUMBERS_OF_A_START` is added.
         - Other messages have no number. Their time is used instead.
@@ -308,7 +309,7 @@ class SessionReader:
             total.
 
     Attributes:
-        header: Description of the session. None before the first message.
+        header: Description of the session. `None` before the first message.
     """
 
     def __init__(
@@ -386,8 +387,8 @@ class SessionReader:
     def _find_time_ns(self, item: McapMessage, epoch_ns: int) -> int:
         """Returns the time at which a message is played, in ns after the start of the session.
 
-        A message was sent at one time and arrived at a later one. The user chooses which of the
-        two times is used.
+        A message was sent at one time and arrived at a later time. The user chooses which of
+        the two times is used.
 
         Args:
             item: The message.
@@ -403,7 +404,7 @@ class SessionReader:
     def _read_session(self, path: Path, reader: McapReader) -> tuple[int, SessionHeader]:
         """Reads the metadata of a file's session, and creates the header for the first file.
 
-        All files must belong to the same session, because they are played as one.
+        All files must belong to the same session, because they are played as one session.
 
         Returns:
             The start of the session in Unix time, in ns, and the header.
@@ -414,7 +415,7 @@ class SessionReader:
         """
         metadata = reader.metadata.get(SESSION, {})
         if "session" not in metadata or SCENARIO not in reader.attachments:
-            raise LogError(f"{path}: is an MCAP file, but not a trilat-net log")
+            raise LogError(f"{path} is an MCAP file, but not a trilat-net log")
 
         try:
             text = reader.attachments[SCENARIO].decode()
@@ -436,7 +437,7 @@ class SessionReader:
         )
         if not is_same_session:
             raise LogError(
-                f"{path}: belongs to a different session from {self._paths[0]}; the files of "
+                f"{path} belongs to a different session from {self._paths[0]}; the files of "
                 "one replay must be parts of the same log"
             )
         return epoch_ns, self.header
@@ -484,7 +485,7 @@ def preload_messages(
                 break
         else:  # the end of the files was reached
             if reader.header is None:
-                raise LogError(f"{paths[0]}: contains nothing")
+                raise LogError(f"{paths[0]} is empty")
             if not waiting.memory:
                 raise UsageError(_describe_empty_selection(paths[0], selection, reader.header))
             return reader.header, waiting.ordered()
@@ -505,18 +506,18 @@ def _describe_empty_selection(
     A wrong start or end is named. Otherwise the filter of the channels is the reason.
     """
     if header.last_ns < header.first_ns:
-        return f"{path}: contains no message"
+        return f"{path} contains no messages"
 
     span = f"from {header.first_ns / NS_PER_S:.3f} s to {header.last_ns / NS_PER_S:.3f} s"
 
     if selection.start_ns is not None and selection.start_ns > header.last_ns:
         option = f"--start {selection.start_ns / NS_PER_S:g} s"
-        return f"{option}: is after the end; the log lasts {span}"
+        return f"{option} is after the end; the log lasts {span}"
     if selection.stop_ns is not None and selection.stop_ns < header.first_ns:
         option = f"--stop {selection.stop_ns / NS_PER_S:g} s"
-        return f"{option}: is before the beginning; the log lasts {span}"
+        return f"{option} is before the beginning; the log lasts {span}"
 
     return (
-        f"{path}: has no message for this selection; the topics of the log have the form "
+        f"{path} has no message for this selection; the topics of the log have the form "
         f"trilat/{header.session}/{header.scenario.names[0]}/state, and the log lasts {span}"
     )

@@ -185,9 +185,7 @@ _MAX_RECORDER_EVENTS = 256
 REFRESH_NS = 500_000_000
 """Time for which an encoded identity is used again, in ns.
 
-An identity contains a whole scenario,
-
-so that its encoding takes long.
+An identity contains a whole scenario, so encoding it takes long.
 """
 
 
@@ -279,8 +277,8 @@ class SiteStandIns:
         """Replies to waiting requests of other programs in the name of the original sites.
 
         It replies to all queries for identities, but to at most one request of a recorder for
-        missing messages, so that the call is short. It also updates which recorders are
-        present, and which messages they have stored.
+        missing messages, to keep the call short. It also updates which recorders are present,
+        and which messages they have stored.
 
         Returns:
             True if a request of a recorder was processed. More requests may be waiting then.

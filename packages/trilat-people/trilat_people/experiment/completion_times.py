@@ -93,7 +93,7 @@ class CompletionComparison(NamedTuple):
 
 
 def is_completed(row: Row) -> bool:
-    """Returns True if a trial was completed, so that its completion time is known.
+    """Returns True if a trial was completed and its completion time is therefore known.
 
     Args:
         row: The trial, with values or with the texts of a CSV file. A row without the key

@@ -134,8 +134,7 @@ def _list_unit_lines(
         values: A value by condition and unit. Each condition is a column of the figure.
 
     Yields:
-        The indices of the columns, and the values there. Conditions without a value are left
-        out.
+        The indices of the columns, and their values. Conditions without a value are left out.
     """
     all_units = chain.from_iterable(values.values())
     for unit in dict.fromkeys(all_units):
@@ -229,7 +228,7 @@ def draw_learning(
         unit: "participant" or "pair", for which means are computed first.
         limit_s: Time limit of a trial, in s, if some trials were not completed in time. The
             figure then shows medians, and open markers on the line of the limit for medians
-            beyond it. None if all trials were completed.
+            beyond it. `None` if all trials were completed.
     """
     if limit_s is not None:
         return _draw_learning_times(rows, limit_s, unit)
@@ -286,7 +285,7 @@ def _group_by_trial(rows: Sequence[Row], condition: str) -> dict[Any, list[Row]]
 def _draw_learning_times(rows: Sequence[Row], limit_s: float, unit: str) -> Figure:
     """Draws how the median completion time changes over the trials of a block.
 
-    The task has a time limit, and some trials were not completed, so that means do not exist. A
+    The task has a time limit, and some trials were not completed, so means do not exist. A
     median beyond the limit has an open marker on the line of the limit.
 
     Args:

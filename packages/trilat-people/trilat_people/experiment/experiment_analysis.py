@@ -486,7 +486,7 @@ class ExperimentAnalysis(Result):
 
         A staircase procedure changes a difference until the participant just perceives it.
         Blocks with too few reversals of the staircase have no threshold, and protocols without
-        a staircase have none at all.
+        a staircase have no thresholds at all.
 
         Yields:
             Rows with the name, the condition, and the threshold under the name of its measure.
@@ -511,7 +511,7 @@ class ExperimentAnalysis(Result):
                 }
 
     def _collect_study(self) -> dict[str, Any]:
-        """Returns the facts of the study that a paper states.
+        """Returns the facts of the study that a paper should state.
 
         Facts that do not apply, such as `pairs` in an experiment with single users, are left
         out.

@@ -331,7 +331,7 @@ class Experiment(Result):
         }
 
     def _describe_pair(self, planned: PlannedTrial, choices: Choices) -> dict[str, Any]:
-        """Returns the two further columns of a trial in a perception test (staircase).
+        """Returns two additional columns for a trial in a perception test (staircase).
 
         Such trials come in pairs that differ in one quantity, and the participant chooses the
         trial in which the quantity was larger.
@@ -591,7 +591,7 @@ def open_experiment(folder: str | Path) -> Experiment:
         stored_plan = json.loads((folder_path / PLAN_FILE).read_text(encoding="utf-8"))
     except (OSError, ValueError):
         raise UsageError(
-            f"{folder_path}: contains no experiment; "
+            f"{folder_path} contains no experiment; "
             "start an experiment with `trilat experiment run FILE`"
         ) from None
 
@@ -654,6 +654,6 @@ def list_log_problems(experiment: Experiment) -> Iterator[str]:
         if entry is None:
             continue
         if not path.exists():
-            yield f"{path}: is missing"
+            yield f"{path} is missing"
         elif digest_file(path) != entry.sha256:
-            yield f"{path}: is not the log that the trial wrote"
+            yield f"{path} is not the log that the trial wrote"

@@ -104,9 +104,11 @@ class _Training(Frozen, frozen=True):
         if self.retention:
             retention_text = f", and {self.retention} more after {self.rest_s:g} s"
         return (
-            f"In these the expert's part of the authority went from {', '.join(courses)}; "
+            "In the training trials, the expert's share of the authority changed from "
+            f"{', '.join(courses)}; "
             f"{count_nouns(self.before, 'trial')} before and "
-            f"{self.after} after them{retention_text} were made without it and are compared"
+            f"{self.after} after them{retention_text} were done by the learner alone and are "
+            "compared"
         )
 
 
@@ -554,9 +556,9 @@ def read_protocol(file: str | Path) -> Protocol:
         tables = tomllib.loads(path.read_text(encoding="utf-8"))
         return msgspec.convert(tables, Protocol)
     except OSError as error:
-        raise UsageError(f"{path}: cannot be read: {error.strerror}") from None
+        raise UsageError(f"{path} cannot be read: {error.strerror}") from None
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise UsageError(f"{path}: is not valid TOML: {error}") from None
+        raise UsageError(f"{path} is not valid TOML: {error}") from None
     except msgspec.ValidationError as error:
         valid = ", ".join(key.encode_name for key in msgspec.structs.fields(Protocol))
         raise UsageError(f"{path}: {error}; the keys of a protocol are {valid}") from None

@@ -114,8 +114,8 @@ class Questionnaire(Frozen, frozen=True):
 
         Returns:
             The raw NASA Task Load Index for `tlx`, the score of the System Usability Scale for
-            `sus`, and the mean of the answers for any other questionnaire. None if an answer is
-            missing.
+            `sus`, and the mean of the answers for any other questionnaire. `None` if an answer
+            is missing.
         """
         given_answers = {item: value for item, value in answers.items() if value is not None}
         if len(given_answers) < len(answers):

@@ -141,7 +141,7 @@ class Staircase(Frozen, frozen=True):
             right: For each answer, True if it was right.
 
         Returns:
-            The threshold in the key's unit. None if no reversals are left.
+            The threshold in the key's unit. `None` if no reversals are left.
         """
         # There is one more difference than directions: that of the next pair.
         pairs = zip(self.list_differences(right), self._list_directions(right), strict=False)

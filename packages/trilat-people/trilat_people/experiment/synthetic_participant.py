@@ -208,7 +208,7 @@ class SyntheticParticipant:
         """Returns the earliest time at which the participant starts the next movement, in s.
 
         The hand and the slave must have come to rest. Then the participant reacts. If the
-        movement corrects an earlier one, the participant also waits until the delayed view
+        movement corrects an earlier movement, the participant also waits until the delayed view
         shows the end of the slave's motion.
 
         Args:

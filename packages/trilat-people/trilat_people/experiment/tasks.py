@@ -238,7 +238,7 @@ class Outcome(NamedTuple):
 class ReachTrial(TrialTask, frozen=True, tag="reach"):
     """Task of an experiment: move the arm to targets on a ring, as in ISO 9241-411.
 
-    Each target is opposite the previous one.
+    Each target is opposite the previous target.
 
     Attributes:
         targets: Number of targets.
@@ -633,7 +633,7 @@ class TrackTrial(TrialTask, frozen=True, tag="track"):
 
     @property
     def has_limit(self) -> bool:
-        """False: following a moving target takes exactly `duration_s`, and cannot fail."""
+        """Always False: following a moving target takes exactly `duration_s`, and cannot fail."""
         return False
 
     @property

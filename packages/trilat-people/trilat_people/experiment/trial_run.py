@@ -94,7 +94,7 @@ class TrialJudge:
     def accept(self, t_s: float, q: Sequence[float], tau_x: Sequence[float]) -> Outcome | None:
         """Takes the next record of the slave into account.
 
-        A record contains what the site of the slave arm measured in one control period. The
+        A record contains the measurements of the slave arm's site in one control period. The
         trial may end with any record.
 
         Args:

@@ -86,7 +86,7 @@ class TrialWatch:
     def poll(self, view: SessionView, absent: Collection[str]) -> list[str]:
         """Judges the trial from new records of the slave arm, and finds reasons to repeat it.
 
-        A record contains what the process of an arm measured and computed in one control
+        A record contains the measurements and results of an arm's process in one control
         period. The trial must be repeated if an arm was stopped, or if the web page of a
         participant has disappeared. The records are then not judged.
 

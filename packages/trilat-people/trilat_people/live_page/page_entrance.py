@@ -7,7 +7,7 @@ nobody can block others by opening many connections.
 
 Invariant:
     - Silent or slow connections and downloads count as strangers. If there are too many
-      strangers, the oldest one is closed for a new connection.
+      strangers, the oldest is closed to admit a new connection.
     - The number of pages is limited separately for each role, so that many watchers cannot
       displace other roles.
     - A new page of an experimenter or a user is always accepted. If there are too many, the
@@ -88,7 +88,7 @@ Page = TypeVar("Page", bound=_SeatedPage)
 
 
 def is_full(pages: Iterable[_SeatedPage], role: Role) -> bool:
-    """Returns True if the largest allowed number of web pages of a role are open.
+    """Returns True if no further web page of a role may be opened.
 
     Args:
         pages: The open pages of all roles.

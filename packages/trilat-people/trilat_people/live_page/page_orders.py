@@ -173,7 +173,7 @@ class MarkMoment(PageMessage, frozen=True, kw_only=True, tag="mark"):
 class ShowAges(PageMessage, frozen=True, kw_only=True, tag="ages"):
     """Request of a page to show or hide the age of displayed poses on the pages of users.
 
-    The network delays what users see of the other arms. The age is this delay.
+    The network delays the users' view of the other arms. The age is this delay.
 
     Attributes:
         shown: True to show the ages, False to hide them.
@@ -393,7 +393,7 @@ class RoleLinks:
 
     A link contains a secret token, so that only those who received it can open the page. A
     token is needed on this machine too, because other users of the machine can connect. The
-    token of a role is computed from a random secret, so that it need not be stored.
+    token of a role is computed from a random secret, so it need not be stored.
     """
 
     def __init__(self) -> None:

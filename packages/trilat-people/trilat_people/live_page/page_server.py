@@ -438,7 +438,7 @@ class PageServer:
         """Shows the session that the last call of `show` requested.
 
         Only the thread of the server uses the state of a session. `show` runs in another
-        thread, and waits until this method has switched, also if it fails.
+        thread, and waits until this method has switched or failed.
         """
         if self._next_session is not None:
             bus, session = self._next_session
@@ -706,8 +706,8 @@ class PageServer:
     async def _serve_page(self, connection: ServerConnection) -> None:
         """Exchanges messages with one web page until its connection ends.
 
-        The page of a user may move its arm at once. The page of an experimenter controls the
-        session if no other experimenter's page does.
+        The page of a user may move the user's arm at once. The page of an experimenter controls
+        the session if no other experimenter's page does.
         """
         assert connection.request is not None
         role = self._links.find(urlsplit(connection.request.path).query)
@@ -1155,7 +1155,7 @@ class PageServer:
 
 
 def _has_screen() -> bool:
-    """Returns True if this machine can show a browser, so that opening one makes sense.
+    """Returns True if this machine can show a browser.
 
     On Linux, this is read from the variables DISPLAY and WAYLAND_DISPLAY.
     """

@@ -1,10 +1,10 @@
 """Composes the JSON messages from which the web pages of a running session are drawn.
 
 A session is a run in which several processes ("sites") each control one robot arm. A record
-contains what a site measured and computed in one tick, a period of its control loop. A page
-first receives the constants of the session, such as the shapes of the arms. Then it receives
-about 30 frames a second. A frame is a message with the present state of each arm and network
-link, and with new points of the plots.
+contains the measurements and results of a site in one tick, a period of its control loop. A
+page first receives the constants of the session, such as the shapes of the arms. Then it
+receives about 30 frames a second. A frame is a message with the present state of each arm and
+network link, and with new points of the plots.
 
 Invariant:
     - A frame is computed from the records since the previous frame, but describes the whole

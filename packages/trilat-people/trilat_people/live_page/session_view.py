@@ -123,8 +123,8 @@ class SiteView:
         window: Latest records of the site.
 
     Attributes:
-        glides: True if the site stops smoothly when it loses its peers (the rule `glide`), so
-            that it has alarms.
+        glides: True if the site stops smoothly when it loses its peers (the rule `glide`). Only
+            such a site has alarms.
         peers: Names of the sites whose states the site receives.
         layout: Numbers of joints and peers in its records, if the site continues without a lost
             peer. Otherwise `None`.

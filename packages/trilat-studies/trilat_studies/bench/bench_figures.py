@@ -226,7 +226,7 @@ def _compute_number(result: BenchCellResult, quantity: str) -> float | None:
             `JUDGEMENTS` is returned.
 
     Returns:
-        The number. None if the runs lack the quantity.
+        The number. `None` if the runs lack the quantity.
     """
     if not quantity:
         return list(JUDGEMENTS).index(result.judgement)
@@ -253,7 +253,7 @@ def _label_laws(axes: Axes, results: BenchResults, task: str) -> None:
 def _mark_cells(axes: Axes, results: BenchResults, task: str) -> None:
     """Marks fields of a figure whose mean value hides runs that are not stable, or are open.
 
-    A cross stands for a run that is not stable, a dot for a run whose stability is open.
+    A cross marks a run that is not stable, and a dot a run whose stability is open.
 
     Args:
         axes: The panel.

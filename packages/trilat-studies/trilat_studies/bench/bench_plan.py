@@ -126,7 +126,7 @@ def _build_dominance(a: float) -> dict[str, dict[str, float]]:
 
 
 class _BenchTask(NamedTuple):
-    """A task of the benchmark: what the operators do, and what the slave arm touches.
+    """A task of the benchmark: actions of the operators, and contacts of the slave arm.
 
     Attributes:
         about: Description of the task for the user.
@@ -162,7 +162,7 @@ TASKS = {
         "a user moves the slave by 0.3 m", {"sites.m1.hands": [_build_hand(_OUT)]}
     ),
     "contact": _BenchTask(
-        "as free, but after half of the way the slave meets a wall of 2000 N/m",
+        "like the task free, but half-way the slave hits a wall of 2000 N/m",
         {"sites.m1.hands": [_build_hand(_OUT)], "sites.s.environment": [_WALL]},
     ),
     "handover": _BenchTask(
@@ -186,7 +186,7 @@ TASKS = {
         cut_s=_CUT_S,
     ),
     "gravity-90": _BenchTask(
-        "as free, but the laws get 90 % of the true gravity parameters",
+        "like the task free, but the laws get 90 % of the true gravity parameters",
         {"sites.m1.hands": [_build_hand(_OUT)]},
         gravity=0.9,
     ),
@@ -228,7 +228,7 @@ Over these links `ROUND_TRIPS` round trips take longer than the tasks, so the ru
 SHORTER_REACH: Settings = {"sites.m1.hands": [_build_hand(_LESS_OUT)]}
 """Overrides that give the task `contact` a shorter reach.
 
-The stiffness at the hand follows from the difference between both reaches.
+The stiffness at the hand is computed from the difference between both reaches.
 """
 
 EQUAL_LAWS = {"six_channel": "four_channel"}
@@ -390,8 +390,9 @@ class TunedGains(msgspec.Struct, frozen=True):
         tried: Number of all candidates.
         passed: Number of candidates that came to rest with a smaller error than the selected
             candidate, but do not stay stable with longer delays.
-        error_rad: Error of the selected candidate, in rad. None if no candidate was selected.
-        effort_nm: Effort of the selected candidate, in N m. None if no candidate was selected.
+        error_rad: Error of the selected candidate, in rad. `None` if no candidate was selected.
+        effort_nm: Effort of the selected candidate, in N m. `None` if no candidate was
+            selected.
         fingerprint: Fingerprint of the scenario and of the law, see `fingerprint_tuning`.
     """
 
@@ -531,7 +532,8 @@ def choose_round_trip(mean_ms: float) -> int:
     """Returns the tuned round trip, in ms, whose gains a link with a given round trip uses.
 
     It is the shortest tuned round trip that is not shorter than the round trip of the link. If
-    the link's round trip is longer than all tuned ones, it is the longest tuned round trip.
+    the link's round trip is longer than all tuned round trips, the longest tuned round trip is
+    returned.
 
     Args:
         mean_ms: Mean round trip of the link, in ms.
@@ -578,7 +580,7 @@ def tune_laws(
     """Tunes control laws for the benchmark, at each of several round trips of the links.
 
     The round trips are `TUNED_ROUND_TRIPS_MS`. Gains that are known and up to date are not
-    tuned again, so that an interrupted tuning continues.
+    tuned again, so an interrupted tuning continues.
 
     Args:
         laws_by_form: Names of the laws to tune, by the kind of scenario in which they run, such
@@ -908,7 +910,7 @@ NO_GAINS = "no gains"
 
 
 def explain_no_cell(law: str, form: str, task: str) -> str:
-    """Explains in a table why the benchmark does not simulate a control law in a task.
+    """Returns a table entry that explains why the benchmark does not simulate a law in a task.
 
     Args:
         law: Name of the control law.
@@ -918,8 +920,8 @@ def explain_no_cell(law: str, form: str, task: str) -> str:
 
     Returns:
         - "-" if the task needs two users, and the form has a single user.
-        - "no handover" if one user hands the control over to the other in this task, and the
-          law cannot change how much each user leads.
+        - "no handover" if one user hands over the control to the other in this task, and the
+          law cannot change the users' shares.
         - "exact model" if the gravity parameters are wrong in this task, and the law takes the
           exact model of the arm instead.
         - `NO_GAINS` otherwise. In this case, the tuning of the law found no stable gains.

@@ -61,7 +61,7 @@ class BenchRun(msgspec.Struct, frozen=True):
     """A finished run of the suite, with its judgement and its measured numbers.
 
     A worker process creates it, and the journal of the suite stores it. The attribute
-    `error_rad` and all later ones are `None` if the run diverged.
+    `error_rad` and all later attributes are `None` if the run diverged.
 
     Attributes:
         name: Name of the cell, as in "contact/wave/rtt272".
@@ -85,8 +85,8 @@ class BenchRun(msgspec.Struct, frozen=True):
             `THROWN_RAD` away from its start.
         energy_j: Minimum over time of the total energy that operators, friction and wall had
             put into the arms, in J.
-        settled_s: Time from which all arms stay at their final poses, in s. None if there is no
-            such time within the run.
+        settled_s: Time from which all arms stay at their final poses, in s. `None` if there is
+            no such time within the run.
         error_rad: RMS over time and joints of the difference between the slave and the average
             of the users, weighted with the dominance factors and without delay, in rad.
         effort_nm: RMS of tau - G(q), the torque without gravity, over sites and joints, in N m.
@@ -286,9 +286,9 @@ class BenchCellResult(NamedTuple):
             quantity: Name of the quantity, a key of `QUANTITIES`.
 
         Returns:
-            The mean. With at least `LEAST_SEEDS` runs, it has a 95 % confidence interval. None
-            if a run lacks the quantity, or if the slave should touch a wall but missed it in a
-            run.
+            The mean. With at least `LEAST_SEEDS` runs, it has a 95 % confidence interval.
+            `None` if a run lacks the quantity, or if the slave should touch a wall but missed
+            it in a run.
         """
         values = [getattr(run, quantity) for run in self.runs]
         if None in values or self.masked:
@@ -400,7 +400,7 @@ class BenchResults(Result):
             link: Name of the link.
 
         Returns:
-            The result. None if the plan does not contain the cell.
+            The result. `None` if the plan does not contain the cell.
         """
         return next(self.select(task, law, link), None)
 

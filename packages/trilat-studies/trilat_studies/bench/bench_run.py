@@ -150,7 +150,7 @@ class JudgedRun(NamedTuple):
         scenario: Scenario of the run. Its duration is that of the run.
         records: All records of the run, by site.
         end: Analysis of the end of the run.
-        twins: Growth of the small disturbances of the twins. None if the roots decide without
+        twins: Growth of the small disturbances of the twins. `None` if the roots decide without
             them.
         roots: Characteristic roots of the loop at the end of the run.
         stability: The judgement.
@@ -510,7 +510,7 @@ def _find_settled_s(records: dict[str, RecordBatch]) -> float | None:
         records: All records of the run, by site.
 
     Returns:
-        The time in s. None if it is less than `REST_S` before the end of the run, because the
+        The time in s. `None` if it is less than `REST_S` before the end of the run, because the
         arms may then still be moving.
     """
     settled_s = 0.0
@@ -586,7 +586,7 @@ def _run_variant(
         duration_s: Duration, in s.
 
     Returns:
-        The scenario and its records. None if the run diverged.
+        The scenario and its records. `None` if the run diverged.
     """
     built = item.cell.build(item.seed)
     overrides = (*built.overrides, *format_settings(settings))
@@ -693,7 +693,7 @@ def _measure_tip(
         window_s: Start and end of the window, in s.
 
     Returns:
-        The motion along x. None if the run ends within the window.
+        The motion along x. `None` if the run ends within the window.
     """
     start_ns, end_ns = (round(time_s * NS_PER_S) for time_s in window_s)
     if records[USER].t_ns[-1] < end_ns - NS_PER_S // scenario.sites[USER].rate_hz:
@@ -733,7 +733,7 @@ def _estimate_impedance(
         contact_s: Time of the first contact, in s.
 
     Returns:
-        |Z| in contact and in free motion, in N s/m. None if a run is too short or diverges.
+        |Z| in contact and in free motion, in N s/m. `None` if a run is too short or diverges.
     """
     start_s = contact_s + STIFFNESS_S
     end_s = start_s + IMPEDANCE_PERIODS / IMPEDANCE_HZ

@@ -21,7 +21,7 @@ from trilat_net.scenario import Scenario, describe_value, identify_law
 
 from .sweep_plan import SweepPlan
 
-FAIR_COMPARISON = "laws at their best gains compare fairly by: trilat compare --tune"
+FAIR_COMPARISON = "to compare laws at their best gains, use: trilat compare --tune"
 """Advice that is printed below a comparison of control laws by a sweep."""
 
 

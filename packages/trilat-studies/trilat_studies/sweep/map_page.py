@@ -8,7 +8,7 @@ colour of a cell depends on the runs of the sweep:
 - With several random seeds per cell, it shows the fraction of runs that are stable. Undecided
   runs are left out.
 - If growth exponents were measured, which are the rates at which small disturbances grow, it
-  shows the exponent. White stands for zero.
+  shows the exponent. White means zero.
 
 Vector files contain the cells as an image, because viewers show seams between adjacent shapes.
 The colours differ in lightness, for grey print and colour-blind readers.
@@ -579,7 +579,7 @@ def _find_exponent_limit(plane: MapPlane) -> float:
 def _draw_colour_bar(figure: Figure, grid: Sequence[Axes], plane: MapPlane) -> None:
     """Draws the colour bar of growth exponents or of stable shares.
 
-    The pointed ends of the bar of exponents stand for all exponents beyond its limits.
+    The pointed ends of the bar of exponents represent all exponents beyond its limits.
 
     Args:
         figure: The Matplotlib figure.
@@ -805,7 +805,7 @@ def _list_notes(chart: StabilityMap) -> list[str]:
         )
     if plane.refused:
         refused = count_nouns(plane.refused, "cell")
-        notes.append(f"refused, and without runs: {refused}, not valid as scenarios")
+        notes.append(f"no runs, because the scenario is not valid: {refused}")
 
     notes += [f"gains that were not swept: {text}" for text in chart.fixed]
     if chart.fixed:

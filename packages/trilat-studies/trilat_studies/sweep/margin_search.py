@@ -243,7 +243,7 @@ class GridPointMargin(NamedTuple):
         margin: The limits that were found by runs.
         linear: The limits within the range at which the linearised loop becomes unstable, in
             rising order.
-        remark: Remark on the linear analysis. Empty if there is none.
+        remark: Remark on the linear analysis. Empty if there is no remark.
         closed: The limit within the range according to a stability criterion in closed form.
             `None` if no criterion applies, or if the limit of the criterion lies outside the
             range.
@@ -607,7 +607,7 @@ def _format_edge(margin: KeyMargin, span: StabilityEdge | None) -> list[str]:
     Args:
         margin: The edges of the grid point.
         span: The edge. `None` if the grid point has no edges. The cell then states whether all
-            values were stable or none was.
+            values or no values were stable.
     """
     if span is None:
         texts = {

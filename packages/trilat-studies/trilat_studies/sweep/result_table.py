@@ -142,7 +142,7 @@ class StoredRows(Sequence[ResultRow]):
         for name in table.columns:
             if name not in self._names:
                 raise UsageError(
-                    f"{file}: contains no results of a sweep: the column {name!r} is missing"
+                    f"{file} contains no results of a sweep: the column {name!r} is missing"
                 )
 
     def __len__(self) -> int:
@@ -221,7 +221,7 @@ class StoredRows(Sequence[ResultRow]):
             yield
         except (OSError, ValueError, TypeError, IndexError, KeyError, csv.Error) as error:
             raise UsageError(
-                f"{self._file}: cannot be read as results of a sweep: {error}"
+                f"{self._file} cannot be read as results of a sweep: {error}"
             ) from None
 
 
@@ -246,7 +246,7 @@ def _read_next(reader: Iterator[list[str]]) -> list[str] | None:
     during this call.
 
     Returns:
-        The fields of the row. None after the last row.
+        The fields of the row. `None` after the last row.
     """
     limit = csv.field_size_limit(_LONGEST_CELL)
     try:

@@ -525,7 +525,7 @@ def _evaluate_damping_criterion(scenario: Scenario) -> StabilityCriterion | None
     (docs/theory/damping-conditions.md, 13).
 
     Returns:
-        The condition. None if it does not cover the scenario.
+        The condition. `None` if it does not cover the scenario.
     """
     if scenario.scheme != "second_order":
         return None
@@ -583,7 +583,7 @@ def _evaluate_damping_criterion(scenario: Scenario) -> StabilityCriterion | None
     )
 
 
-_DAMPING_SOURCE = "P+d: sufficient whatever the arms weigh, and necessary for the worst masses"
+_DAMPING_SOURCE = "P+d: sufficient for arms of any mass, and necessary for the worst masses"
 
 
 def _find_scalar_gains(spec: SiteSpec) -> tuple[float, float] | None:
@@ -775,8 +775,8 @@ def _evaluate_sampling_criterion(scenario: Scenario) -> StabilityCriterion | Non
         symbol=r"$\Gamma g^2 h = K_p$",
         text="Gamma g² h = Kp",
         source=(
-            "a rule for arms of about 1 m and no delay: "
-            "the estimate of gravity against the lag of a tick"
+            "a rule of thumb for arms of about 1 m and no delay: "
+            "gravity must not be estimated too fast for the tick rate"
         ),
         excess=min(site_excess),
     )
@@ -788,7 +788,7 @@ def _list_delays_s(scenario: Scenario) -> list[float] | None:
     Links with a dominance factor of 0 are left out: their samples have no effect.
 
     Returns:
-        The delays. None if a delay is not constant, or if a link loses messages.
+        The delays. `None` if a delay is not constant, or if a link loses messages.
     """
     delays_s = []
     for site in scenario.names:
@@ -1013,7 +1013,7 @@ class MapLine(NamedTuple):
 ZERO_EXPONENT = "exponent = 0"
 """Name of the measured line of zero growth exponents."""
 _ABOUT_TWINS = (
-    "where a small push of the run neither grows nor dies away, straight from cell to cell"
+    "where a small push neither grows nor dies away, interpolated linearly between cells"
 )
 """Explanation of this line on the page of the map."""
 
@@ -1033,7 +1033,7 @@ def _trace_zero_exponent(plane: MapPlane, panel: MapPanel) -> MapLine | None:
         panel: Part of the map with the exponent at each grid point.
 
     Returns:
-        The line. None if it does not cross this part of the map.
+        The line. `None` if it does not cross this part of the map.
     """
     name = ZERO_RATE if plane.is_linear else ZERO_EXPONENT
     line = MapLine(
@@ -1059,8 +1059,8 @@ def trace_closed_form(load: PanelLoader, x: PlaneAxis, y: PlaneAxis) -> MapLine 
         y: Vertical axis of the map.
 
     Returns:
-        The line. None if no condition is known for the scenario, or if the line does not cross
-        the map.
+        The line. `None` if no condition is known for the scenario, or if the line does not
+        cross the map.
     """
     first_criterion: StabilityCriterion | None = None
     columns = []
@@ -1115,7 +1115,7 @@ def trace_linear_analysis(
         y: Vertical axis.
 
     Returns:
-        The line, or None if it does not cross the panel; and remarks of the analysis for the
+        The line, or `None` if it does not cross the panel; and remarks of the analysis for the
         reader of the map, without duplicates.
     """
     decay_columns = []
@@ -1215,8 +1215,8 @@ def find_criterion_edge(
         high: Upper end of the searched interval.
 
     Returns:
-        The value. None if the criterion has the same sign at both ends, or if it does not apply
-        to a value between them.
+        The value. `None` if the criterion has the same sign at both ends, or if it does not
+        apply to a value between them.
     """
     # imported late: SciPy costs half a second, and most commands do not need it
     from scipy.optimize import brentq

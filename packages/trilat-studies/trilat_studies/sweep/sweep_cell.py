@@ -115,9 +115,9 @@ class CellResult(msgspec.Struct, frozen=True):
             in 1/s. `None` if there is no trend.
         speed_rate_per_s: Rate of the trend of |qd|, in 1/s. `None` if there is no trend.
         peak_error_rad: Largest |e| of the run, in rad.
-        settled_s: Time from which |e| stays below 0.01 rad, in s. None if |e| is not below
+        settled_s: Time from which |e| stays below 0.01 rad, in s. `None` if |e| is not below
             0.01 rad at the end.
-        diverged_s: Time at which the first site left its limits, in s. None if no site did.
+        diverged_s: Time at which the first site left its limits, in s. `None` if no site did.
         rms_error_rad: See `RunTotals`. The fields from this one to `walls_j` cover the
             scenario's duration without extensions.
         effort_nm: See `RunTotals`.

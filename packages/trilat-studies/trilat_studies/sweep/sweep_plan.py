@@ -45,7 +45,7 @@ _ON_GRID = Decimal("1e-9")
 _KEYS_WITH_OPTIONS = {
     "seed": "seeds have their own option, as in --seeds 1..20",
     "duration_s": "the duration of a cell depends on its verdict: --duration sets the first "
-    "one, --longest the limit",
+    "duration, --longest the limit",
 }
 """Keys that cannot be swept, each with the option that sets the key instead."""
 _MAX_AXIS_VALUES = 10**12
@@ -488,7 +488,7 @@ def plan_sweep(
     use the law in the scenario already, it keeps the gains of the scenario. Otherwise it gets
     its default gains. Overrides of gains apply in both cases.
 
-    The arguments are explained at `trilat_net.sweep`. Overrides are texts KEY=VALUE.
+    The arguments are explained in `trilat_net.sweep`. Overrides are texts KEY=VALUE.
 
     Returns:
         The checked plan.
@@ -534,7 +534,7 @@ def plan_sweep(
     _check_refinement(plan)
     if judge == "linear" and plan.metrics:
         raise UsageError(
-            "metrics need a run, and --judge linear makes none: leave out one of them"
+            "metrics need a run, but --judge linear runs nothing: leave out one of them"
         )
     if longest_s is None:
         longest_s = plan.default_longest_s
@@ -925,7 +925,8 @@ def _describe_key(key: str, scenario: Scenario | None = None) -> tuple[str, str]
         scenario: Scenario in which the names of operators and walls are looked up.
 
     Returns:
-        The name in words, such as "K of s", and the unit, which is empty if there is none.
+        The name in words, such as "K of s", and the unit, which is empty if the setting has no
+        unit.
     """
     *tables, name = key.split(".")
     subscript = ""
@@ -944,7 +945,7 @@ def _describe_owner(tables: list[str], scenario: Scenario | None) -> str:
     """Returns the phrase of a label that names the site, link or actor of a setting.
 
     Args:
-        tables: Names of the tables that contain the key, from the outermost one.
+        tables: Names of the tables that contain the key, from the outermost table.
         scenario: Scenario in which the kind of an operator or a wall is looked up.
 
     Returns:

@@ -249,17 +249,17 @@ def read_results(path: Path) -> SweepResults:
     file = path / RESULTS_FILE if is_folder else path
     if not file.is_file():
         hint = f"; continue it with: trilat sweep --resume {path}" if is_folder else ""
-        raise UsageError(f"{file}: there are no results of a sweep{hint}")
+        raise UsageError(f"{file} does not exist: there are no results of a sweep{hint}")
     plan_file = file.with_name(PLAN_FILE)
     if not plan_file.is_file():
         raise UsageError(
-            f"{file}: contains no results of a sweep: there is no {PLAN_FILE} next to this file"
+            f"{file} contains no results of a sweep: there is no {PLAN_FILE} next to this file"
         )
     try:
         plan_text = plan_file.read_text(encoding="utf-8")
         plan = plan_from_json(json.loads(plan_text))
     except (OSError, ValueError, KeyError, TypeError):
-        raise UsageError(f"{plan_file}: cannot be read as the plan of a sweep") from None
+        raise UsageError(f"{plan_file} cannot be read as the plan of a sweep") from None
 
     return SweepResults(plan, read_rows(file, plan))
 
@@ -427,7 +427,7 @@ _TOTALS = {
 
 
 _MAX_CELLS_SHOWN = 8
-"""Largest number of doubtful or refused cells in the summary. The CSV files have all of them.
+"""Largest number of doubtful or rejected cells in the summary. The CSV files have all of them.
 """
 
 
@@ -459,7 +459,7 @@ def describe_sweep_plan(plan: SweepPlan) -> list[str]:
 
     first_s = plan.base.duration_s
     longest_s = plan.longest_s
-    extended = f", an undecided one up to {longest_s:g} s" if longest_s > first_s else ""
+    extended = f", undecided runs up to {longest_s:g} s" if longest_s > first_s else ""
     if plan.refine:
         steps = count_nouns(1 << plan.refine, "cell")
         times = count_nouns(plan.refine, "time")
@@ -629,7 +629,7 @@ def _summarize_seeds(results: SweepResults, not_random: int) -> Iterator[str]:
     """
     if not_random:
         cells = count_nouns(not_random, "cell")
-        yield f"in {cells} nothing is random: one seed was run there, for all"
+        yield f"nothing is random in {cells}: only one seed was run there"
 
     doubtful = []
     doubtful_count = 0

@@ -152,7 +152,7 @@ def open_sweep_folder(path: Path, expected: SweepPlan | None = None) -> SweepFol
             stored_text = _format_fact(key, stored)
             current_text = _format_fact(key, current)
             raise UsageError(
-                f"{path}: contains a sweep with {difference}: {stored_text} in the folder, "
+                f"{path} contains a sweep with {difference}: {stored_text} in the folder, "
                 f"{current_text} now; results cannot be mixed: choose another folder"
             )
     return _build_folder(path, plan_from_json(stored), stored)
@@ -210,17 +210,15 @@ def _read_facts(path: Path) -> dict[str, Any]:
     try:
         facts = json.loads(file.read_text(encoding="utf-8"))
     except FileNotFoundError:
-        raise UsageError(
-            f"{path}: this folder contains no sweep: {PLAN_FILE} is missing"
-        ) from None
+        raise UsageError(f"{path} contains no sweep: {PLAN_FILE} is missing") from None
     except (OSError, ValueError) as error:
         reason = getattr(error, "strerror", None) or "is not JSON"
-        raise UsageError(f"{file}: cannot be read: {reason}") from None
+        raise UsageError(f"{file} cannot be read: {reason}") from None
     # A plan does not store these keys if they have their defaults.
     optional = {"judge", "metrics", "refine"}
     required = {"source", "folder", "name", *_DIFFERENCES} - optional
     if not isinstance(facts, dict) or not required <= facts.keys():
-        raise UsageError(f"{file}: is not the plan of a sweep")
+        raise UsageError(f"{file} is not the plan of a sweep")
     return facts
 
 

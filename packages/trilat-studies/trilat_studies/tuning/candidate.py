@@ -11,14 +11,14 @@ arms would agree if gravity did not act on them:
   m/rad.
 - After the operators have released the arms, q* keeps its value.
 
-Here beta_i is the influence of arm i. It follows from the dominance factors alpha_ij, the
-weights with which arm i follows arm j, by beta' alpha = beta' with sum_i beta_i = 1.
+Here beta_i is the influence of arm i. The dominance factors alpha_ij, the weights with which
+arm i follows arm j, determine it by beta' alpha = beta' with sum_i beta_i = 1.
 
 A law may promise a motion other than agreement at q*, see `LawSettings.target_motion`. In this
 case, the error contains the distance of each arm from the promised motion instead of the
 distance between the arms, and a run is judged by the end of the promised motion. The distance
-of the mean from q* stays part of the error, so that arms that do not move at all are no
-solution.
+of the mean from q* stays part of the error, so that arms that do not move at all have a large
+error.
 
 Walls, and operators who push without a target, do not determine a final pose. A scenario that
 contains them is also run without them, to find the pose at which the arms would come to rest.
@@ -281,7 +281,7 @@ CLASS_MEANINGS = {
     CandidateClass.OSCILLATED: "it keeps oscillating, drifts or grows",
     CandidateClass.STRAYED: (
         f"the mean pose ends more than {STRAYED_RAD} rad from the pose of a weightless "
-        "consensus, or would after as long again: the arms fell, hang, sink, or were thrown"
+        "consensus, or would after twice the time: the arms fell, hang, sink, or were thrown"
     ),
     CandidateClass.APART: f"an arm ends more than {TOGETHER_RAD} rad from the mean of all arms",
     CandidateClass.OPEN: "it hardly decays, or is undecided: a longer run may decide",
@@ -297,7 +297,7 @@ def classify_candidate(
 
     If the scenario has walls or operators who push without a target pose, a second run without
     them shows at which pose the arms would come to rest undisturbed. The arms should rest near
-    the consensus pose q*, which follows from the targets of the other operators.
+    the consensus pose q*, which is computed from the targets of the other operators.
 
     Args:
         ends: Judgements of the end of the run and of the second run. Without a second run, the
@@ -423,7 +423,8 @@ class CandidateScore(msgspec.Struct, frozen=True):
 
     Attributes:
         outcome: Class of the candidate.
-        error_rad: RMS distance of the arms from the pose q*, in rad. None if the run diverged.
+        error_rad: RMS distance of the arms from the pose q*, in rad. `None` if the run
+            diverged.
         spread_rad: Part of the error that is the distance between the arms at the same time,
             without delays. For a law that promises another motion, it is the distance of the
             arms from this motion.
@@ -433,12 +434,12 @@ class CandidateScore(msgspec.Struct, frozen=True):
             error of a site against its peers, the arms that it follows. `None` if |e| is larger
             at the end.
         saturated: Fraction of all joint torques that were at the torque limit.
-        diverged_s: Time at which the first site left its limits, in s. None if no site did.
+        diverged_s: Time at which the first site left its limits, in s. `None` if no site did.
         seeds: Number of runs over which the score is averaged. The class is the worst class
             among these runs.
-        error_half_rad: Half the width of the 95 % interval of the mean error. None for a single
-            run.
-        effort_half_nm: Half the width of the 95 % interval of the mean effort. None for a
+        error_half_rad: Half the width of the 95 % interval of the mean error. `None` for a
+            single run.
+        effort_half_nm: Half the width of the 95 % interval of the mean effort. `None` for a
             single run.
     """
 
@@ -463,7 +464,7 @@ def average_scores(scores: Sequence[CandidateScore]) -> CandidateScore:
     """Combines the scores of a candidate over runs that differ only in their random numbers.
 
     The class is the worst of all runs, and each number is the mean over the runs. A number that
-    is missing for one of the runs is None.
+    is missing for one of the runs is `None`.
 
     Args:
         scores: Score of each run, at least one.
@@ -500,7 +501,7 @@ def measure_candidate(text: str, twin_text: str | None) -> CandidateScore:
 
     Args:
         text: Canonical text of the candidate's scenario.
-        twin_text: Canonical text of the twin's scenario. None if there is no twin. The final
+        twin_text: Canonical text of the twin's scenario. `None` if there is no twin. The final
             pose is then taken from the candidate's own run.
 
     Returns:
@@ -637,7 +638,7 @@ def _compute_promised_motion(
             external torques.
 
     Returns:
-        The promised joint angles, shape (N, K, n), in rad. None if the law promises that the
+        The promised joint angles, shape (N, K, n), in rad. `None` if the law promises that the
         arms move together.
     """
     laws = [scenario.sites[name].control for name in scenario.names]
@@ -687,8 +688,8 @@ def _find_settling_time(t_s: Array, e: Array) -> float | None:
         e: Errors, shape (N, K, n), in rad.
 
     Returns:
-        The time. It is 0 if |e| is always below 0.01 rad, and None if |e| is not below 0.01 rad
-        at the end.
+        The time. It is 0 if |e| is always below 0.01 rad, and `None` if |e| is not below 0.01
+        rad at the end.
     """
     largest_rad = np.abs(e).max(axis=(0, 2))
     is_settled = largest_rad[-1] < SETTLED_ERROR_RAD

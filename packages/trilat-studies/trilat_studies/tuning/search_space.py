@@ -149,7 +149,7 @@ class _TunedGain(NamedTuple):
 
     Attributes:
         name: Name of the gain.
-        unit: Unit of the gain. Empty if it has none.
+        unit: Unit of the gain. Empty if the gain has no unit.
         low: Least value.
         high: Largest value.
         where: Role of the sites that have the gain. Empty if all sites have it.
@@ -170,7 +170,7 @@ class SearchSpace(NamedTuple):
             which gets the true inertia of the arm.
         knobs: Gains that are searched, with their units and ranges.
         known_facts: Information about the arm that the law gets, as text for tables.
-        kind: Class of a built-in law. None for a user's law.
+        kind: Class of a built-in law. `None` for a user's law.
     """
 
     law: str

@@ -90,7 +90,7 @@ class Objective(StrEnum):
             score: Score of the candidate.
 
         Returns:
-            The objective and the effort. None if the candidate may not be part of a Pareto
+            The objective and the effort. `None` if the candidate may not be part of a Pareto
             front, because it is not stable or does not end at the common pose.
         """
         value = score.error_rad if self is Objective.ERROR else score.settled_s
@@ -797,7 +797,7 @@ def plan_tuning(
 ) -> TuningPlan:
     """Plans a comparison of control laws with tuned gains, and checks that it can run.
 
-    The arguments are explained at `trilat_net.tune`. Overrides are texts KEY=VALUE. With
+    The arguments are explained in `trilat_net.tune`. Overrides are texts KEY=VALUE. With
     several seeds, the first is the seed of the scenario, and each further seed is larger by 1.
 
     Returns:

@@ -236,8 +236,8 @@ def _format_mean(mean: float | None, half: float | None) -> str:
     """Returns a mean as text, with the half-width of its confidence interval if known.
 
     Args:
-        mean: The mean, or None.
-        half: Half the width of the interval, or None.
+        mean: The mean, or `None`.
+        half: Half the width of the interval, or `None`.
     """
     if mean is None or half is None:
         return format_number(mean)
