@@ -42,7 +42,6 @@ from trilat_net.records import Mode
 from trilat_net.scenario import (
     LinkTables,
     Scenario,
-    find_owner,
     make_site_order,
     resolve_change,
     to_core_change,
@@ -353,7 +352,7 @@ class ChangeServer:
             self._scenario, self._links, {**settings, "to": request.to}, from_ns
         )
 
-        responsible_site = find_owner(change)
+        responsible_site = change.owner
         if responsible_site != self._site:
             raise ScenarioError(
                 f"{self._site} cannot make this change; send the change to {responsible_site}"

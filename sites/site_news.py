@@ -26,7 +26,7 @@ from trilat_net.log import compute_task_errors
 from trilat_net.net import MODE_WORDS, ClockNotice, EventPublisher
 from trilat_net.recorded_change import count_skipped_ticks
 from trilat_net.records import NS_PER_S, Mode, TickRecord
-from trilat_net.scenario import Change, describe_change
+from trilat_net.scenario import Change
 
 from .site_parts import SiteParts
 
@@ -95,7 +95,7 @@ class SiteNews:
             if count_skipped_ticks([change]):
                 continue
             source = parts.changes.sources.pop(change, "")
-            sentence = describe_change(msgspec.json.decode(change, type=Change), source)
+            sentence = msgspec.json.decode(change, type=Change).describe(source)
             self._publisher.publish(
                 "change", sentence, command=change, t_ns=output.t_ns, ticks=output.tick
             )

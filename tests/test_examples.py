@@ -28,7 +28,6 @@ from trilat_net.log.ros2.topic_names import TopicTable
 from trilat_net.net.arm_client import SwitchClient
 from trilat_net.net.bus import Bus
 from trilat_net.scenario import load_scenario
-from trilat_net.scenario.validate import list_simulated_settings
 
 LOOK = Path(__file__).parents[1] / "examples" / "look_into_a_log.py"
 
@@ -174,7 +173,7 @@ def test_two_operator_scenarios_run_with_simulated_robots(name: str) -> None:
     live = trilat_net.load_scenario(path)
     assert live.outside == ("s",)
     assert {spec.on_stale.action for spec in live.sites.values()} == {"glide"}
-    settings = {**list_simulated_settings(live), "link.model": "none"}
+    settings = {**live.simulated_settings, "link.model": "none"}
     log = trilat_net.simulate(path, settings, duration_s=2.0)
     assert log.scenario.open_hands == ("m1", "m2")
     assert abs(log["s"].q - log["s"].q[0]).max() < 1e-9  # no arm sinks
@@ -183,7 +182,7 @@ def test_two_operator_scenarios_run_with_simulated_robots(name: str) -> None:
 def test_six_joint_robot_follows_a_push() -> None:
     path = LOOK.with_name("two_operators_six_joints.toml")
     push = {"kind": "pulse", "start_s": 1.0, "end_s": 4.0, "peak_nm": [10, 10, 10, 3, 2, 1]}
-    settings = list_simulated_settings(trilat_net.load_scenario(path))
+    settings = trilat_net.load_scenario(path).simulated_settings
     log = trilat_net.simulate(path, {**settings, "sites.m1.hands": [push]}, duration_s=20.0)
     moved = abs(log["s"].q[-1] - log["s"].q[0])
     assert min(moved) > 0.2, "each joint was pushed"

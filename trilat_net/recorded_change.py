@@ -39,7 +39,7 @@ class RecordedChange(
 
     It changes a network link, the weights with which an arm follows the others, or gives a
     command to one arm's process. Exactly one of `link`, `dominance` and `site` is not empty.
-    The values are not checked; `scenario_types.Change` is the checked form.
+    The values are not checked; `change.Change` is the checked form.
 
     Attributes:
         at_s: Time at which the change takes effect, in s after the epoch, the common start

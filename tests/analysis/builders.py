@@ -30,8 +30,8 @@ from trilat_net.log.site_log import SiteLog
 from trilat_net.net import topics
 from trilat_net.net.wire import encode, encode_state
 from trilat_net.scenario import Scenario, load_scenario, parse_scenario
+from trilat_net.scenario.change import Change
 from trilat_net.scenario.run_changes import to_core_change
-from trilat_net.scenario.scenario_types import Change
 
 FOUR = """
 name = "four"

@@ -17,7 +17,7 @@ from trilat_net.scenario.expect import Expect
 from trilat_net.scenario.key_checks import StructType, list_fields
 from trilat_net.scenario.laws import LAWS
 from trilat_net.scenario.operators import ENVIRONMENTS, OPERATORS
-from trilat_net.scenario.scenario_types import SITE_GROUPS
+from trilat_net.scenario.site_spec import SITE_GROUPS
 from trilat_net.scenario.written_kinds import written_kind
 from trilat_net.scenario.written_tables import WrittenChange, WrittenScenario, WrittenSite
 

@@ -5,9 +5,8 @@ from typing import Any, get_args
 
 import pytest
 
-from trilat_net.scenario.event_text import describe_event
-from trilat_net.scenario.run_changes import describe_change, find_requester
-from trilat_net.scenario.scenario_types import Change, SiteOrder
+from trilat_net.scenario.change import Change, describe_event, find_requester
+from trilat_net.scenario.scenario_types import SiteOrder
 
 CHANGES = {
     "m2 was stopped by the experimenter at 58.2 s": {
@@ -40,9 +39,9 @@ def event_of(table: dict[str, Any], text: str = "s takes in {}") -> tuple[str, s
 @pytest.mark.parametrize("sentence", CHANGES)
 def test_a_change_is_a_sentence(sentence: str) -> None:
     table = CHANGES[sentence]
-    assert describe_change(Change(**table), "the experimenter") == sentence
+    assert Change(**table).describe("the experimenter") == sentence
     without = sentence.replace(" by the experimenter", "")
-    assert describe_change(Change(**table)) == without
+    assert Change(**table).describe() == without
     assert describe_event(*event_of(table)) == without
     assert describe_event(*event_of(table, sentence)) == sentence
 
@@ -50,7 +49,7 @@ def test_a_change_is_a_sentence(sentence: str) -> None:
 @pytest.mark.parametrize("order", [order for order in get_args(SiteOrder) if order])
 def test_every_order_is_a_sentence(order: str) -> None:
     change = Change(at_s=1.0, site="m1", order=order, ticks=int(order == "overrun"))  # type: ignore[arg-type]
-    sentence = describe_change(change)
+    sentence = change.describe()
     assert "m1" in sentence
     assert sentence.endswith("1.0 s")
     assert not set("{}_") & set(sentence)
@@ -60,8 +59,8 @@ def test_every_order_is_a_sentence(order: str) -> None:
 def test_the_source_of_a_stop_is_recovered() -> None:
     change = Change(at_s=58.2, site="m2", order="stop")
     for who in ("the experimenter", "the user of m1", "a watcher at a terminal"):
-        assert find_requester(describe_change(change, who)) == who
-    assert find_requester(describe_change(change)) == ""
+        assert find_requester(change.describe(who)) == who
+    assert find_requester(change.describe()) == ""
     assert find_requester("m2 follows its peers from t = 1.000 s") == ""
 
 

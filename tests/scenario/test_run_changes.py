@@ -13,12 +13,7 @@ from trilat_net.core.links.delay import DelayKind, LinkModel
 from trilat_net.core.step.ticks import DominanceRamp, first_tick_at
 from trilat_net.errors import ScenarioError
 from trilat_net.execution import virtual
-from trilat_net.scenario import (
-    Scenario,
-    find_owner,
-    load_scenario,
-    parse_core_change,
-)
+from trilat_net.scenario import Scenario, load_scenario, parse_core_change
 from trilat_net.scenario.run_changes import LinkTables, resolve_change, to_core_change
 
 S = 10**9
@@ -104,14 +99,14 @@ def test_commands_hold_from_their_tick_at_receivers() -> None:
     change = resolve_order(
         scenario, {"link": "m1->s", "to": {"delay_ms": 350, "loss": 0.05}}, 123_456_789
     )
-    assert (find_owner(change), change.start_ns) == ("s", 123_456_789)
+    assert (change.owner, change.start_ns) == ("s", 123_456_789)
     change_made = to_core_change(scenario, change)
     assert (change_made.peer, change_made.model) == (
         0,
         LinkModel(from_ns=123_456_789, location=350_000.0, loss_good=0.05),
     )
     change = resolve_order(scenario, {"dominance": "m2", "to": {"s": 1}, "ramp_s": 0.5}, 2 * S)
-    assert find_owner(change) == "m2"
+    assert change.owner == "m2"
     assert to_core_change(scenario, change).ramp == DominanceRamp(
         2 * S, 2_500_000_000, (0.0, 1.0)
     )

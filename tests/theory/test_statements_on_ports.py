@@ -18,7 +18,6 @@ from trilat_net.core.links.dominance import find_balancing_weights
 from trilat_net.core.step.control import project_estimate
 from trilat_net.laws.conditions import COMMON_MOTION_SHARE
 from trilat_net.scenario import load_scenario
-from trilat_net.scenario.describe import lacks_detailed_balance
 
 
 def one_factor(a: float) -> Any:
@@ -113,10 +112,10 @@ def test_scenarios_of_irreversible_shares_say_so() -> None:
         "dominance.s": {"m1": 0.25, "m2": 0.75},
     }
     known = {"control.Gamma": 0.0, "control.theta_hat0": [3.0, 1.0, 1.0, 2.0, 1.0]}
-    assert lacks_detailed_balance(load_scenario("p_d_margin", rows))
-    assert lacks_detailed_balance(load_scenario("free", {**rows, **known}))
-    assert not lacks_detailed_balance(load_scenario("free", rows))  # gravity is learnt
-    assert not lacks_detailed_balance(load_scenario("p_d_margin"))
+    assert load_scenario("p_d_margin", rows).has_irreversible_shares
+    assert load_scenario("free", {**rows, **known}).has_irreversible_shares
+    assert not load_scenario("free", rows).has_irreversible_shares  # gravity is learnt
+    assert not load_scenario("p_d_margin").has_irreversible_shares
 
 
 def make_reflecting_network(d_m: float, delay_s: float, slave_kg: float = 1.5) -> Network:

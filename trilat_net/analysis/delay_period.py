@@ -19,7 +19,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ..core import DelayKind, TraceEnd
-from ..scenario import LinkBase, Scenario, scheduled_links
+from ..scenario import LinkBase, Scenario
 
 MAX_PERIOD_TICKS = 400_000
 """Longest true period that is analysed, in ticks of the fastest site."""
@@ -195,7 +195,7 @@ def find_final_link(scenario: Scenario, name: str) -> LinkBase:
     """
     end_ns = round(scenario.duration_s * 1e9)
     link: LinkBase = scenario.links[name]
-    for from_ns, later_link in scheduled_links(scenario.timeline, name):
+    for from_ns, later_link in scenario.scheduled_links(name):
         link = later_link if from_ns <= end_ns else link
     return link
 

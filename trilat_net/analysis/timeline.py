@@ -20,14 +20,7 @@ from ..core import HELD_OVERRUN_TICKS, LifeAlarm
 from ..errors import count_nouns
 from ..log import Log, SiteLog
 from ..net import MODES, ModeMeaning
-from ..scenario import (
-    Change,
-    LinkBase,
-    describe_change,
-    describe_event,
-    find_owner,
-    find_requester,
-)
+from ..scenario import Change, LinkBase, describe_event, find_requester
 
 
 def list_effective_commands(log: Log) -> list[Change]:
@@ -172,7 +165,7 @@ def list_changes(log: Log) -> list[_AppliedChange]:
         LogError: A record names a change that is not valid.
     """
     applied_changes = [
-        _AppliedChange(change, find_owner(change), None, describe_change(change))
+        _AppliedChange(change, change.owner, None, change.describe())
         for change in log.scenario.timeline
     ]
 
@@ -187,7 +180,7 @@ def list_changes(log: Log) -> list[_AppliedChange]:
                 change = msgspec.json.decode(text, type=Change)
                 event = change_events.get((site, text))
                 if event is None:
-                    sentence = describe_change(change)
+                    sentence = change.describe()
                 else:
                     sentence = describe_event(event.kind, event.text, event.command)
                 applied_changes.append(_AppliedChange(change, site, tick, sentence))

@@ -26,7 +26,7 @@ from typing import Any
 from trilat_net.entry_points import HOOKS, load_entry
 from trilat_net.errors import RunFailed, ScenarioError, SessionError, UsageError
 from trilat_net.net import topics
-from trilat_net.scenario import Scenario, embedded_names_reader, find_site, parse_embedded
+from trilat_net.scenario import Scenario, embedded_names_reader, parse_embedded
 
 from ..net import (
     OPERATOR,
@@ -953,7 +953,7 @@ def open_hand(
     Raises:
         UsageError: The scenario does not permit a live operator at that arm.
     """
-    find_site(scenario, site)
+    scenario.find_site(site)
     live = scenario.sites[site].find_live_hand(is_open=True)
     if live is None:
         open_sites = ", ".join(scenario.open_hands)

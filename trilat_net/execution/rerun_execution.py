@@ -36,8 +36,6 @@ from ..scenario import (
     Scenario,
     describe_law,
     describe_value,
-    find_owner,
-    find_site,
     flatten_table,
     load_scenario,
     parse_scenario,
@@ -147,7 +145,7 @@ def resolve_rerun_request(
         raise UsageError(f"name the sites to execute: give {hint}")
 
     for name in replace:
-        find_site(original, name)
+        original.find_site(name)
     replaced = tuple(name for name in names if closed_loop or name in replace)
     _refuse_external_sites(original, replaced)
     recorded = tuple(name for name in names if name not in replaced)
@@ -287,8 +285,8 @@ def _join_scenarios(
     def choose(site: str) -> Scenario:
         return original if site in recorded else requested
 
-    timeline = [change for change in original.timeline if find_owner(change) in recorded]
-    timeline += [change for change in requested.timeline if find_owner(change) not in recorded]
+    timeline = [change for change in original.timeline if change.owner in recorded]
+    timeline += [change for change in requested.timeline if change.owner not in recorded]
     links = {}
     for link in original.links:
         receiver = link.partition("->")[2]

@@ -63,14 +63,7 @@ from ..net import (
 from ..own_code import ImportedLaw
 from ..recorded_change import count_skipped_ticks
 from ..records import NS_PER_S, Arrival, Mode, TickRecord
-from ..scenario import (
-    POLICY,
-    PlantPlayer,
-    Scenario,
-    make_hand_players,
-    make_plant_players,
-    refuse_external_arms,
-)
+from ..scenario import POLICY, PlantPlayer, Scenario, make_hand_players, make_plant_players
 from .resumption import read_output, select_peer_channels
 from .virtual_network import Network, PromptNetwork
 
@@ -385,7 +378,7 @@ def check_virtual(scenario: Scenario) -> None:
     # Arms that this program does not simulate are real robots, or belong to users' programs.
     real_robots = set(scenario.outside)
     simulated_by_user = set(scenario.external) - real_robots
-    refuse_external_arms(scenario, simulated_by_user)
+    scenario.refuse_external_arms(simulated_by_user)
     for name, settings in scenario.sites.items():
         if isinstance(settings.control, ImportedLaw):
             # A site creates its control law, and raises an error if this is not possible. The
@@ -448,7 +441,7 @@ def execute_virtual(
         LawFailed: A user's control law failed.
         PlantFailed: A user's plant failed.
     """
-    refuse_external_arms(scenario, {**measured, **plants})
+    scenario.refuse_external_arms({**measured, **plants})
     if network is None:
         rates_hz = {name: spec.rate_hz for name, spec in scenario.sites.items()}
         network = PromptNetwork(rates_hz)

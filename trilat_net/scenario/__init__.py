@@ -22,7 +22,6 @@ __all__ = [
     "apply_overrides",
     "check_outside_arms",
     "embedded_names_reader",
-    "find_site",
     "import_trace",
     "list_shipped",
     "load_scenario",
@@ -34,10 +33,8 @@ __all__ = [
     "parse_scenario",
     "read_source",
     "read_template",
-    "refuse_external_arms",
     "reseed_scenario",
     "split_assignment",
-    "write_simulated_options",
     # The parts of a scenario
     "BUILT_IN",
     "GRID_LOSSES_PERCENT",
@@ -51,11 +48,9 @@ __all__ = [
     "SiteSpec",
     "check_finite",
     "field_names",
-    "identify_law",
     "is_distribution",
     "is_number",
     "read_arm",
-    "scheduled_links",
     # Links and delays
     "ConstantDelay",
     "LinkBase",
@@ -87,8 +82,6 @@ __all__ = [
     "make_plant_players",
     # Changes during a run
     "LinkTables",
-    "describe_change",
-    "find_owner",
     "find_requester",
     "make_site_order",
     "parse_core_change",
@@ -109,13 +102,13 @@ __all__ = [
     "describe_scenario",
     "describe_value",
     "flatten_table",
-    "lacks_detailed_balance",
     "list_arm_notes",
     "list_law_situations",
 ]
 
 if TYPE_CHECKING:
     from .arms import TASK_AXES, ArmModel, read_arm
+    from .change import Change, describe_event, find_requester
     from .delay_models import LinkBase
     from .delay_models.kernel_delays import ConstantDelay, NoDelay
     from .delay_traces import TracePoint, import_trace
@@ -128,14 +121,12 @@ if TYPE_CHECKING:
         describe_scenario,
         describe_value,
         flatten_table,
-        lacks_detailed_balance,
         list_arm_notes,
         list_law_situations,
     )
-    from .event_text import describe_event
     from .expect import ALL_SITES_QUANTITIES, END_WINDOW_S, Expect, ExpectWindow
     from .key_checks import check_finite, field_names, is_distribution, is_number
-    from .laws import BUILT_IN, LAWS, identify_law
+    from .laws import BUILT_IN, LAWS
     from .link_presets import GRID_LOSSES_PERCENT, GRID_ROUND_TRIPS_MS
     from .operators import ActorBase
     from .operators.kernel_operators import (
@@ -161,9 +152,6 @@ if TYPE_CHECKING:
     from .plant_player import PlantContext, PlantPlayer, make_plant_players
     from .run_changes import (
         LinkTables,
-        describe_change,
-        find_owner,
-        find_requester,
         make_site_order,
         parse_core_change,
         resolve_change,
@@ -179,7 +167,6 @@ if TYPE_CHECKING:
     from .scenario_reader import (
         ExperimentText,
         embedded_names_reader,
-        find_site,
         list_shipped,
         load_scenario,
         parse_embedded,
@@ -188,27 +175,28 @@ if TYPE_CHECKING:
         read_template,
         reseed_scenario,
     )
-    from .scenario_types import Change, Limits, Scenario, SiteSpec, scheduled_links
+    from .scenario_types import Scenario
     from .simulated_arm import SimulatedArm
+    from .site_spec import Limits, SiteSpec
     from .skeletons import name_skeleton_class, new_hand, new_law, new_plant
-    from .validate import check_outside_arms, refuse_external_arms, write_simulated_options
+    from .validate import check_outside_arms
 else:
     __getattr__ = import_on_use(
         __name__,
         {
             "arms": "ArmModel TASK_AXES read_arm",
+            "change": "Change describe_event find_requester",
             "delay_models": "LinkBase",
             "delay_models.kernel_delays": "ConstantDelay NoDelay",
             "delay_traces": "TracePoint import_trace",
             "describe": (
                 "IRREVERSIBLE_SHARES ScenarioDifference compare_scenarios describe_law "
                 "describe_law_conditions describe_scenario describe_value flatten_table "
-                "lacks_detailed_balance list_arm_notes list_law_situations"
+                "list_arm_notes list_law_situations"
             ),
-            "event_text": "describe_event",
             "expect": "ALL_SITES_QUANTITIES END_WINDOW_S Expect ExpectWindow",
             "key_checks": "check_finite field_names is_distribution is_number",
-            "laws": "BUILT_IN LAWS identify_law",
+            "laws": "BUILT_IN LAWS",
             "link_presets": "GRID_LOSSES_PERCENT GRID_ROUND_TRIPS_MS",
             "operators": "ActorBase",
             "operators.kernel_operators": (
@@ -222,19 +210,19 @@ else:
             "own_plant": "OwnPlant",
             "plant_player": "PlantContext PlantPlayer make_plant_players",
             "run_changes": (
-                "LinkTables describe_change find_owner find_requester make_site_order "
-                "parse_core_change resolve_change to_core_change"
+                "LinkTables make_site_order parse_core_change resolve_change to_core_change"
             ),
             "sample_uses": (
                 "LinkSchedule PictureDelay draw_link_samples draw_used_samples first_ticks"
             ),
             "scenario_reader": (
-                "ExperimentText embedded_names_reader find_site list_shipped load_scenario "
+                "ExperimentText embedded_names_reader list_shipped load_scenario "
                 "parse_embedded parse_scenario read_source read_template reseed_scenario"
             ),
-            "scenario_types": "Change Limits Scenario SiteSpec scheduled_links",
+            "scenario_types": "Scenario",
             "simulated_arm": "SimulatedArm",
+            "site_spec": "Limits SiteSpec",
             "skeletons": "name_skeleton_class new_hand new_law new_plant",
-            "validate": "check_outside_arms refuse_external_arms write_simulated_options",
+            "validate": "check_outside_arms",
         },
     )

@@ -24,7 +24,6 @@ from ..core import (
     Array,
     ChainJoint,
     DelayKind,
-    find_balancing_weights,
     link_key,
 )
 from ..errors import count_nouns
@@ -42,7 +41,8 @@ from .operators.kernel_operators import (
 from .rest_bounds import find_rest_bounds
 from .sample_uses import count_silences, draw_used_samples
 from .scenario_reader import load_scenario
-from .scenario_types import Scenario, SiteSpec
+from .scenario_types import Scenario
+from .site_spec import SiteSpec
 from .urdf import UrdfJoint
 
 # Notes on the matrix of dominance factors, the weights with which sites follow their peers.
@@ -55,21 +55,6 @@ IRREVERSIBLE_SHARES = (
     "alpha_ji), so no damping suffices for every passive operator "
     "(docs/theory/port-conditions.md, 14)"
 )
-
-
-def lacks_detailed_balance(scenario: Scenario) -> bool:
-    """Returns True if the weights with which arms follow each other are irreversible.
-
-    The weight alpha_ij (dominance factor) states how much arm i follows arm j. The weights are
-    reversible if there is a diagonal matrix D > 0 for which D (I - alpha) is symmetric, where I
-    is the identity matrix. Some stability conditions require this. The result is False if a
-    control law exchanges more than positions or does not compensate gravity, because the
-    condition does not apply then.
-    """
-    laws = [spec.control for spec in scenario.sites.values()]
-    if not all(law.exchanges_positions() for law in laws):
-        return False
-    return find_balancing_weights(scenario.alpha) is None
 
 
 def _find_link_delays(links: Mapping[str, LinkBase], rates_hz: Mapping[str, int]) -> Array:
@@ -346,7 +331,7 @@ def _describe_shares(scenario: Scenario) -> list[str]:
     ]
     if beta is not None and np.ptp(beta) >= ROW_SUM_TOLERANCE:
         lines.append(COUPLED_OPERATORS)
-    if lacks_detailed_balance(scenario):
+    if scenario.has_irreversible_shares:
         lines.append(IRREVERSIBLE_SHARES)
     return lines
 

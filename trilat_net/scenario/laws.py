@@ -11,7 +11,7 @@ Invariant:
 import pkgutil
 from collections.abc import Iterator
 from importlib import import_module
-from typing import TYPE_CHECKING, Any, Union
+from typing import TYPE_CHECKING, Union
 
 from ..laws import ControlLaw, LawSettings, format_class_name
 from ..own_code import ImportedLaw
@@ -43,14 +43,3 @@ else:
     # Built at run time from the laws that were found.
     ChosenLaw = Union[tuple(LAWS.values())]  # noqa: UP007
     """Type of the key `control` of a site."""
-
-
-def identify_law(law: Any) -> str:
-    """Returns the name by which a scenario file selects a control law.
-
-    The name of a user's law consists of its module and class, for example "package.module:Law".
-
-    Args:
-        law: Control law of a site.
-    """
-    return law.code if isinstance(law, ImportedLaw) else str(law.tag)

@@ -23,7 +23,8 @@ from .delay_models import DELAY_MODELS
 from .key_checks import check_keys, field_names, hint_at_quotes
 from .laws import LAWS
 from .link_presets import PRESETS
-from .scenario_types import SITE_GROUPS, Scenario
+from .scenario_types import Scenario
+from .site_spec import SITE_GROUPS
 from .written_tables import TRACE_KEYS
 
 _KIND_KEYS = {"control": ("law",), "link": ("model", "preset")}

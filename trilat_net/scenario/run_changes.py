@@ -1,4 +1,4 @@
-"""Checks and describes changes of a running experiment, such as a new delay or a stop.
+"""Checks changes of a running experiment, such as a new delay or a stop.
 
 Three things can change: a network link between two arms, the weights with which an arm follows
 the others (dominance factors), and the mode of an arm, by commands such as stop, enable and
@@ -12,7 +12,6 @@ Invariant:
       uses.
 """
 
-import re
 from collections import deque
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -22,10 +21,11 @@ import msgspec
 from ..core import CoreChange, LifeOrder
 from ..errors import ScenarioError
 from ..records import NS_PER_S
+from .change import Change
 from .delay_models import LinkBase
 from .refusals import check_table
 from .resolve import complete_target, resolve_dominance_row
-from .scenario_types import Change, Scenario, SiteOrder
+from .scenario_types import Scenario, SiteOrder
 from .validate import check_change, check_links_memory
 from .written_tables import WrittenChange
 
@@ -99,20 +99,8 @@ def resolve_change(
         changed_scenario = msgspec.structs.replace(
             scenario, timeline=(*scenario.timeline, complete)
         )
-        check_links_memory(changed_scenario, find_owner(complete))
+        check_links_memory(changed_scenario, complete.owner)
     return complete
-
-
-def find_owner(change: Change) -> str:
-    """Returns the name of the arm whose process must carry out a change of a run.
-
-    The receiver of a network link carries out a change of this link. Any other change names its
-    arm. The process of an arm is called a site.
-
-    Args:
-        change: Change of a link or of dominance factors, or a command to a site.
-    """
-    return change.site or change.dominance or change.link.partition("->")[2]
 
 
 def make_site_order(
@@ -143,63 +131,6 @@ def make_site_order(
     return Change(at_s=from_ns / NS_PER_S, site=site, order=order, ticks=ticks)
 
 
-_ORDER_SENTENCES = {
-    "stop": "{site} was stopped{by} at {at}",
-    "enable": "{site} was enabled{by} at {at}",
-    "reset": "the fault of {site} was reset{by} at {at}",
-    "held": "the dead-man switch of {site} was held again at {at}",
-    "released": "the dead-man switch of {site} was released at {at}",
-    "arm_silent": "no measurement came from the arm of {site} at {at}",
-    "arm_lost": "the arm of {site} was silent for too long at {at}",
-    "arm_back": "measurements came again from the arm of {site} at {at}",
-    "overrun": "{site} missed {ticks} {noun} before {at}",
-}
-"""Sentence that describes each command to people."""
-
-
-def describe_change(change: Change, ordered_by: str = "") -> str:
-    """Describes a change of a run in a phrase for people.
-
-    An example is "m2 was stopped by the experimenter at 58.2 s", without a full stop.
-
-    Args:
-        change: A command to a site, or a change of a link or of dominance factors.
-        ordered_by: Who requested the change, as a noun phrase. Empty if this is not known.
-    """
-    by = f" by {ordered_by}" if ordered_by else ""
-    if change.order:
-        sentence = _ORDER_SENTENCES[change.order]
-        return sentence.format(
-            site=change.site,
-            by=by,
-            at=f"{change.at_s:.1f} s",
-            ticks=change.ticks,
-            noun="tick" if change.ticks == 1 else "ticks",
-        )
-    at = f"{round(change.at_s, 3):g} s"
-    if change.link:
-        link = change.after.describe()
-        return f"the link {change.link} was set to {link}{by}, from {at} on"
-    shares = ", ".join(f"{peer} {share:g}" for peer, share in change.to.items() if share)
-    ramp = f" within {change.ramp_s:g} s" if change.ramp_s else ""
-    target = shares or "nobody"
-    return f"the shares of {change.dominance} were set to {target}{ramp}{by}, from {at} on"
-
-
-def find_requester(sentence: str) -> str:
-    """Returns who requested a stop, from the sentence about it in a log, for a report.
-
-    Args:
-        sentence: Sentence that `describe_change` returned.
-
-    Returns:
-        The requester as a noun phrase. Empty if the sentence is not about a stop, or does not
-        say who requested it.
-    """
-    match = re.fullmatch(r"\S+ was stopped by (.+) at [\d.]+ s", sentence)
-    return "" if match is None else match[1]
-
-
 def to_core_change(scenario: Scenario, change: Change) -> CoreChange:
     """Converts a change during a run to the form that the compiled control loop reads.
 
@@ -209,7 +140,7 @@ def to_core_change(scenario: Scenario, change: Change) -> CoreChange:
             command to a site.
     """
     text = msgspec.json.encode(change).decode()
-    site = find_owner(change)
+    site = change.owner
     if change.order:
         return CoreChange(text, order=LifeOrder[change.order.upper()], skipped=change.ticks)
     if change.dominance:
@@ -255,7 +186,7 @@ def parse_core_change(scenario: Scenario, site: str, text: str) -> CoreChange:
 
     targets = [name for name in (change.link, change.dominance, change.site) if name]
     is_order = bool(change.order)
-    is_for_site = find_owner(change) == site
+    is_for_site = change.owner == site
     if not is_for_site or len(targets) != 1 or bool(change.site) != is_order:
         raise ScenarioError(
             f"the record contains a command that is not for {site}", path=text[:80]

@@ -34,7 +34,7 @@ from .override import (
     split_entries,
 )
 from .resolve import resolve_scenario
-from .scenario_types import Scenario, SiteSpec
+from .scenario_types import Scenario
 from .validate import build_scenario
 
 MAX_KEY_PARTS = 32
@@ -268,29 +268,6 @@ def read_source(source: str | Path) -> tuple[str, Path]:
     except (OSError, UnicodeDecodeError) as error:
         reason = getattr(error, "strerror", None) or "not UTF-8 text"
         raise ScenarioError(f"cannot be read: {reason}", source=name) from None
-
-
-def find_site(scenario: Scenario, name: str) -> SiteSpec:
-    """Returns an arm of a scenario by its name; the error for a wrong name suggests another.
-
-    An arm with its control loop is called a site.
-
-    Args:
-        scenario: Description of the experiment.
-        name: Name of the site.
-
-    Raises:
-        ScenarioError: There is no such site.
-    """
-    if name not in scenario.sites:
-        hint = suggest_nearest(name, scenario.names)
-        # A question mark ends a sentence.
-        listing = " The sites are " if hint else "; the sites are "
-        raise ScenarioError(
-            f"there is no site {name!r}{hint}" + listing + ", ".join(scenario.names),
-            source=scenario.name,
-        )
-    return scenario.sites[name]
 
 
 _PARSE_LOCK = RLock()

@@ -1,4 +1,4 @@
-"""Defines the types of a complete scenario: the whole, its arms, limits and planned changes.
+"""Defines the type of a complete scenario, in which every value is explicit.
 
 A scenario describes an experiment. Each arm is controlled by a process called a site, and each
 pair of sites is connected by two directed links. `Scenario.setup` translates a scenario into
@@ -6,19 +6,14 @@ the numbers from which the simulation kernel, the compiled control and simulatio
 site.
 
 Invariant:
-    - The name of a key ends in its unit. Symbols are those of the paper on which the project is
-      based.
     - `Scenario.text` is canonical: loading it gives the same scenario. Its SHA-256 hash
       identifies the experiment.
-    - A change contains the time from which it holds, and the complete settings after it, so
-      that it can be understood without the earlier changes.
 """
 
 import hashlib
-import math
 import re
 import zlib
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator
 from functools import cached_property
 from typing import Annotated, Any, Literal
 
@@ -38,267 +33,33 @@ from ..core import (
     RestGains,
     Scheme,
     SiteSetup,
-    StaleAction,
-    StaleRule,
     dominance,
+    find_balancing_weights,
     link_key,
     make_layout,
 )
-from ..errors import ScenarioError
-from ..fields import Frozen, Joints, Positive, PositiveJoints, RateHz, Real
+from ..errors import ScenarioError, suggest_nearest
+from ..fields import Frozen
 from ..laws import SentVectorSpecs
 from ..own_code import build_channel
-from ..recorded_change import RecordedChange
 from ..recorded_change import SiteOrder as SiteOrder
-from ..records import MAX_JOINTS, Layout
+from ..records import Layout
 from .arms import (
     START_MARGIN_RAD,
     Arm,
     ArmModel,
-    Task,
     bound_estimates,
     build_arm,
     compute_rest_gains,
     start_margin,
 )
+from .change import Change
 from .delay_models import Link, LinkBase
 from .distributions import Distribution
 from .expect import Expect
 from .laws import ChosenLaw
-from .operators import Environment, Operator
-from .operators.kernel_operators import LiveHand
 from .own_plant import OwnPlant
-
-
-class OnStale(Frozen, frozen=True, omit_defaults=True):
-    """What an arm does if the messages of another arm are too old or missing.
-
-    Every arm's process (site) sends its state, a sample, in each period of its control loop.
-
-    Attributes:
-        action: What the site does. "use": It goes on with the old sample. "hold": It keeps its
-            last reference. "brake": It keeps the position where its arm is. "glide": At the
-            start, it waits for all peers. If no sample of a peer has come into use for
-            `silence_ms`, its reference decelerates to rest. Later it aligns with its peers
-            without a jump.
-        age_ms: Age of a sample beyond which it is too old, in ms. Not used by "glide".
-        return_s: Duration of the return to the reference after a fresh sample has come into
-            use, in s. Not used by "glide".
-        silence_ms: For "glide": time without a new sample in use after which a peer counts as
-            silent, in ms.
-        align_speed_rad_s: For "glide": speed with which the site moves to its peers, in rad/s,
-            or in m/s if the sites share a position.
-        align_limit_rad: For "glide": longest path that the site moves by itself, in rad, or in
-            m if the sites share a position.
-        on_lost: For "glide": reaction to a silent peer. "hold": The site waits for the peer.
-            "degrade": It goes on without a silent master, as long as the remaining sites all
-            reach each other.
-    """
-
-    action: Literal["use", "hold", "brake", "glide"] = "use"
-    age_ms: Annotated[float, Meta(gt=0.0, le=1e6)] = 350.0
-    return_s: Annotated[float, Meta(gt=0.0, le=1e3)] = 1.0
-    silence_ms: Annotated[float, Meta(gt=0.0, le=1e4)] = 20.0
-    align_speed_rad_s: Annotated[float, Meta(gt=0.0, le=1e3)] = 0.5
-    align_limit_rad: Annotated[float, Meta(gt=0.0, le=1e3)] = 1.0
-    on_lost: Literal["hold", "degrade"] = "hold"
-
-    @property
-    def rule(self) -> StaleRule:
-        """What to do if messages of another arm are missing, as the control loop reads it.
-
-        Times are converted from ms to whole ns, because the compiled code computes with
-        integers.
-        """
-        if self.action == "glide":
-            return StaleRule(
-                action=StaleAction.GLIDE,
-                age_ns=round(self.silence_ms * 1e6),
-                align_speed=self.align_speed_rad_s,
-                align_limit=self.align_limit_rad,
-                degrades=self.on_lost == "degrade",
-            )
-        return StaleRule(
-            action=StaleAction[self.action.upper()],
-            age_ns=round(self.age_ms * 1e6),
-            return_ns=round(self.return_s * 1e9),
-        )
-
-
-SpeedLimit = Annotated[float, Meta(gt=0.0, le=10_000.0)]
-JointSpeedLimits = Annotated[
-    tuple[SpeedLimit, ...],
-    Meta(min_length=1, max_length=MAX_JOINTS, extra={"per": "joints"}),
-]
-SharedSpeedLimits = Annotated[
-    tuple[SpeedLimit, ...],
-    Meta(min_length=1, max_length=MAX_JOINTS, extra={"per": "shared"}),
-]
-
-
-GLIDE_TAU_RATE_NM_S = 1000.0
-"""Default limit of the torque's rate of change under the stale rule "glide", in N m/s.
-
-It is the limit of Franka's arms, 1 N m per millisecond.
-"""
-
-
-def _or_infinity(limit: Any) -> Any:
-    """Returns a limit, or infinity if there is none."""
-    return math.inf if limit is None else limit
-
-
-class Limits(Frozen, frozen=True):
-    """Limits of one arm, such as its largest torque, for all joints together or for each.
-
-    If a limit is exceeded, the run ends. Under the rule "glide" for silent arms, only this arm
-    is brought to rest instead.
-
-    Attributes:
-        tau_limit_nm: Largest control torque of a joint, in N m. A larger torque is cut off. By
-            default, the efforts in the URDF file of a chain.
-        qd_limit_rad_s: Joint speed beyond which a run counts as diverged and ends, in rad/s.
-            Under the stale rule "glide", only the site stops with a fault, and the run goes on.
-            By default, the speeds in the URDF file of a chain.
-        tau_rate_limit_nm_s: Largest rate of change of a joint's control torque, in N m/s. By
-            default there is no limit, but `GLIDE_TAU_RATE_NM_S` under the stale rule "glide".
-        qd_des_limit_rad_s: Largest speed of the reference, in rad/s, or in m/s if the sites
-            share a position.
-        q_min_rad: Smallest angle of a joint, in rad. Beyond it, the site stops with a fault.
-            Allowed only under the stale rule "glide".
-        q_max_rad: Largest angle of a joint, in rad. Like `q_min_rad`.
-    """
-
-    tau_limit_nm: Positive | PositiveJoints = 200.0
-    qd_limit_rad_s: SpeedLimit | JointSpeedLimits = 100.0
-    tau_rate_limit_nm_s: Positive | PositiveJoints | None = None
-    qd_des_limit_rad_s: SpeedLimit | SharedSpeedLimits | None = None
-    q_min_rad: Real | Joints | None = None
-    q_max_rad: Real | Joints | None = None
-
-    @property
-    def motion(self) -> MotionLimits:
-        """Limits of angles, reference speed and torque rate, as the control loop reads them.
-
-        A limit that the author left out is infinite, so that the loop needs no special case.
-        """
-        return MotionLimits(
-            q_min=-math.inf if self.q_min_rad is None else self.q_min_rad,
-            q_max=_or_infinity(self.q_max_rad),
-            qd_des_limit=_or_infinity(self.qd_des_limit_rad_s),
-            tau_rate=_or_infinity(self.tau_rate_limit_nm_s),
-        )
-
-
-class SiteSpec(Frozen, frozen=True):
-    """Description of a site in a scenario: an arm with its control loop.
-
-    A site is a process that runs one arm. Its peers are the other sites whose states it
-    receives.
-
-    Attributes:
-        role: Role of the site for people who read figures, and for the stale rule "degrade". It
-            enters no formula.
-        rate_hz: Tick rate of the control loop, in Hz.
-        q0_rad: Start pose, in rad.
-        qd0_rad_s: Start velocity, in rad/s.
-        arm: Arm of the site.
-        control: Control law and its gains.
-        limits: Limits of torques, speeds and positions.
-        on_stale: Reaction if the samples of a peer are too old or missing.
-        task: Coordinates that the site shares with its peers: its joint angles, or the pose of
-            its end effector.
-        hands: Operators: persons or programs who move the arm.
-        environment: Walls and other bodies that act on the arm.
-        plant: Who moves the arm. "simulated": The program. "external": A real robot, whose
-            state is measured. Otherwise a user's class, which computes the motion.
-        view: Delay, loss and order of the picture in which the user of the site sees the other
-            arms. It has the keys of a link. None if the user sees the samples that the
-            controller uses. The view enters no formula.
-    """
-
-    role: Literal["master", "slave"]
-    rate_hz: RateHz
-    q0_rad: Joints
-    qd0_rad_s: Joints
-    arm: Arm
-    control: ChosenLaw
-    limits: Limits
-    on_stale: OnStale = OnStale()
-    task: Task = Task()
-    hands: tuple[Operator, ...] = ()
-    environment: tuple[Environment, ...] = ()
-    plant: Literal["simulated", "external"] | OwnPlant = "simulated"
-    view: Link | None = None
-
-    def find_live_hand(self, *, is_open: bool = False) -> LiveHand | None:
-        """Finds the operator of the site who may move the arm while the session runs.
-
-        An operator is a person or program that moves the arm.
-
-        Args:
-            is_open: If True, an operator counts only if any member of the session may take the
-                role.
-
-        Returns:
-            The operator. None if the site has no such operator.
-        """
-        for hand in self.hands:
-            if isinstance(hand, LiveHand) and (hand.is_open or not is_open):
-                return hand
-        return None
-
-
-SITE_GROUPS: dict[str, type[Frozen]] = {
-    "arm": Arm,
-    "limits": Limits,
-    "on_stale": OnStale,
-    "task": Task,
-}
-"""Groups of keys that may be written once for all sites and again for one site, by table."""
-
-
-class Change(RecordedChange, frozen=True, omit_defaults=True):
-    """Change during a run: of a network link, of weights, or a command to one arm's process.
-
-    The weights (dominance factors) state how much an arm follows the others. A scenario plans
-    changes, and users request further ones. Exactly one of `link`, `dominance` and `site` is
-    not empty, and says what is changed. Commands (`site`) occur only in the log of a run.
-    """
-
-    @property
-    def start_ns(self) -> int:
-        """Time at which the change takes effect, in ns after the common start of the session.
-
-        Times of the simulation are integers, so that they are the same on every machine.
-        """
-        return round(self.at_s * 1e9)
-
-    @property
-    def after(self) -> LinkBase:
-        """All settings of a network link after this change, also those that stay the same.
-
-        Only a change of a link has them.
-        """
-        return msgspec.convert(self.to, Link)
-
-
-def scheduled_links(timeline: Sequence[Change], name: str) -> Iterator[tuple[int, LinkBase]]:
-    """Yields the settings that a link takes during a run because of planned changes.
-
-    The settings at the start of the run are not included.
-
-    Args:
-        timeline: Changes of the run, in the order of their times.
-        name: Name of the link, for example "m1->s".
-
-    Yields:
-        The send time of the first affected sample, in ns after the epoch, and the link.
-    """
-    for change in timeline:
-        if change.link == name:
-            yield change.start_ns, change.after
-
+from .site_spec import SiteSpec
 
 _ABSENT_VALUES: dict[str, tuple[Any, ...]] = {
     **dict.fromkeys(("timeline", "environment"), ((), [])),
@@ -446,6 +207,21 @@ class Scenario(Frozen, frozen=True, dict=True):
             [[self.dominance[i].get(j, 0.0) for j in self.names] for i in self.names]
         )
 
+    @property
+    def has_irreversible_shares(self) -> bool:
+        """True if the weights with which the arms follow each other are irreversible.
+
+        The weight alpha_ij (dominance factor) states how much arm i follows arm j. The weights
+        are reversible if there is a diagonal matrix D > 0 for which D (I - alpha) is symmetric,
+        where I is the identity matrix. Some stability conditions require this. The value is
+        False if a control law exchanges more than positions or does not compensate gravity,
+        because the condition does not apply then.
+        """
+        laws = [spec.control for spec in self.sites.values()]
+        if not all(law.exchanges_positions() for law in laws):
+            return False
+        return find_balancing_weights(self.alpha) is None
+
     @cached_property
     def controls(self) -> tuple[ChosenLaw, ...]:
         """Control law of every arm with its gains, in the order of the arms.
@@ -559,14 +335,46 @@ class Scenario(Frozen, frozen=True, dict=True):
         """
         return tuple(name for name in self.names if name != site)
 
+    def find_site(self, name: str) -> SiteSpec:
+        """Returns a site, an arm with its control loop, by its name.
+
+        Args:
+            name: Name of the site.
+
+        Raises:
+            ScenarioError: There is no such site. The message suggests a similar name.
+        """
+        if name not in self.sites:
+            hint = suggest_nearest(name, self.names)
+            # A question mark ends a sentence.
+            listing = " The sites are " if hint else "; the sites are "
+            raise ScenarioError(
+                f"there is no site {name!r}{hint}" + listing + ", ".join(self.names),
+                source=self.name,
+            )
+        return self.sites[name]
+
+    def scheduled_links(self, name: str) -> Iterator[tuple[int, LinkBase]]:
+        """Yields the settings that a link takes during the run because of planned changes.
+
+        The settings at the start of the run are not included.
+
+        Args:
+            name: Name of the link, for example "m1->s".
+
+        Yields:
+            The send time of the first affected sample, in ns after the epoch, and the link.
+        """
+        for change in self.timeline:
+            if change.link == name:
+                yield change.start_ns, change.after
+
     def _all_links(self) -> list[LinkBase]:
         """Returns the settings of all network links, at the start and after planned changes.
 
         For example, a run is random if any of these settings has random delays.
         """
-        later_links = [
-            link for name in self.links for _, link in scheduled_links(self.timeline, name)
-        ]
+        later_links = [link for name in self.links for _, link in self.scheduled_links(name)]
         return [*self.links.values(), *later_links]
 
     @property
@@ -619,6 +427,64 @@ class Scenario(Frozen, frozen=True, dict=True):
         A simulation cannot run these sites. Empty if there are none.
         """
         return tuple(name for name, spec in self.sites.items() if spec.plant == "external")
+
+    @property
+    def simulated_settings(self) -> dict[str, Any]:
+        """Settings that must change to run the experiment with simulated arms only.
+
+        The value is the new value of each key, by the dotted name of the key. The masses of a
+        simulated arm are known, and only a real arm has a dead-man switch.
+        """
+        settings: dict[str, Any] = {}
+        for name in self.external:
+            settings[f"sites.{name}.plant"] = "simulated"
+            arm = self.sites[name].arm
+            if not arm.known:
+                settings[f"sites.{name}.arm.known"] = True
+            if arm.dead_man:
+                settings[f"sites.{name}.arm.dead_man"] = False
+        return settings
+
+    @property
+    def simulated_options(self) -> str:
+        """Command-line options that run the experiment with simulated arms only.
+
+        Error messages suggest these options `--set` when an experiment with real arms cannot be
+        simulated.
+        """
+        options = []
+        for key, value in self.simulated_settings.items():
+            text = str(value).lower() if isinstance(value, bool) else value
+            options.append(f"--set {key}={text}")
+        return " ".join(options)
+
+    def refuse_external_arms(self, exempt: Collection[str] = ()) -> None:
+        """Refuses an experiment with arms that the program does not simulate itself.
+
+        Such an arm is either a real robot outside of the program, or a user's class computes
+        its motion.
+
+        Args:
+            exempt: Names of sites whose arms may be external, because a log contains their
+                motion.
+
+        Raises:
+            ScenarioError: The arm of another site is external.
+        """
+        options = self.simulated_options
+        for name in self.external:
+            if name in exempt:
+                continue
+            problem = (
+                "is a user's own plant, which runs in `trilat sim` and live, but not here; to "
+                f"use the arm of the scenario instead, add: {options}"
+            )
+            if name in self.outside:
+                problem = (
+                    "is external: a scenario with an external arm can only run live; to "
+                    f"rehearse it with a simulated arm, add: {options}"
+                )
+            raise ScenarioError(problem, path=f"sites.{name}.plant", source=self.name)
 
     @property
     def open_hands(self) -> tuple[str, ...]:
@@ -832,7 +698,7 @@ class Scenario(Frozen, frozen=True, dict=True):
         """
         name = f"{peer}->{site}"
         first_link = self.links[name]
-        later_links = scheduled_links(self.timeline, name)
+        later_links = self.scheduled_links(name)
         links: list[tuple[int, LinkBase]] = [(0, first_link), *later_links]
         peer_index = self.names.index(peer)
         speed_limit: tuple[float, ...] = ()

@@ -15,7 +15,6 @@ from numpy.typing import ArrayLike
 from ..core import Array, build_chain, find_acceleration, place_joints
 from ..records import MAX_JOINTS
 from .arms import build_arm
-from .scenario_reader import find_site
 from .scenario_types import Scenario
 
 
@@ -45,7 +44,7 @@ class SimulatedArm:
     """
 
     def __init__(self, scenario: Scenario, site: str, heavier: float = 1.0) -> None:
-        spec = find_site(scenario, site)
+        spec = scenario.find_site(site)
         model = build_arm(spec.arm, spec.task, scenario.urdf, chains=True)
         model = model.widen_stops(spec.q0_rad)
         assert model.chain is not None

@@ -30,7 +30,7 @@ from .named_files import NamedFiles
 from .operators import ENVIRONMENTS, OPERATORS, HeldArm, resolve_operators
 from .own_plant import resolve_plant
 from .refusals import convert_drawn
-from .scenario_types import GLIDE_TAU_RATE_NM_S, SITE_GROUPS, Limits, SiteSpec
+from .site_spec import GLIDE_TAU_RATE_NM_S, SITE_GROUPS, Limits, SiteSpec
 
 _MIN_DOWN_LENGTH = 1e-6
 """Smallest sum of the absolute components of a vector that still counts as a direction."""

@@ -9,7 +9,7 @@ from functools import cache
 from .delay_models import DELAY_MODELS
 from .key_checks import field_names
 from .laws import LAWS
-from .scenario_types import SITE_GROUPS
+from .site_spec import SITE_GROUPS
 
 
 @cache

@@ -4,8 +4,8 @@ A scenario is the description of an experiment. The types of its tables limit ea
 The functions of this module check conditions that involve several keys, for example that a
 joint starts within its stops. `build_scenario` does both.
 
-`refuse_external_arms`, `refuse_live_only` and `check_outside_arms` are for callers that need
-more than a valid scenario: a run in virtual time, or a live session with real robots.
+`check_outside_arms` is for callers that need more than a valid scenario: a live session with
+real robots.
 
 Invariant:
     - An error contains the path of the key in the scenario file.
@@ -15,7 +15,7 @@ Invariant:
 """
 
 import math
-from collections.abc import Collection, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import msgspec
@@ -36,6 +36,7 @@ from ..laws import LawSettings
 from ..own_code import ImportedLaw, check_sends
 from . import operators
 from .arms import START_MARGIN_M, START_MARGIN_RAD, TASK_AXES, start_margin
+from .change import Change
 from .delay_models import Link
 from .delay_models.kernel_delays import ConstantDelay
 from .distributions import dotted_key
@@ -43,77 +44,11 @@ from .expect import find_expect_problem
 from .operators import kernel_operators
 from .operators.program_hand import ProgramHand
 from .refusals import convert_drawn, refuse
-from .scenario_types import Change, Limits, Scenario, SiteSpec
+from .scenario_types import Scenario
+from .site_spec import Limits, SiteSpec
 
 RANK_TOLERANCE = 1e-6
 """Ratio of a singular value to the largest one below which the direction counts as immobile."""
-
-
-def list_simulated_settings(scenario: Scenario) -> dict[str, Any]:
-    """Returns the settings that must change to run an experiment with simulated arms only.
-
-    The masses of a simulated arm are known, and only a real arm has a dead-man switch.
-
-    Args:
-        scenario: Description of the experiment.
-
-    Returns:
-        The new value of each key that has to change, by the dotted name of the key.
-    """
-    settings: dict[str, Any] = {}
-    for name in scenario.external:
-        settings[f"sites.{name}.plant"] = "simulated"
-        arm = scenario.sites[name].arm
-        if not arm.known:
-            settings[f"sites.{name}.arm.known"] = True
-        if arm.dead_man:
-            settings[f"sites.{name}.arm.dead_man"] = False
-    return settings
-
-
-def write_simulated_options(scenario: Scenario) -> str:
-    """Returns the command-line options that run an experiment with simulated arms only.
-
-    Error messages suggest these options `--set` when an experiment with real arms cannot be
-    simulated.
-
-    Args:
-        scenario: Description of the experiment.
-    """
-    options = []
-    for key, value in list_simulated_settings(scenario).items():
-        text = str(value).lower() if isinstance(value, bool) else value
-        options.append(f"--set {key}={text}")
-    return " ".join(options)
-
-
-def refuse_external_arms(scenario: Scenario, exempt: Collection[str] = ()) -> None:
-    """Refuses experiments with arms that the program does not simulate itself.
-
-    Such an arm is either a real robot outside of the program, or a user's class computes its
-    motion.
-
-    Args:
-        scenario: Description of the experiment.
-        exempt: Names of sites whose arms may be external, because a log contains their motion.
-
-    Raises:
-        ScenarioError: The arm of another site is external.
-    """
-    options = write_simulated_options(scenario)
-    for name in scenario.external:
-        if name in exempt:
-            continue
-        problem = (
-            "is a user's own plant, which runs in `trilat sim` and live, but not here; to use "
-            f"the arm of the scenario instead, add: {options}"
-        )
-        if name in scenario.outside:
-            problem = (
-                "is external: a scenario with an external arm can only run live; to rehearse "
-                f"it with a simulated arm, add: {options}"
-            )
-        raise ScenarioError(problem, path=f"sites.{name}.plant", source=scenario.name)
 
 
 OUTSIDE_LIMITS = ("tau_rate_limit_nm_s", "qd_des_limit_rad_s", "q_min_rad", "q_max_rad")

@@ -30,14 +30,8 @@ from .expect import Expect
 from .key_checks import StructType, check_finite, field_names
 from .laws import LAWS
 from .refusals import check_table, refuse
-from .scenario_types import (
-    Duration,
-    Limits,
-    OnStale,
-    ScenarioName,
-    SchemeName,
-    Seed,
-)
+from .scenario_types import Duration, ScenarioName, SchemeName, Seed
+from .site_spec import Limits, OnStale
 from .suggestions import list_group_paths
 from .written_kinds import written_kind, written_type
 
@@ -92,7 +86,7 @@ key does not name them as the owners of the key.
 class WrittenSite(Frozen, frozen=True, kw_only=True):
     """Table of one arm as an author may write it.
 
-    The complete form is `scenario_types.SiteSpec`. The keys of `control`, `view` and of the
+    The complete form is `site_spec.SiteSpec`. The keys of `control`, `view` and of the
     tables in the lists depend on the kind that the table names.
     """
 
@@ -115,7 +109,7 @@ class WrittenChange(Frozen, frozen=True, kw_only=True, omit_defaults=True):
     """Planned change of a network link, or of weights, as an author may write it.
 
     The weights (dominance factors) state how much an arm follows the others. The keys of `to`
-    depend on what is changed, see `scenario_types.Change`.
+    depend on what is changed, see `change.Change`.
     """
 
     at_s: Annotated[float, Meta(extra={"must_be": "a time in s"})]

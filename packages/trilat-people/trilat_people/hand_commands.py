@@ -70,12 +70,11 @@ def hand_command(
 
     from sites import run_hand
     from trilat_net.net import OPERATOR, default_endpoints
-    from trilat_net.scenario import find_site
 
     chosen = options.load_chosen_scenario(scenario, overrides, duration, seed)
     session_name = options.check_session_name(session or chosen.name)
     endpoints = default_endpoints(session_name, chosen.names, encrypted=reach.keys is not None)
-    find_site(chosen, name)
+    chosen.find_site(name)
     member = options.MemberOptions(None, *reach)
     connection = member.resolve((), [endpoints[name]]).require(OPERATOR)
     with Interrupt() as interrupt:

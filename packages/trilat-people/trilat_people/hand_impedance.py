@@ -51,7 +51,7 @@ from trilat_net.errors import UsageError, count_nouns
 from trilat_net.log import Log, open_log
 from trilat_net.presentation import Block, TextTable
 from trilat_net.results import Result
-from trilat_net.scenario import Multisine, Scenario, find_site
+from trilat_net.scenario import Multisine, Scenario
 
 MIN_SEGMENTS = 5
 """Smallest number of segments for confidence intervals."""
@@ -246,7 +246,7 @@ def identify_hand(log: Log | str | Path, site: str = "m1") -> HandImpedance:
     if not isinstance(log, Log):
         log = open_log(log)
     scenario = log.scenario
-    find_site(scenario, site)
+    scenario.find_site(site)
     sines = _find_sines(scenario)
     records = align_records(log)[site]
     force, position = _compute_hand_force(records, scenario)

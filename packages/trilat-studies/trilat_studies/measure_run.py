@@ -55,7 +55,6 @@ from trilat_net.scenario import (
     ExpectWindow,
     Scenario,
     field_names,
-    refuse_external_arms,
 )
 
 BATCH_RECORDS = 1000
@@ -145,18 +144,18 @@ class RecordBatch(NamedTuple):
         columns = [column[first:stop] for column in self]
         return RecordBatch._make(columns)
 
+    @classmethod
+    def join(cls, batches: "Sequence[RecordBatch]") -> "RecordBatch":
+        """Joins consecutive batches of records of one arm into a single batch.
 
-def join_batches(batches: Sequence[RecordBatch]) -> RecordBatch:
-    """Joins consecutive batches of records of one arm into a single batch.
-
-    Args:
-        batches: Batches in the order of time, at least one.
-    """
-    columns = []
-    for parts in zip(*batches, strict=True):
-        column = np.concatenate(parts)
-        columns.append(column)
-    return RecordBatch._make(columns)
+        Args:
+            batches: Batches in the order of time, at least one.
+        """
+        columns = []
+        for parts in zip(*batches, strict=True):
+            column = np.concatenate(parts)
+            columns.append(column)
+        return RecordBatch._make(columns)
 
 
 def _build_batch(axes: Sequence[float], t_ns: Ints, used: Ints, *vectors: Array) -> RecordBatch:
@@ -334,50 +333,55 @@ class WholeRun(NamedTuple):
     end: RunEnd
     run: FusedRun
 
+    @classmethod
+    def simulate(cls, scenario: Scenario) -> "WholeRun":
+        """Simulates a scenario by compiled code, and keeps all records in memory.
 
-def run_whole(scenario: Scenario) -> WholeRun:
-    """Simulates a scenario by compiled code, and keeps all records in memory.
+        Measures of the whole run, such as an impedance, need all records at once.
 
-    Measures of the whole run, such as an impedance, need all records at once.
+        Args:
+            scenario: Scenario to run: arms, control laws, links and duration.
+        """
+        batches: dict[str, list[RecordBatch]] = {name: [] for name in scenario.names}
+        receivers = {name: batches[name].append for name in batches}
+        run = run_compiled_in_batches(scenario, receivers)
+        return _join_run(scenario, run, batches)
 
-    Args:
-        scenario: Scenario to run: arms, control laws, links and duration.
-    """
-    batches: dict[str, list[RecordBatch]] = {name: [] for name in scenario.names}
-    receivers = {name: batches[name].append for name in batches}
-    run = run_compiled_in_batches(scenario, receivers)
-    return _join_run(scenario, run, batches)
+    @classmethod
+    def simulate_together(
+        cls,
+        scenarios: Sequence[Scenario],
+    ) -> "Iterator[tuple[int, WholeRun, str]]":
+        """Simulates several scenarios, as many as possible at once, and keeps their records.
+
+        Scenarios that differ only in numbers are computed together with vector instructions.
+        Each run equals that of `simulate` bit for bit.
+
+        Args:
+            scenarios: The scenarios.
+
+        Yields:
+            The index of a scenario; its run, equal to that of `simulate`; and the property
+            because of which it was computed alone, or an empty text. The order is that of
+            groups of runs, of which one is in memory at a time.
+        """
+        batches: list[dict[str, list[RecordBatch]]] = []
+        compiled = []
+        for scenario in scenarios:
+            batches.append({name: [] for name in scenario.names})
+            receivers = {name: records.append for name, records in batches[-1].items()}
+            compiled.append(_CompiledRun(scenario, receivers))
+        for index, obstacle in _finish_together(compiled):
+            yield (
+                index,
+                _join_run(scenarios[index], compiled[index].run, batches[index]),
+                obstacle,
+            )
+            batches[index].clear()
 
 
 _RECORD_ROWS = 1 << BATCH_RECORDS.bit_length()
 """Number of records that runs side by side keep, a power of two above `BATCH_RECORDS`."""
-
-
-def run_whole_together(
-    scenarios: Sequence[Scenario],
-) -> Iterator[tuple[int, WholeRun, str]]:
-    """Simulates several scenarios, as many as possible at once, and keeps all of their records.
-
-    Scenarios that differ only in numbers are computed together with vector instructions. Each
-    run equals that of `run_whole` bit for bit.
-
-    Args:
-        scenarios: The scenarios.
-
-    Yields:
-        The index of a scenario; its run, equal to that of `run_whole`; and the property because
-        of which it was computed alone, or an empty text. The runs are yielded group by group,
-        because only one group is in memory at a time.
-    """
-    batches: list[dict[str, list[RecordBatch]]] = []
-    compiled = []
-    for scenario in scenarios:
-        batches.append({name: [] for name in scenario.names})
-        receivers = {name: records.append for name, records in batches[-1].items()}
-        compiled.append(_CompiledRun(scenario, receivers))
-    for index, obstacle in _finish_together(compiled):
-        yield index, _join_run(scenarios[index], compiled[index].run, batches[index]), obstacle
-        batches[index].clear()
 
 
 def _finish_together(compiled: Sequence[_CompiledRun]) -> Iterator[tuple[int, str]]:
@@ -391,7 +395,7 @@ def _finish_together(compiled: Sequence[_CompiledRun]) -> Iterator[tuple[int, st
         an empty text.
     """
     # A single run must not load the code of lanes.
-    from trilat_net.execution import group_runs
+    from trilat_net.core import group_runs
 
     for group in group_runs([member.run for member in compiled], _RECORD_ROWS):
         members = [compiled[index] for index in group.members]
@@ -418,7 +422,7 @@ def _join_run(
     buckets = []
     last_tau_x = []
     for name, site_batches in batches.items():
-        site_records = join_batches(site_batches)
+        site_records = RecordBatch.join(site_batches)
         records[name] = site_records
         buckets.append(site_records.reduce())
         last_tau_x.append(site_records.tau_x[-1])
@@ -745,7 +749,7 @@ class SiteStats:
             end_ns: Time of the run's last record, in ns. If the records of this arm end earlier
                 than others, fewer records are returned.
         """
-        rows = join_batches(self._tail)
+        rows = RecordBatch.join(self._tail)
         start_ns = end_ns - _END_NS
         return rows.since(start_ns)
 
@@ -1099,7 +1103,7 @@ class _EvenBatches:
         self._count += len(batch.t_ns)
         if self._count < BATCH_RECORDS:
             return
-        joined = join_batches(self._waiting)
+        joined = RecordBatch.join(self._waiting)
         whole = self._count - self._count % BATCH_RECORDS
         for first in range(0, whole, BATCH_RECORDS):
             self._receive(joined.slice(first, first + BATCH_RECORDS))
@@ -1110,7 +1114,7 @@ class _EvenBatches:
     def flush(self) -> None:
         """Passes on the last records, which are fewer than a batch."""
         if self._waiting:
-            self._receive(join_batches(self._waiting))
+            self._receive(RecordBatch.join(self._waiting))
             self._waiting.clear()
 
 
@@ -1132,7 +1136,7 @@ class _MeasuredRun:
         receivers = {name: batches.add for name, batches in self._batches.items()}
         self.obstacle = ""
         self.compiled: _CompiledRun | None = None
-        refuse_external_arms(scenario)
+        scenario.refuse_external_arms()
         try:
             check_fusable(scenario)
         except ScenarioError:
@@ -1520,7 +1524,7 @@ def refuse_live_only(scenario: Scenario) -> None:
         ScenarioError: An arm is external, or a link has the model "measured", with which the
             real network determines the delay. In virtual time there is no real network.
     """
-    refuse_external_arms(scenario)
+    scenario.refuse_external_arms()
     if scenario.measured:
         measured_links = [name for name, link in scenario.links.items() if link.measured]
         path = f"links.{measured_links[0]}.model" if measured_links else "timeline"

@@ -43,7 +43,6 @@ from trilat_net.scenario import (
     HandSite,
     LiveHand,
     Scenario,
-    find_site,
     load_scenario,
     make_plant_players,
 )
@@ -449,8 +448,8 @@ class TeleoperationEnv(gymnasium.Env[dict[str, Array], Array]):
         Raises:
             ScenarioError: The scenario does not contain the site of the user or of the task.
         """
-        find_site(scenario, self.user)
-        find_site(scenario, self.leads)
+        scenario.find_site(self.user)
+        scenario.find_site(self.leads)
         spec = scenario.sites[self.user]
         hand = spec.find_live_hand(is_open=True) or LiveHand()
         if self._mode:

@@ -21,7 +21,7 @@ and S_i for each law, and the literature.
 import numpy as np
 
 from ...core import Array, Gains, Law, Scheme
-from ...scenario import Scenario, identify_law
+from ...scenario import Scenario
 from ..aligned import (
     AlignedRecords,
     DelayedPeer,
@@ -244,7 +244,7 @@ def _measure_delay_energy(view: RunView, link: str) -> MetricValues:
     if missing:
         return unavailable(ENERGY, f"no records of {', '.join(missing)}", of="link")
     if gains.law is Law.USER:
-        name = identify_law(law)
+        name = view.scenario.sites[site].law_name
         unknown = f"the law {name} does not say which part of its torque is due to a peer"
         return unavailable(ENERGY, unknown, of="link")
 

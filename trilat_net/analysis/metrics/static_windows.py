@@ -28,7 +28,7 @@ import numpy as np
 
 from ...core import Array, Law, TorqueKind
 from ...log import Ints
-from ...scenario import Scenario, identify_law
+from ...scenario import Scenario
 from ..aligned import Bools, find_latest_rows
 from ..arm_rows import build_arm_rows
 from ..dominance_history import find_closed_groups, left_perron_vector
@@ -587,7 +587,7 @@ def _find_holding_stiffness(scenario: Scenario, site: str) -> tuple[Array, str]:
     gains = spec.control.gains(arm.theta)
     unknown = np.zeros(len(spec.q0_rad))
     if gains.law is Law.USER:
-        name = identify_law(spec.control)
+        name = spec.law_name
         return unknown, f"the law {name} states no stiffness that holds e at rest"
     if not spec.arm.known:
         return unknown, "theta of the arm is not known"

@@ -32,13 +32,7 @@ from ...errors import ScenarioError, UsageError
 from ...execution import FusedRun
 from ...log import Log
 from ...results import Result
-from ...scenario import (
-    IRREVERSIBLE_SHARES,
-    Scenario,
-    describe_law_conditions,
-    lacks_detailed_balance,
-    load_scenario,
-)
+from ...scenario import IRREVERSIBLE_SHARES, Scenario, describe_law_conditions, load_scenario
 from ..blas_threads import limit_blas_threads
 from ..stability_decision import NEAR_REST_RAD
 from .characteristic_roots import CharacteristicRoot, Spectrum, compute_delay_spectrum
@@ -163,7 +157,7 @@ class LinearAnalysis(Result):
                 f"{self.decisive.drifting} of the roots at zero only drift: "
                 "their modes keep their speed"
             )
-        if lacks_detailed_balance(self.scenario):
+        if self.scenario.has_irreversible_shares:
             notes.append(IRREVERSIBLE_SHARES.removeprefix("note: "))
         ticks_grow = self.sampled is not None and self.sampled.verdict == "unstable"
         return (*notes, *describe_law_conditions(self.scenario, ticks_grow=ticks_grow))

@@ -40,7 +40,7 @@ from ...files import find_page
 from ...laws import LinearForm, LinearSituation
 from ...own_code import ImportedLaw
 from ...records import NS_PER_S
-from ...scenario import LinkBase, Scenario, draw_used_samples, refuse_external_arms
+from ...scenario import LinkBase, Scenario, draw_used_samples
 from ..delay_period import (
     MAX_PERIOD_TICKS,
     find_final_link,
@@ -358,7 +358,7 @@ def _find_linear_gains(scenario: Scenario, *, own_laws: bool) -> dict[str, Gains
             )
         gains_by_site[name] = gains
 
-    refuse_external_arms(scenario)
+    scenario.refuse_external_arms()
     return gains_by_site
 
 

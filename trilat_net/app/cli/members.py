@@ -78,10 +78,9 @@ def site_command(
     from sites import SiteOptions, run_site
 
     from ...net import default_endpoints
-    from ...scenario import find_site
 
     chosen = options.load_chosen_scenario(scenario, overrides, duration, seed)
-    find_site(chosen, name)
+    chosen.find_site(name)
     session_name = options.check_session_name(session or chosen.name)
 
     # By default each site connects to the sites before it, so that each pair has one
@@ -121,11 +120,9 @@ def _check_without(scenario: "Scenario", name: str, without: list[str]) -> tuple
         UsageError: This site is not the first one, or the scenario does not let sites join
             later.
     """
-    from ...scenario import find_site
-
     first_site = scenario.names[0]
     for late_site in without:
-        find_site(scenario, late_site)
+        scenario.find_site(late_site)
         if name != first_site or late_site == name:
             raise UsageError(
                 f"--without can be given only at {first_site}, the first site, and must name "

@@ -47,7 +47,6 @@ def sim_command(
     """
     from ...execution import record_virtual
     from ...own_code import find_user_laws
-    from ...scenario import write_simulated_options
     from .options import parse_viz_rate
 
     chosen = options.load_chosen_scenario(scenario, overrides, duration, seed)
@@ -59,7 +58,7 @@ def sim_command(
             arguments += ["--seed", str(seed)]
         if output is not None:
             arguments += ["-o", str(output)]
-        command = f"{shlex.join(arguments)} {write_simulated_options(chosen)}"
+        command = f"{shlex.join(arguments)} {chosen.simulated_options}"
         raise ScenarioError(
             f"is 'external': {', '.join(chosen.outside)} is a real arm, which only a live "
             f"session can move; to rehearse with a simulated arm, run: {command}",

@@ -633,7 +633,7 @@ class TrackTrial(TrialTask, frozen=True, tag="track"):
 
     @property
     def has_limit(self) -> bool:
-        """Always False: following a moving target takes exactly `duration_s`, and cannot fail."""
+        """Always False: following a target takes exactly `duration_s`, and cannot fail."""
         return False
 
     @property

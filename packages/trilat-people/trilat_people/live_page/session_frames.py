@@ -39,7 +39,7 @@ from trilat_net.analysis import (
 from trilat_net.core import Array, HandInForce, LifeAlarm
 from trilat_net.net import Event
 from trilat_net.records import NS_PER_S
-from trilat_net.scenario import Scenario, describe_event, identify_law
+from trilat_net.scenario import Scenario, describe_event
 
 from .session_view import SessionView, SiteView, Tail
 
@@ -133,7 +133,7 @@ class _ArmFrames:
             "unit": "m" if model.shares_pose else "rad",
             "hand": self._describe_hand(),
             "stops": settings.on_stale.action == "glide",
-            "law": identify_law(settings.control),
+            "law": settings.law_name,
         }
 
     def _describe_hand(self) -> Json | None:

@@ -17,7 +17,7 @@ import msgspec
 
 from trilat_net.errors import ScenarioError
 from trilat_net.own_code import ImportedLaw, read_code
-from trilat_net.scenario import Scenario, describe_value, identify_law
+from trilat_net.scenario import Scenario, describe_value
 
 from .sweep_plan import SweepPlan
 
@@ -51,7 +51,7 @@ def _describe_laws(plan: SweepPlan, scenario: Scenario) -> Iterator[str]:
     """
     sites_of_law: dict[tuple[str, str], list[str]] = {}
     for site, spec in scenario.sites.items():
-        law = identify_law(spec.control)
+        law = spec.law_name
         gain_texts = _format_gains(plan, site, spec.control)
         gains = ", ".join(gain_texts) or "none"
         sites = sites_of_law.setdefault((law, gains), [])
