@@ -69,7 +69,7 @@ def run() -> list[str]:
 
 
 def _measure_start() -> tuple[float, float]:
-    """Returns the processor time and the wall-clock time until the first tick of `trilat demo paper`, s."""
+    """Returns the processor time and the wall-clock time until the first tick of `trilat demo paper`, in s."""
     since = time.perf_counter()
     with _demo() as demo:
         time.sleep(AHEAD_S)

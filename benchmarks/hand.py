@@ -25,7 +25,7 @@ DEVICE_STATES = 5000
 
 
 def run() -> list[str]:
-    """Returns the figures of one session of `play`, three sites at 1 kHz and a recorder."""
+    """Returns the results of one session of `play`, three sites at 1 kHz and a recorder."""
     with tempfile.TemporaryDirectory() as folder:
         stage, alone_per_s = Stage(Path(folder)), _ask_alone()
         try:
@@ -53,7 +53,7 @@ def _epoch_ns(log: Log, site: str) -> int:
 
 
 def _move(session: Session) -> list[tuple[int, int]]:
-    """Moves a hand at random times; returns the number of each message and the time of the request, ns."""
+    """Moves a hand at random times; returns the number of each message and the time of the request, in ns."""
     moved = []
     with trilat_net.hand(
         "t", "m1", connect=session.endpoints, source="benchmark", timeout_s=60.0
@@ -113,7 +113,7 @@ def _describe_moves(log: Log, moved: list[tuple[int, int]]) -> list[str]:
 
 
 def _kill(session: Session) -> int:
-    """Kills a program that holds m2, and returns the time, ns."""
+    """Kills a program that holds m2, and returns the time, in ns."""
     words = [sys.executable, "-c", HOLDER, "m2", *session.endpoints]
     holder = subprocess.Popen(words, stdout=subprocess.PIPE, cwd=Path(__file__).parents[1])
     assert holder.stdout is not None
@@ -138,7 +138,7 @@ def _describe_kill(log: Log, killed_ns: int) -> list[str]:
 
 
 def _flood(session: Session) -> tuple[int, int, int]:
-    """Sends garbage to the hand of s as fast as possible; returns begin and end, ns, and the number of messages."""
+    """Sends garbage to the hand of s as fast as possible; returns begin and end, in ns, and the number of messages."""
     connection = Connection.of_member(None, session.endpoints, None, None, [], None)
     bus = ZenohBus([], connection.connect or ())
     time.sleep(2.0)

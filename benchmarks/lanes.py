@@ -125,7 +125,7 @@ def _compare_twins() -> list[str]:
 
 
 def _processor_s(call: Callable[[], object]) -> float:
-    """Returns the processor time of a call, s."""
+    """Returns the processor time of a call, in s."""
     begun = time.process_time()
     call()
     return time.process_time() - begun

@@ -57,7 +57,7 @@ def run() -> list[str]:
 
 
 def _run(waker: str) -> tuple[Log, float]:
-    """Runs one session; returns its complete log, and the p99 lateness of the program that woke up beside it, us."""
+    """Runs one session; returns its complete log, and the p99 lateness of the program that woke up beside it, in us."""
     with paper(DURATION_S) as session:
         session.all()
         session.begun()
@@ -73,7 +73,7 @@ def _run(waker: str) -> tuple[Log, float]:
 
 
 def _sent_after_us(log: Log, site: str) -> np.ndarray:
-    """Returns the times from a site's turn in its ticks to the sending of its samples, by its clock, us."""
+    """Returns the times from a site's turn in its ticks to the sending of its samples, by its clock, in us."""
     turn_ns = find_turn_ns(SITES.index(site), len(SITES), log[site].rate_hz)
     return np.array(
         [(state.sent_ns - state.t_ns - turn_ns) / 1000 for state in log[site].states]
@@ -81,7 +81,7 @@ def _sent_after_us(log: Log, site: str) -> np.ndarray:
 
 
 def cyclictest_us(priority: int, duration_s: int) -> float:
-    """Returns the 99th percentile of cyclictest's latencies, us."""
+    """Returns the 99th percentile of cyclictest's latencies, in us."""
     every_ms = ["cyclictest", "-q", "-m", "-i", "1000", "-h", "10000", "-D", str(duration_s)]
     policy = ["-p", str(priority)] if priority else ["--policy=other"]
     text = subprocess.run(
@@ -95,7 +95,7 @@ def cyclictest_us(priority: int, duration_s: int) -> float:
 
 
 def thread_us(priority: int, duration_s: int) -> float:
-    """Returns the 99th percentile of the latencies of a thread that sleeps until each millisecond, us."""
+    """Returns the 99th percentile of the latencies of a thread that sleeps until each millisecond, in us."""
     late_ns: list[int] = []
 
     def wake() -> None:

@@ -84,7 +84,7 @@ def run() -> list[str]:
 
 
 def _read_mb(name: str) -> float:
-    """Returns the memory of this process, MB."""
+    """Returns the memory of this process, in MB."""
     for line in Path("/proc/self/status").read_text().splitlines():
         if line.startswith(f"{name}:"):
             return float(line.split()[1]) / 1000.0

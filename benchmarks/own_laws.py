@@ -18,7 +18,7 @@ DURATION_S = 20.0
 
 
 def _judge(law: str, text: str) -> tuple[str, float, str]:
-    """Returns the law, the processor time of its cell, s, and the verdict."""
+    """Returns the law, the processor time of its cell, in s, and the verdict."""
     begun = time.process_time()
     verdict = str(classify_cell(text, 0.0).verdict)
     return law, time.process_time() - begun, verdict

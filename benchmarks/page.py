@@ -100,7 +100,7 @@ class SocketClient(threading.Thread):
 
 
 def measure_once(pages: int) -> tuple[float, float]:
-    """Returns the p99 of the loops' lateness, us, and the server's share of a core, percent."""
+    """Returns the p99 of the loops' lateness, in us, and the server's share of a core, in per cent."""
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name) / "run"
         with live_session(folder) as (address, pid):
@@ -122,7 +122,7 @@ def measure_once(pages: int) -> tuple[float, float]:
 
 
 def measure_load() -> tuple[float, float, float]:
-    """Returns medians: lateness with two pages and without pages, us, and the server's share with two pages, percent."""
+    """Returns medians: lateness with two pages and without pages, in us, and the server's share with two pages, in per cent."""
     pairs = [(measure_once(2), measure_once(0)) for _ in range(PAIRS)]
     print(
         "p99 with two pages and with none, us:",
@@ -152,7 +152,7 @@ class TargetWatch(threading.Thread):
 
 
 def measure_pointer() -> "np.ndarray[tuple[int, int], np.dtype[np.float64]]":
-    """Returns the delays from a pointer's move, and from Playwright's order, to a record with a new target, ms.
+    """Returns the delays from a pointer's move, and from Playwright's order, to a record with a new target, in ms.
 
     Chromium stamps a move when the move reaches it. The delay of Playwright and its pipe does
     not exist for a user.

@@ -36,7 +36,7 @@ def run() -> list[str]:
 
 
 def measured(path: Path) -> list[str]:
-    """Returns the figures of a log of three sites m1, m2 and s.
+    """Returns the results for a log of three sites m1, m2 and s.
 
     Args:
         path: Path of the log.

@@ -51,7 +51,7 @@ trilat.pressed = performance.timeOrigin + event.timeStamp; }, true)"""
 
 
 def run() -> list[str]:
-    """Returns the figures of stops of sessions of `play`, three sites and a recorder."""
+    """Returns the results of stops of sessions of `play`, three sites and a recorder."""
     with tempfile.TemporaryDirectory() as folder, mock.patch.dict(PLAIN, XDG_STATE_HOME=folder):
         stage = Stage(Path(folder))
         try:
@@ -70,7 +70,7 @@ def run() -> list[str]:
 
 
 def _stop_once() -> tuple[float, float]:
-    """Returns the processor time of a stop with all of its threads, and its duration, s."""
+    """Returns the processor time of a stop with all of its threads, and its duration, in s."""
     began_s = time.monotonic()
     command = [sys.executable, "-m", "trilat_net", "stop", "--session", "t"]
     stop = subprocess.Popen(command, env=PLAIN, stdout=subprocess.PIPE)
@@ -128,7 +128,7 @@ def _describe_presses() -> list[str]:
 def _press_often(
     browser: Browser, address: str, way: str, apart_ms: list[float]
 ) -> list[float]:
-    """Presses and lets the arms follow again, repeatedly; returns the Unix times of the presses, ms."""
+    """Presses and lets the arms follow again, repeatedly; returns the Unix times of the presses, in ms."""
     options, press = WAYS[way]
     page = browser.new_page(**options)
     page.goto(with_query(address, "as=m1"))
@@ -149,7 +149,7 @@ def _press_often(
 
 
 def _find_offset_ms(page: Page) -> float:
-    """Returns the largest possible difference between the clocks of page and program, from several readings, ms."""
+    """Returns the largest possible difference between the clocks of page and program, from several readings, in ms."""
     bounds = []
     for _ in range(10):
         before_s = time.time()
@@ -161,7 +161,7 @@ def _find_offset_ms(page: Page) -> float:
 
 
 def _find_stop_ms(log: Log, pressed_ms: float) -> list[float]:
-    """Returns the delay from a press to the first stopped tick of each arm, ms."""
+    """Returns the delay from a press to the first stopped tick of each arm, in ms."""
     epoch_ms = int(log.session["epoch_unix_ns"]) / 1e6
     found = []
     for site in log.sites:

@@ -49,7 +49,7 @@ def send(folder: str, *places: str) -> None:
 
 
 def measure_us() -> "list[np.ndarray[tuple[int, int], np.dtype[np.float64]]]":
-    """Returns the delays of all samples over plain TCP and over TLS, us, shape (ROUNDS, SAMPLES - SKIPPED)."""
+    """Returns the delays of all samples over plain TCP and over TLS, in us, shape (ROUNDS, SAMPLES - SKIPPED)."""
     clock = SystemClock()
     with tempfile.TemporaryDirectory() as name, ExitStack() as stack:
         folder = Path(name) / "keys"

@@ -60,7 +60,7 @@ def verify_singly(path: Path) -> verification.VerifyResult:
 
 
 def _processor_s(call: Callable[[], object]) -> float:
-    """Returns the processor time of a call, s."""
+    """Returns the processor time of a call, in s."""
     begun = time.process_time()
     call()
     return time.process_time() - begun

@@ -38,7 +38,7 @@ def run() -> list[str]:
 
 
 def time_writing(scenario: Scenario) -> tuple[float, float]:
-    """Returns the times to encode and to write all records of a run, s."""
+    """Returns the times to encode and to write all records of a run, in s."""
     steps = list(virtual.execute_virtual(scenario))
 
     def encode() -> list[tuple[str, bytes, int, int]]:
@@ -67,7 +67,7 @@ def time_writing(scenario: Scenario) -> tuple[float, float]:
 
 
 def time_checking(scenario: Scenario) -> tuple[float, float]:
-    """Returns the times to read and to verify a log, s."""
+    """Returns the times to read and to verify a log, in s."""
     stream = io.BytesIO()
     virtual.write_virtual_log(scenario, stream)
 

@@ -25,9 +25,9 @@ from typing import Any
 import trilat_net as tn
 
 RADIUS_M = 0.15
-"""Distance of the places from the start, m."""
+"""Distance of the places from the start, in m."""
 NEAR_M = 0.03
-"""Largest distance at which an episode has succeeded, m."""
+"""Largest distance at which an episode has succeeded, in m."""
 MOVING_SHARE = 0.6
 """Share of an episode in which the program moves. It waits in the rest."""
 PERIOD_S = 0.02
@@ -85,10 +85,10 @@ def record(
         follower: the operator of m2, which goes where m1 is.
         leads: False if a person moves m1.
         episodes: number of episodes. The end of the session ends them earlier.
-        seconds: duration of an episode, s.
+        seconds: duration of an episode, in s.
         draw: source of the random places.
-        now_s: returns the present time, s.
-        wait_s: waits for a time, s.
+        now_s: returns the present time, in s.
+        wait_s: waits for a time, in s.
     """
     results: list[bool] = []
     x_m, y_m = hand.pose

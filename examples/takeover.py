@@ -26,7 +26,7 @@ from train_over_delay import FIRM, NETWORKS, STUDIES, interval, train
 import trilat_net as tn
 
 TAKEN_S = 2.0
-"""Time at which the person gets the lead, s."""
+"""Time at which the person gets the lead, in s."""
 RAMP_S = 2.0
 LASTS_S = 10.0
 NEAR_M = 0.05

@@ -1,7 +1,7 @@
 """Measures the delays of the messages on a ROS 2 topic, for `trilat ping --ros2`.
 
-ROS 2 is the Robot Operating System. Each message of its programs carries the time at which it
-was sent, so that the delay is known on arrival.
+ROS 2 is the Robot Operating System. Each message of its programs contains the time at which it
+was sent, so the delay is known on arrival.
 
 Invariant:
     - The measurement does not disturb the publishers. This process only receives.
@@ -37,7 +37,7 @@ def ping_topic(
 
     Args:
         topic: Name of the topic.
-        routers: Endpoints of the Zenoh router of ROS. The first one that answers is used.
+        routers: Endpoints of the Zenoh router of ROS. The first endpoint that answers is used.
         domain: Number of the ROS domain.
         lasts_s: Duration of the measurement, in s.
         report: Function that receives a sentence about messages that could not be used.

@@ -362,8 +362,8 @@ class WholeRun(NamedTuple):
 
         Yields:
             The index of a scenario; its run, equal to that of `simulate`; and the property
-            because of which it was computed alone, or an empty text. The order is that of
-            groups of runs, of which one is in memory at a time.
+            because of which it was computed alone, or an empty text. The runs are in the order
+            of their groups, of which one at a time is in memory.
         """
         batches: list[dict[str, list[RecordBatch]]] = []
         compiled = []
@@ -1151,7 +1151,7 @@ class _MeasuredRun:
         return self._measure(diverged_at_s, late_samples)
 
     def measure_compiled(self, run: FusedRun) -> RunMetrics:
-        """Returns the metrics of the run, which has ended.
+        """Returns the metrics of a finished run.
 
         Args:
             run: The run.

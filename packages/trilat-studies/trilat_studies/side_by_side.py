@@ -1,8 +1,8 @@
 """Decides which runs of a study are computed side by side, and reports the others.
 
-Runs that differ in numbers only share the vector instructions of the processor, see
-`trilat_net.core.group_runs`. A study passes a scenario of each kind of run to
-`prepare_kinds`, which compiles the code where the number of runs is worth it. After the runs,
+Runs that differ only in numbers are computed together with vector instructions, see
+`trilat_net.core.group_runs`. A study passes a scenario of each kind of run to `prepare_kinds`,
+which compiles the code if there are enough runs to be worth it. After the runs,
 `describe_runs_alone` names those that were computed one by one.
 """
 

@@ -201,7 +201,9 @@ def trace_import_command(
     column: Annotated[str, value("--column", "NAME")] = "",
     every_s: Annotated[
         float,
-        value("--every", "S", "Interval between pings, s, if the output of ping has no times."),
+        value(
+            "--every", "S", "Interval between pings, in s, if the output of ping has no times."
+        ),
     ] = 1.0,
     as_json: options.JsonOption = False,
     force: options.ForceOption = False,

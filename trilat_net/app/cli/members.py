@@ -69,7 +69,7 @@ def site_command(
     Options:
         name: Name of the site in the scenario.
         scenario: Name of a shipped scenario, or path of a TOML file.
-        stay: Longest wait at the end for the recorder to leave the session, s.
+        stay: Longest wait at the end for the recorder to leave the session, in s.
         without: Begin without SITE, which may join later; repeatable. Only the first site
             accepts this option.
         leave_timeout: Longest time to continue after another site has left, if the arms then
@@ -172,7 +172,7 @@ def record_command(
         include: Record only these channels, for example '**/m1/**'; repeatable.
         exclude: Leave out these channels, for example '**/link'; repeatable.
         split_size: Split the log into parts of at most this size, MiB.
-        split_duration: Split the log into parts of this duration, s.
+        split_duration: Split the log into parts of this duration, in s.
         durable: Sync to the disk at every flush instead of every second.
     """
     from recorder import record_session
@@ -306,7 +306,7 @@ def replay_command(
     loop: Annotated[bool, flag("--loop", "Start over at the end, until Ctrl-C.")] = False,
     start: Annotated[float | None, value("--start", "S")] = None,
     stop: Annotated[
-        float | None, value("--stop", "S", "End of the part to play, s since tick 0.")
+        float | None, value("--stop", "S", "End of the part to play, in s after tick 0.")
     ] = None,
     duration: Annotated[float | None, value("--duration", "S")] = None,
     include: Annotated[list[str] | None, value("--include", "KEYEXPR")] = None,
@@ -337,8 +337,8 @@ def replay_command(
     Options:
         files: File of an MCAP log, or the files of all its parts in order.
         rate: Speed relative to the recording, or max for as fast as possible.
-        start: Start of the part to play, s since tick 0.
-        duration: Duration of the part to play, s, instead of --stop.
+        start: Start of the part to play, in s after tick 0.
+        duration: Duration of the part to play, in s, instead of --stop.
         include: Play only these channels, for example '**/m1/*'; repeatable. Default: all
             channels of the sites.
         exclude: Leave out these channels, for example '**/link'; repeatable.

@@ -203,8 +203,8 @@ class SiteStandIns:
         history: The messages that were played.
 
     Attributes:
-        recorders: Identifiers of the starts of the recorders that are present, as text. Each
-            start of a process has its own random number.
+        recorders: Identifiers of the recorders that are present, as text. A recorder gets a new
+            random identifier at each start.
         refilled: Number of messages that were sent again to recorders.
     """
 

@@ -97,7 +97,7 @@ class _ExperimentStatus(NamedTuple):
 class Experiment(Result):
     """An experiment in its folder: the plan, the trials that were run, and their results.
 
-    `begin` and `open_experiment` create this object.
+    `Experiment.begin` and `open_experiment` create this object.
 
     Args:
         folder: Folder with the plan, journals and logs of the experiment.

@@ -188,8 +188,7 @@ class CellResult(msgspec.Struct, frozen=True):
         - The motion grows with a pronounced trend: over the second half of the run, the largest
           speed doubled, or error and speed both halved.
         - The motion is bounded and steady: over the second half of the run, the logarithms of
-        the
-          largest error and of the largest speed changed by at most `FLAT_LOG_CHANGE`.
+          the largest error and of the largest speed changed by at most `FLAT_LOG_CHANGE`.
 
         Decay is not conclusive. Near the limit of stability, a slowly growing motion can be
         hidden by a decaying motion until the decaying motion has vanished.
@@ -318,9 +317,10 @@ class _CellInProgress:
 def classify_cell(text: str, longest_s: float) -> CellResult:
     """Runs a cell in virtual time and classifies the end of the run.
 
-    While a longer run might have another class (see `CellResult.is_conclusive`), the duration
-    is doubled and the same run continues, at most up to `longest_s`. The decision of the
-    stability certificate about the whole run then gives the class, see `CellClass.of_decision`.
+    As long as a longer run might have another class (see `CellResult.is_conclusive`), the
+    duration is doubled and the same run continues, at most up to `longest_s`. The decision of
+    the stability certificate about the whole run then gives the class, see
+    `CellClass.of_decision`.
 
     A run that chatters at a sampled wall, where its small motions grow, is not extended. Such
     chatter may end after minutes, once the estimates of the law have drifted, but this does not

@@ -127,7 +127,7 @@ class SweepResults(Result):
     def iterate_grid_points(self) -> "Iterator[GridPoint]":
         """Yields the summary of each combination of swept parameters.
 
-        `list_grid_points` returns the same as a list.
+        `list_grid_points` returns the same summaries as a list.
         """
         totals = list_totals(self.plan)
         groups = groupby(self.rows, key=lambda row: (row["cell"], row["law"]))
