@@ -67,7 +67,7 @@ def _move(session: Session) -> list[tuple[int, int]]:
 
 
 def _ask_alone() -> float:
-    """Returns the number of states per second of such a device on an otherwise idle machine."""
+    """Returns the number of states per second from a Haply device on an otherwise idle machine."""
     with HaplyService() as service, trilat_net.HaplyInverse3(service.address) as device:
         begun_s = time.monotonic()
         for _ in range(DEVICE_STATES):

@@ -74,7 +74,7 @@ def _step(link: dict[str, Any], peers: int) -> Callable[[], None]:
 
 
 def per_sample_us(link: dict[str, Any]) -> np.ndarray:
-    """Returns the additional cost of one more link per sample, us, for each round."""
+    """Returns the additional cost of one more link per sample, in us, for each round."""
     few, many = _step(link, 1), _step(link, 1 + MORE)
     costs = []
     gc.disable()

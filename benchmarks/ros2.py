@@ -29,7 +29,7 @@ def run() -> list[str]:
 
 
 def measure(*, bridged: bool) -> tuple[float, float, float]:
-    """Returns the p99 lateness of the worst site, us; a listener's messages per second; and the load of the bridge, %."""
+    """Returns the p99 lateness of the worst site, in us; a listener's messages per second; and the load of the bridge, in %."""
     (router,) = find_free_endpoints(1)
     with paper(RUN_S) as session:
         session.all()
@@ -52,7 +52,7 @@ def measure(*, bridged: bool) -> tuple[float, float, float]:
 
 
 def listen(router: str, pid: int, lasts_s: float = 6.0) -> tuple[float, float]:
-    """Listens to every topic for some time; returns the messages per second, and the load of the bridge, %."""
+    """Listens to every topic for some time; returns the messages per second, and the load of the bridge, in %."""
     settings = {
         "mode": "client",
         "connect": {"endpoints": [router]},
