@@ -454,7 +454,7 @@ def reset_command(
     *,
     reach: options.Reach,
 ) -> None:
-    """Clears the faults of sites if the causes of the faults have been removed.
+    """Clears the faults of sites if the causes have been removed.
 
     The sites then wait for the other sites. Each arm aligns with the other arms before it
     follows them.
