@@ -37,16 +37,16 @@ __all__ = [
 ]
 
 if TYPE_CHECKING:
-    from .api import (AnyScenario, Overrides)
+    from .api import AnyScenario, Overrides
     from .cli import options
-    from .cli.options import (flag, seconds, value)
-    from .cli.run_progress import (run_in_own_folder, show_progress)
-    from .cli.sessions import (run_and_report)
-    from .demo_session import (SessionResult, compile_core, run_demo)
-    from .input_device import (Device, DeviceState, Vector)
-    from .monitor import (SessionDisplay, StatusRow)
-    from .running_session import (RunningSession, ShareHistory, open_hand)
-    from .session_ping import (ping_session)
+    from .cli.options import flag, seconds, value
+    from .cli.run_progress import run_in_own_folder, show_progress
+    from .cli.sessions import run_and_report
+    from .demo_session import SessionResult, compile_core, run_demo
+    from .input_device import Device, DeviceState, Vector
+    from .monitor import SessionDisplay, StatusRow
+    from .running_session import RunningSession, ShareHistory, open_hand
+    from .session_ping import ping_session
 else:
     __getattr__ = import_on_use(
         __name__,
