@@ -372,7 +372,7 @@ class AnalysedRun:
 
     @cached_property
     def certificate(self) -> Certificate:
-        return certify(self.log)
+        return certify_log(self.log)
 
 
 _runs: dict[str, AnalysedRun] = {}

@@ -95,7 +95,7 @@ def test_the_bar_stands_below_the_slider(
     size: tuple[int, int], browser: Browser, tmp_path: Path
 ) -> None:
     log = simulate_training()
-    path, _ = write_report(log, tmp_path, certificate=certify(log))
+    path, _ = write_report(log, tmp_path, certificate=certify_log(log))
     options: dict[str, Any] = {
         "viewport": {"width": size[0], "height": size[1]},
         "reduced_motion": "reduce",

@@ -1,4 +1,4 @@
-"""Computes the weights with which arms follow each other over a run, and their energy weights.
+"""Computes the weights with which arms follow each other, and the energy weights of the arms.
 
 A slave may follow two masters, for example with weights 0.7 and 0.3, and these weights may
 change during the run, at once or in a ramp. The weight with which arm i follows arm j is called
@@ -28,7 +28,9 @@ from ..log import Log
 from ..scenario import Scenario
 
 RAMP_TIME_TOLERANCE_S = 5e-10
-"""Half of the nanosecond to which the starts and ends of ramps are rounded, in s."""
+"""Tolerance for the starts and ends of ramps, in s: half of the nanosecond to which they are
+rounded.
+"""
 
 
 class DominanceHistory(NamedTuple):
@@ -207,9 +209,9 @@ class DominancePlan(NamedTuple):
 
 
 def find_lost_peers(log: Log, site: str, t_s: Array) -> NDArray[np.bool_]:
-    """Finds the times at which an arm continued without another arm that it had lost.
+    """Finds the times at which an arm continued without another arm whose messages had stopped.
 
-    An arm is lost if nothing was heard of it for some time, see `core.lost_peers`.
+    An arm counts as lost if no message from it arrived for some time, see `core.lost_peers`.
 
     Args:
         log: The log of the run.
@@ -297,17 +299,17 @@ KD_SHAPE_TOLERANCE = 1e-9
 class _LyapunovWeights(NamedTuple):
     """Weights beta of the N arms in the energy function V of the stability proof.
 
-    With these weights the energies that arms transfer to each other cancel in V. They follow
-    from the matrix alpha of the dominance factors and from the damping gains Kd.
+    With these weights the energies that arms transfer to each other cancel in V. The weights
+    follow from the matrix alpha of the dominance factors and from the damping gains Kd.
 
     Attributes:
         beta: Weight of each site, shape (N,), with the sum N. With equal dominance factors each
             weight is 1, as in the paper.
-        groups: Groups of sites that follow nobody outside their group, as tuples of indices.
+        groups: Groups of sites that follow no site outside their group, as tuples of indices.
             With a single group the left eigenvector pi of alpha is unique, though some of its
             entries may be 0. With several groups beta is not unique.
         scales: Factors c_i such that Kd_i = c_i Kbar with a common Kbar, and c_i = 1 for the
-            first site, shape (N,). None if no such factors exist.
+            first site, shape (N,). `None` if no such factors exist.
     """
 
     beta: Array
@@ -316,9 +318,9 @@ class _LyapunovWeights(NamedTuple):
 
 
 def find_closed_groups(alpha: Array) -> tuple[tuple[int, ...], ...]:
-    """Finds the groups of arms that follow each other, and that follow nobody else.
+    """Finds the groups of arms that follow each other, and no arm outside the group.
 
-    An arm may follow another one directly or through further arms. If there are several groups,
+    An arm may follow another arm directly or through further arms. If there are several groups,
     the weights of the arms in the energy function V are not unique.
 
     Args:
@@ -344,9 +346,10 @@ def find_closed_groups(alpha: Array) -> tuple[tuple[int, ...], ...]:
 def left_perron_vector(alpha: Array) -> Array:
     """Returns the left eigenvector pi of the dominance factors for the eigenvalue 1.
 
-    It satisfies pi >= 0, pi' alpha = pi', and its sum is 1. A closed group is a group of sites
-    that follow nobody outside the group. pi is 0 for sites outside closed groups. With several
-    closed groups pi is not unique: each group then counts by its number of sites.
+    The vector satisfies pi >= 0 and pi' alpha = pi', and its sum is 1. A closed group is a
+    group of sites that follow no site outside the group. pi is 0 for sites outside closed
+    groups. With several closed groups pi is not unique: the sum of its entries in each group is
+    then chosen proportional to the number of sites in the group.
 
     Args:
         alpha: Matrix of the dominance factors, shape (N, N).
@@ -367,15 +370,15 @@ def left_perron_vector(alpha: Array) -> Array:
 def find_kd_scales(Kd: Array) -> Array | None:
     """Finds the ratio of the damping gain Kd of each arm to the gain of the first arm.
 
-    The stability proof allows arms with different gains if all joints have the same ratio: the
-    weights of the arms in V then balance it.
+    The stability proof allows arms with different gains if all joints have the same ratio,
+    because the weights of the arms in V then compensate for the ratio.
 
     Args:
         Kd: Damping gains of the N arms along n axes, shape (N, n). NaN along an axis that an
             arm does not follow.
 
     Returns:
-        The ratios, shape (N,). All are 1 if all gains are zero. None if the gains of the arms
+        The ratios, shape (N,). All are 1 if all gains are zero. `None` if the gains of the arms
         are not multiples of each other.
     """
     if not np.nan_to_num(Kd).any():
@@ -399,10 +402,11 @@ def find_kd_scales(Kd: Array) -> Array | None:
 def compute_lyapunov_weights(alpha: Array, Kd: Array) -> _LyapunovWeights:
     """Computes the weight of each site in the energy function of the stability proof.
 
-    A site is the process that runs one arm. Its weight is beta_i = pi_i / c_i, where pi is the
-    left eigenvector of `alpha` for the eigenvalue 1, and c_i is the factor between the damping
-    gain of site i and that of the first site. The weights are scaled so that their sum is N. If
-    the gains differ by more than a factor, c_i = 1 is used, and the energy may rise.
+    A site is the process that runs one arm. The weight of site i is beta_i = pi_i / c_i, where
+    pi is the left eigenvector of `alpha` for the eigenvalue 1, and c_i is the factor between
+    the damping gain of site i and that of the first site. The weights are scaled so that their
+    sum is N. If the gains are not multiples of each other, c_i = 1 is used, and the energy may
+    rise.
 
     Args:
         alpha: Dominance factors: entry (i, j) is the weight with which site i follows site j,

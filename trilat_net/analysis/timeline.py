@@ -1,4 +1,4 @@
-"""Lists what happened in a run over time: commands, network delays, modes of the arms, alarms.
+"""Lists the events of a run over time: commands, network delays, modes of the arms, alarms.
 
 For example, a command may change a delay at 5 s, or stop all arms at 8 s. A reader of a figure
 or of a judgement needs these times. The mode of an arm is what its controller does: it follows
@@ -24,7 +24,7 @@ from ..scenario import Change, LinkBase, describe_event, find_requester
 
 
 class _AppliedChange(NamedTuple):
-    """A change of a setting during the run, such as another network delay, at one arm.
+    """A change of a setting at one arm during the run, such as a new network delay.
 
     The scenario planned the change, or a command requested it.
 
@@ -32,9 +32,10 @@ class _AppliedChange(NamedTuple):
         change: The change of a link or of dominance factors, or the order to a site, with its
             time.
         site: The site that carried it out.
-        taken_at_tick: Tick of the record that names the change. None for a change that was
+        taken_at_tick: Tick of the record that names the change. `None` for a change that was
             planned in the scenario.
-        sentence: A sentence for people. It names whoever ordered the change, if known.
+        sentence: A sentence for users. The sentence names the person or program that ordered
+            the change, if known.
     """
 
     change: Change
@@ -44,7 +45,7 @@ class _AppliedChange(NamedTuple):
 
     @property
     def subject(self) -> str:
-        """What was changed: a link such as "m1->s", a site, or the shares of a site.
+        """The object that was changed: a link such as "m1->s", a site, or the shares of a site.
 
         The shares are the dominance factors with which the site follows its peers, for example
         "shares of s".
@@ -53,11 +54,11 @@ class _AppliedChange(NamedTuple):
 
     @property
     def text(self) -> str:
-        """A phrase for the user: what applies after the change.
+        """A phrase for the user that describes the state after the change.
 
-        For an order to a site, it is the order and its length, for example "hold, 500 ticks".
-        For a link, it describes the new delay, and for shares it lists the new shares with the
-        time of the transition, for example "m1 0.7, m2 0.3 within 2 s".
+        For an order to a site, the phrase is the order and its length, for example "hold, 500
+        ticks". For a link, it describes the new delay, and for shares it lists the new shares
+        with the time of the transition, for example "m1 0.7, m2 0.3 within 2 s".
         """
         change = self.change
         if change.order:

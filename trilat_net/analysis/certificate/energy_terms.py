@@ -54,7 +54,7 @@ RATE_TOLERANCE = 1e-12
 It is a share of the largest torque.
 """
 JUMP_TOLERANCE = 1e-12
-"""Changes of e, in rad, or of its derivative, in rad/s, count as jumps if they are larger."""
+"""Changes of e (rad) or of its derivative (rad/s) that exceed this value count as jumps."""
 _GAIN_NAMES = (
     "Lambda",
     "Kp",
@@ -266,10 +266,10 @@ class SiteMotion:
 
     @cached_property
     def following(self) -> Following:
-        """Functions that convert errors between the arms to errors of this arm's joints.
+        """Converter from errors between the arms to motion and torque of this arm's joints.
 
-        Arms that follow each other with their end effectors need other functions than arms that
-        follow joint by joint.
+        Arms that follow each other with their end effectors need a different conversion than
+        arms that follow joint by joint.
         """
         records = self.records
         c = self.constants
@@ -350,8 +350,8 @@ class SiteMotion:
         """Returns the torque that the control law would demand for given errors.
 
         Pose and parameter estimates are taken from the records. The errors may differ from the
-        recorded ones. This shows, for example, the torque just before a new sample of a peer
-        was used.
+        recorded ones. For example, this gives the torque just before a new sample of a peer was
+        used.
 
         Args:
             rows: Rows of the records whose pose and estimates are used, shape (K,).
@@ -383,11 +383,11 @@ class SiteMotion:
 
     @property
     def rests(self) -> Bools:
-        """Marks the records in which the site brings its arm to rest, or did so, shape (K,).
+        """Marks the records in which the site brings its arm to rest, or did so shortly before.
 
         The site then adds a braking torque, for example because a peer is silent. The recorded
         torque may therefore differ from the torque of the control law, and must not be compared
-        with it.
+        with it. The shape is (K,).
         """
         records = self.records
         if records.rests.size:
@@ -449,9 +449,9 @@ class SiteMotion:
 
         The reference is the motion that the site follows: the delayed motions of its peers,
         weighted with the dominance factors. Within a period the delays are taken as constant,
-        so that the reference moves smoothly. At the end of the period it jumps to its next
-        recorded value. If samples of a peer stop arriving, the rule for silent peers determines
-        the reference instead. Then its recorded velocity is integrated by the trapezoid rule.
+        and the reference moves smoothly. At the end of the period it jumps to its next recorded
+        value. If samples of a peer stop arriving, the rule for silent peers determines the
+        reference instead. Then its recorded velocity is integrated by the trapezoid rule.
         """
         records = self.records
         dominance = self.dominance
@@ -862,7 +862,7 @@ def _dot_rows(x: Array, y: Array) -> Array:
 
 
 def _energy_in_transit(constants: SiteConstants, peer_motion: DelayedPeer) -> Array:
-    """Returns the energy of motion that a peer made but that has not reached the site, in J.
+    """Returns the energy of the peer's motion that has not yet reached the site, in J.
 
     It is 1/2 int qd_j' Kd qd_j ds, from the time at which the sample in use was sent until now,
     at each of K records.
@@ -896,8 +896,9 @@ class Increment(NamedTuple):
     def total(self) -> Array:
         """Change of the energy in each tick period, in J, as the sum of the three parts.
 
-        The parts are the contribution of the power at its start, that at its end, and the jump
-        there. K ticks bound K - 1 periods, so that the shape is (K - 1,).
+        The parts are the contribution of the power at the start of the period, the contribution
+        at its end, and the jump at the end. K ticks bound K - 1 periods, so the shape is (K -
+        1,).
         """
         return self.left + self.right + self.jump
 
@@ -917,7 +918,7 @@ def _trapezoid(
         site: Motion of the site, which gives the length of a period.
         left: Power at the start of every period, shape (K - 1,), in W.
         right: Power at the end of every period, before the jump, in W.
-        jump: Energy of the jump after each period, in J. None for no energy.
+        jump: Energy of the jump after each period, in J. `None` for no energy.
     """
     half_s = 0.5 * site.records.h_s
     if jump is None:
@@ -931,7 +932,7 @@ def _integrate_power(site: SiteMotion, power: Array, jump: Array | None = None) 
     Args:
         site: Motion of the site, with K records.
         power: The power, shape (K,), in W.
-        jump: Energy of the jump after each period, shape (K - 1,), in J. None for no energy.
+        jump: Energy of the jump after each period, shape (K - 1,), in J. `None` for no energy.
     """
     left = power[:-1]
     right = power[1:]
@@ -1043,7 +1044,7 @@ def _unknown_friction_work(site: SiteMotion) -> Increment:
     uncompensated_share = 1.0 - c.friction
 
     def power(r: Array, qd: Array) -> Array:
-        """Returns the power of the friction that the law does not know, shape (rows,), in W."""
+        """Returns the power of the uncompensated friction, shape (rows,), in W."""
         friction = c.arm.friction(qd - r)
         return -_dot_rows(r * uncompensated_share, friction)
 
