@@ -257,7 +257,7 @@ def test_energies_close_over_a_task_space_hold() -> None:
     first = int(np.flatnonzero(modes == "hold")[0])
     assert set(modes[first : first + 1400]) == {"hold"}
     assert energy.motion.measure_torque_error().max() <= 1e-9
-    assert verify(log).differing == 0
+    assert verify_log(log).differing == 0
 
 
 @pytest.mark.long

@@ -173,7 +173,7 @@ def test_stops_and_returns_add_no_steps() -> None:
         (log["s"].mode[1:] == "return") & (log["s"].mode[:-1] == "stopped")
     )
     assert (log["s"].tau[jump + 1] == log["s"].tau[jump]).all()
-    assert verify(log).identical == 16_000
+    assert verify_log(log).identical == 16_000
     balance = EnergyBalance.of_energies(SiteEnergy.by_site(log))
     assert np.abs(balance.residual).max() <= 1e-3 * balance.scale
 

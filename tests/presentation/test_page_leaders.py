@@ -12,7 +12,7 @@ from playwright.sync_api import Browser
 from tests.analysis.builders import make_busy_run, make_run, make_short_log
 from tests.live.browsers import needs_browser
 from tests.page.whole_pages import watched_page
-from trilat_net.analysis.certificate.stability_certificate import certify
+from trilat_net.analysis.certificate.stability_certificate import certify_log
 from trilat_net.analysis.dominance_history import DominanceHistory
 from trilat_net.log.log_reader import Log
 from trilat_net.presentation.charts import ChartBuilder

@@ -175,7 +175,7 @@ def test_key_numbers_have_place_and_time() -> None:
 def test_all_texts_have_the_same_last_error(name: str) -> None:
     """The page, the table of `report` and `certify` name one number and its joint."""
     log = make_short_log(name)
-    certificate = certify(log)
+    certificate = certify_log(log)
     error = JointError.find_last_of_all(log)
     assert error is not None
     facts = summarise_run(log)

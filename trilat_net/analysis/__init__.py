@@ -35,7 +35,7 @@ __all__ = [
     "ObservedFinding",
     "RecordWindow",
     "RunningEnergy",
-    "certify",
+    "certify_log",
     "premise_quantities",
     "verdict_facts",
     # Twins
@@ -115,7 +115,7 @@ if TYPE_CHECKING:
     from .certificate.energy_balance import ZERO_ENERGY_J, EnergyBalance
     from .certificate.observed_energy import ObservedEnergy, ObservedFinding
     from .certificate.running_energy import KEPT_S, RecordWindow, RunningEnergy
-    from .certificate.stability_certificate import certify
+    from .certificate.stability_certificate import certify_log
     from .dominance_history import (
         DominanceHistory,
         DominancePlan,
@@ -181,7 +181,7 @@ else:
             "certificate.observed_energy": "ObservedEnergy ObservedFinding",
             "certificate.premise_quantities": "premise_quantities",
             "certificate.running_energy": "KEPT_S RecordWindow RunningEnergy",
-            "certificate.stability_certificate": "certify",
+            "certificate.stability_certificate": "certify_log",
             "certificate.verdict_facts": "verdict_facts",
             "decision_facts": "decision_facts",
             "dominance_history": (

@@ -254,7 +254,7 @@ class AlignedRecords(NamedTuple):
         """Returns the motion of another arm as this arm received it, with the network delay.
 
         The records of this arm say which message was used in each tick (control period), and
-        the motion of the other arm says what this message contained.
+        the motion of the other arm says which state this message contained.
 
         Args:
             past: Motion of the peer over time.
@@ -277,7 +277,7 @@ class AlignedRecords(NamedTuple):
         """Finds the last record of an arm at or before each of several times.
 
         It relates arms whose control loops have different rates: a time of one arm is looked up
-        in the records of another one.
+        in the records of another arm.
 
         Args:
             t_s: Times since the start of the session, shape (K,), in s.

@@ -64,9 +64,9 @@ class DominanceHistory(NamedTuple):
     def of_log(cls, log: Log, site: str, t_s: Array) -> "DominanceHistory":
         """Returns the dominance factors of a site at successive ticks.
 
-        They change by the timeline of the scenario and by commands during the run. If the site
-        lost a peer and continues without it, the factors of the others are scaled so that their
-        sum is 1.
+        The factors change according to the timeline of the scenario and the commands during the
+        run. If the site lost a peer and continues without it, the factors of the others are
+        scaled so that their sum is 1.
 
         Args:
             log: The log of the run.
@@ -259,16 +259,16 @@ class PeerLoss(NamedTuple):
 
     @classmethod
     def list_of_log(cls, log: Log) -> "list[PeerLoss]":
-        """Lists when sites continued without a peer that they no longer heard.
+        """Lists the times in which sites continued without a peer whose messages had stopped.
 
-        In these times the dominance factors differ from the planned ones, because a site gives
-        the share of the lost peer to the others.
+        In these times the dominance factors differ from the planned ones, because a site
+        distributes the share of the lost peer among the others.
 
         Args:
             log: The log of the run.
 
         Returns:
-            Each span of time, by site and peer. Empty if no peer was lost.
+            The spans of time, ordered by site and peer. Empty if no peer was lost.
         """
         losses = []
         for site in log.sites:

@@ -24,7 +24,7 @@ from .blas_threads import limit_blas_threads
 from .certificate.certificate_result import Certificate
 from .certificate.observed_energy import find_energy_laws
 from .certificate.premise_quantities import MissingFunctional
-from .certificate.stability_certificate import certify
+from .certificate.stability_certificate import certify_log
 from .decision_facts import LoopRoots, RunFindings, StabilityDecision
 from .delay_period import find_final_link
 from .run_end import RunEnd, RunTrace, Stability

@@ -314,7 +314,7 @@ class ValueStatistics(NamedTuple):
             values: The numbers.
 
         Returns:
-            The statistics. None if there are no numbers.
+            The statistics. `None` if there are no numbers.
         """
         numbers = np.asarray(values, dtype=np.float64)
         if not numbers.size:
@@ -390,7 +390,7 @@ class ClockSummary(NamedTuple):
     def of_link(cls, log: Log, peer: str, site: str) -> "ClockSummary | None":
         """Returns how far the clocks of two arms differ, as one of them estimated in a session.
 
-        The age of a message is known only as well as this difference.
+        The age of a message is known only as accurately as this difference.
 
         Args:
             log: The log of the run.
@@ -398,7 +398,7 @@ class ClockSummary(NamedTuple):
             site: Name of the site that estimated the clock.
 
         Returns:
-            The estimates. None in virtual time, or if the site published none.
+            The estimates. `None` in virtual time, or if the site published no estimates.
         """
         stats = [report for report in log.link_stats(site) if peer in report.offset_us]
         if not stats:

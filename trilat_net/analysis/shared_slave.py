@@ -22,7 +22,7 @@ class UserShares(NamedTuple):
 
     The slave follows the master of each user with a weight, the dominance factor. For example,
     shares of 0.7 and 0.3 mean that the first user leads. In some experiments a program moves
-    the arm of one user. While another user leads, a person intervenes.
+    the arm of one user. Whenever another user leads, a person intervenes.
 
     Attributes:
         shares: The slave's dominance factors for its U users, shape (K, U).
@@ -58,8 +58,8 @@ class SharedSlave:
     def program(self) -> str:
         """The user whose arm a program moved. Empty if no program moved an arm.
 
-        It is the last user with a hand of kind "own", or otherwise the last user whose arm a
-        policy held, through the LeRobot plugin or in an environment.
+        This is the last user with a hand of kind "own", or otherwise the last user whose arm a
+        policy moved, through the LeRobot plugin or in an environment.
         """
         log = self._log
         held_by_policy = [user for user in self.users if _is_held_by_policy(log, user)]
@@ -105,8 +105,8 @@ class SharedSlave:
 def list_program_sites(log: Log) -> list[str]:
     """Lists the sites whose arms a program moved in a run, in scenario order.
 
-    The program is a hand of kind "own", or a policy that held the arm through the LeRobot
-    plugin or in an environment. It reacts to the motion of the arms, unlike a script.
+    The program is a hand of kind "own", or a policy that moved the arm through the LeRobot
+    plugin or in an environment. Unlike a script, the program reacts to the motion of the arms.
 
     Args:
         log: Log of the run.

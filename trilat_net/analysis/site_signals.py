@@ -131,7 +131,7 @@ class JointError(NamedTuple):
             log: Log of the run.
 
         Returns:
-            The error. None if no record of that second has a finite error.
+            The error. `None` if no record of that second has a finite error.
         """
         errors = [JointError.find_in_last_second(log[site]) for site in log.sites]
         known = [error for error in errors if error is not None]

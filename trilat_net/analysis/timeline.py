@@ -184,7 +184,7 @@ class Timeline:
     def changes(self) -> list[_AppliedChange]:
         """All changes before the end of the run, in the order in which they took effect.
 
-        The records also name ticks that a site had to skip. Such an entry is included only if
+        The records also name ticks that a site had to skip. Skipped ticks are included only if
         the site skipped so many ticks that it held its position.
 
         Raises:
@@ -227,9 +227,9 @@ class Timeline:
     def effective_commands(self) -> list[Change]:
         """The commands that changed something, by the time at which they take effect.
 
-        A command that sets a link or the dominance factors of a site (the weights with which it
-        follows its peers) to what is in force already changes nothing and is left out. Orders
-        to sites, such as "stop", always count.
+        A command that sets a link, or the dominance factors of a site (the weights with which
+        it follows its peers), to their present values is left out. Orders to sites, such as
+        "stop", are always included.
 
         Raises:
             LogError: A record names a change that is not valid.
@@ -309,7 +309,7 @@ class Timeline:
     def alarms(self) -> list[_RaisedAlarm]:
         """The alarms of all arms, in the order of their start.
 
-        If somebody ordered an arm to stop, the reason of the alarm names this person.
+        If a person ordered an arm to stop, the reason of the alarm names this person.
 
         Raises:
             LogError: A record names a change that is not valid.

@@ -929,7 +929,7 @@ class RunMetrics(msgspec.Struct, frozen=True, kw_only=True):
             late_samples=late_samples,
             missing=missing,
         )
-        expected_metrics = measure_run(log, scenario.expect.metrics)
+        expected_metrics = LogMetrics.measure_run(log, scenario.expect.metrics)
         return msgspec.structs.replace(metrics, metrics=expected_metrics)
 
     def compare_with(self, expect: Expect) -> "list[ExpectationResult]":

@@ -28,7 +28,7 @@ from tests.theory.energy import compute_balance as balance_by_hand
 from tests.theory.energy import left_null_vector
 from trilat_net.analysis.certificate.certificate_result import Certificate
 from trilat_net.analysis.certificate.energy_balance import EnergyBalance, SiteEnergy
-from trilat_net.analysis.certificate.stability_certificate import certify
+from trilat_net.analysis.certificate.stability_certificate import certify_log
 from trilat_net.analysis.certificate.verdict_facts import StabilityFinding
 from trilat_net.analysis.metrics.log_metrics import LogMetrics
 from trilat_net.presentation.premise_text import explain_no_functional
@@ -302,7 +302,7 @@ def find_unexplained_share(balance: EnergyBalance) -> float:
 def check_six_joints(duration_s: float) -> LogMetrics:
     """Checks the certificate of a run of six joints, and its metrics."""
     log = trilat_net.simulate(parse_scenario(six_joint_text(duration_s, 200.0)))
-    certificate = certify(log)
+    certificate = certify_log(log)
     metrics = LogMetrics.of_log(log)
     assert certificate.verdict.finding is StabilityFinding.COVERED, certificate.verdict.text
     assert certificate.balance is not None

@@ -14,7 +14,7 @@ from tests.analysis.builders import (
     make_short_log,
 )
 from tests.log.builders import replace_fields, rewrite_log
-from trilat_net.analysis.certificate.stability_certificate import certify
+from trilat_net.analysis.certificate.stability_certificate import certify_log
 from trilat_net.analysis.certificate.verdict_facts import RecordGap, StabilityFinding
 from trilat_net.analysis.run_end import EndBehaviour, Stability
 from trilat_net.errors import LogError

@@ -567,15 +567,15 @@ class EnergyBalance:
     ) -> "EnergyBalance":
         """Adds up the energies of several sites to the energy balance of the group.
 
-        The sites are weighted so that the energies which they transfer to each other cancel in
+        The sites are weighted such that the energies that they transfer to each other cancel in
         the sum.
 
         Args:
             energies: Energies of the sites in scenario order. No site may follow a site outside
                 the group.
             paper_weights: True to give all sites the same weight, as in the paper on which the
-                control law is based. The transferred energies may then not cancel. In that case
-                the balance does not close.
+                control law is based. The transferred energies may then fail to cancel, in which
+                case the balance does not close.
         """
         times = find_common_times(energies)
         weights_by_grid = {}
@@ -622,7 +622,8 @@ class EnergyBalance:
                 kind: The kind, such as "dissipation" or "work".
 
             Returns:
-                The energies in J by name, such as "damping". Each starts with 0.
+                The energies over the judged periods, in J, by name, such as "damping". Each
+                starts with 0.
             """
             selected = {}
             for (group, name), energy in sums.items():

@@ -590,12 +590,12 @@ class SiteMotion:
             right = right + half_alpha_right * squared_right
 
         def damping_power(r: Array) -> Array:
-            """Returns the power that the damping of the control law takes, in W."""
+            """Returns the power that the damping of the control law dissipates, in W."""
             torque = c.Kp * r + c.robust_torque(r)
             return _dot_rows(r, torque)
 
         def friction_power(r: Array, qd: Array) -> Array:
-            """Returns the power that friction takes beyond what the law compensates, in W."""
+            """Returns the power that uncompensated friction dissipates, in W."""
             friction = c.arm.friction(qd)
             torque = friction - c.arm.friction(qd - r)
             return _dot_rows(r, torque)
@@ -621,14 +621,15 @@ class SiteMotion:
     def compute_transfer(self, axes: Array) -> "Increment":
         """Computes the energy that a site gives to sites which follow it, minus what it gets.
 
-        In each tick period it is the integral of 1/2 qd_i'Kd qd_i - 1/2 sum_j alpha_ij qd_j'Kd
-        qd_j. Here qd_i is the velocity of the site and qd_j of its peer j, Kd is the damping
-        gain, and alpha_ij is the dominance factor: the weight with which site i follows peer j.
-        In the weighted sum over all sites these energies cancel.
+        It is the given energy minus the received energy: in each tick period the integral of
+        1/2 qd_i'Kd qd_i - 1/2 sum_j alpha_ij qd_j'Kd qd_j. Here qd_i is the velocity of the
+        site and qd_j of its peer j, Kd is the damping gain, and alpha_ij is the dominance
+        factor: the weight with which site i follows peer j. In the weighted sum over all sites
+        these energies cancel.
 
         Args:
-            axes: 1 for each of the m coordinates that counts, and 0 for each other one, shape
-                (m,). The shape () applies to all coordinates.
+            axes: 1 for each of the m coordinates to include, and 0 for each other coordinate,
+                shape (m,). The shape () applies to all coordinates.
         """
         dominance = self.dominance
         Kd_of_axes = axes * self.constants.Kd
@@ -696,9 +697,9 @@ class SiteMotion:
     def compute_link_work(self, j: int) -> "Increment":
         """Returns the work of the link from peer j: the change of V_i as the age jumps.
 
-        At the end of a period the sample in use, which was sent at s and has moved on to s + h,
-        is replaced by the next one, which was sent at s'. With r and e half-way through the
-        jump, and de the jump of e by this link, the work is exactly
+        At the end of a period the sample in use is replaced. The time of the old sample, sent
+        at s, has advanced to s + h, and the new sample was sent at s'. With r and e half-way
+        through the jump, and de the jump of e by this link, the work is exactly
 
             (Lambda M r + Lambda Kd e)' de - 1/2 alpha_ij int qd_j' Kd qd_j ds from s + h to s'.
 
@@ -770,7 +771,7 @@ class SiteMotion:
         """Computes how much the recorded torques differ from those that the law demands.
 
         The law is evaluated again from the recorded motion. A large error means that the log
-        was changed, or that the arm ran another law than the scenario states.
+        was changed, or that the arm ran a different law than the scenario states.
 
         Returns:
             The largest difference of all joints, shape (K,), in N m. It is 0 for interpolated
@@ -797,7 +798,7 @@ class SiteMotion:
         - Parameter estimates: their recorded step, compared with the trapezoid rule for the
           adaptive law.
 
-        This work is no part of the energy balance. It explains part of the balance's residual.
+        This work is not part of the energy balance. It explains part of the balance's residual.
         """
         records = self.records
         c = self.constants

@@ -413,5 +413,5 @@ class RunningEnergy:
         return SiteEnergy.derive_all(self._scenario, records, pasts, self._trace_dominance)
 
     def _trace_dominance(self, site: str, t_s: Array) -> DominanceHistory:
-        """Returns the dominance factors of a site, its weights of the peers, at times in s."""
+        """Returns the dominance factors with which a site follows its peers, over time."""
         return self._dominance[site].evaluate(t_s)

@@ -175,8 +175,8 @@ class LogMetrics(Result):
     def measure_run(log: Log, keys: Iterable[str]) -> dict[str, Metric]:
         """Computes only some quantities of a whole run, which is faster than all of them.
 
-        Other commands need a few numbers of many runs, for example to compare the points of a
-        sweep.
+        Other commands need a few quantities of many runs, for example to compare the points of
+        a sweep.
 
         Args:
             log: The log of the run.

@@ -111,7 +111,7 @@ class FrequencyResponse(NamedTuple):
 
         Returns:
             The responses, the one with the strongest drive first. If no frequency is driven, a
-            single response with the reason.
+            single response that contains the reason.
         """
         length = round(SEGMENT_S * rate_hz)
         starts = _find_segments(usable, length)

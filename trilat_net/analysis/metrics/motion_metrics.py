@@ -467,9 +467,9 @@ class ParameterEstimates(NamedTuple):
 
     @classmethod
     def by_site(cls, view: RunView) -> "dict[str, ParameterEstimates]":
-        """Reads what adaptive control laws learnt about their arms during a run.
+        """Reads the parameter estimates that adaptive control laws learnt during a run.
 
-        The result compares first and last estimates of masses and inertias with the true ones.
+        The result contains the first, the last and the true values of masses and inertias.
 
         Args:
             view: The run.

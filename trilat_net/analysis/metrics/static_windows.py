@@ -329,10 +329,10 @@ class SharingRatio(NamedTuple):
     def list_of_run(cls, view: RunView) -> "list[SharingRatio]":
         """Compares the torque that an operator feels with the torque that another arm receives.
 
-        This is done at every joint at which exactly two arms carry a torque, while all arms
-        rest. The operator who feels the torque is the operator who holds an arm like a spring.
-        If both do so, or none, it is the operator of the master. The torque on the other arm is
-        the cause.
+        The comparison is made at every joint at which exactly two arms carry a torque, while
+        all arms rest. The operator who feels the torque is the one who holds an arm like a
+        spring. If both operators do so, or neither of them, it is the operator of the master.
+        The torque on the other arm is the cause.
 
         Args:
             view: The recorded run.

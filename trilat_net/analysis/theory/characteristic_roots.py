@@ -235,8 +235,8 @@ class Pencil(NamedTuple):
             wanted: Number of roots. A conjugate pair counts once.
 
         Returns:
-            The `wanted` rightmost roots, or fewer if there are not as many.
-            The number of guesses from which no root was reached.
+            The `wanted` rightmost roots, or fewer if the loop does not have so many. The number
+            of guesses from which no root was reached.
         """
         roots: list[CharacteristicRoot] = []
         dropped = 0

@@ -159,8 +159,8 @@ class DelayMargin(NamedTuple):
 
         The delays that the loop itself contains are replaced by this common delay. The unstable
         characteristic roots are counted for a small delay, below the first delay at which roots
-        cross the imaginary axis. From there on, every crossing changes the count by the number
-        of roots that cross.
+        cross the imaginary axis. For larger delays, every crossing changes the count by the
+        number of roots that cross.
 
         Args:
             loop: Linear model of the coupled arms.

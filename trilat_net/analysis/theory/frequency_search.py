@@ -100,7 +100,7 @@ class Minima(NamedTuple):
             level: Value of the curve below which bands of frequencies are reported.
             tolerance: Function that returns the rounding error of the curve at given
                 frequencies. Smaller differences from the level, or between neighbouring values,
-                are ignored. None if there is no rounding error.
+                are ignored. `None` if there is no rounding error.
 
         Returns:
             The frequencies and values, and the bands in which the curve is below the level.

@@ -81,7 +81,7 @@ class SiteJacobian(NamedTuple):
         *,
         all_estimates: bool = False,
     ) -> "list[SiteJacobian]":
-        """Builds the linear model of each site about a pose of rest, without the other sites.
+        """Builds the linear model of each site by itself about a pose of rest.
 
         A site is a process that runs one arm. The model contains the derivatives of its rates
         of change with respect to its own states and to its inputs.

@@ -410,7 +410,7 @@ def _has_same_sign(loop: SampledLoop, at_rest: Spectrum, last_pose: Equilibrium)
 
 
 def _summarise_roots(spectrum: Spectrum, *, exact: bool) -> LoopRoots:
-    """Returns the fastest growing root, and what it says about the stability of the run.
+    """Returns the fastest growing root, and its verdict on the stability of the run.
 
     Args:
         spectrum: The roots at the end pose.

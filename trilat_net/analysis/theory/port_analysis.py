@@ -299,8 +299,8 @@ class PortAnalysis(NamedTuple):
             scenario: Description of the coupled arms.
             rest: The pose of rest.
             of: Site (process that runs one arm) whose arm is once free and once clamped, while
-                operators feel the other arms. None for the slave, or for the last site if there
-                is no slave.
+                operators feel the other arms. If `None`, the slave is used, or the last site if
+                there is no slave.
             band_hz: Lower and upper end of the band, in Hz.
             hands: Measured impedances of operators. Any of them may hold the arm of any master.
 
@@ -364,7 +364,7 @@ class PortAnalysis(NamedTuple):
     def to_json(self) -> dict[str, Any]:
         """Converts an analysis of what operators feel to plain values for JSON.
 
-        Infinite numbers become None, as JSON does not know them.
+        Infinite numbers become `None`, because JSON has no representation for them.
         """
         measured = self.measured
         return {

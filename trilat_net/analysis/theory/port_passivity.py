@@ -99,17 +99,17 @@ class Passivity(NamedTuple):
     ) -> "Passivity":
         """Checks whether coupled arms are passive at the places (ports) where operators act.
 
-        They are passive if they never return more energy than they received. This is examined
-        over frequency, with additional frequencies near the minima.
+        The arms are passive if they never return more energy than they received. This is
+        examined over frequency, with additional frequencies near the minima.
 
         Args:
             response: Function that returns the response at given frequencies: usually the
                 admittance, the velocities at the p ports per torque. Another output with p
                 entries is allowed too.
             w_rad_s: First frequencies, rising, shape (F,), in rad/s.
-            weights: Positive weights of the ports, shape (p,). None if all are 1. The examined
-                sum of torque times output is then a physical power, if the outputs are
-                velocities.
+            weights: Positive weights of the ports, shape (p,). `None` if all are 1. In this
+                case the examined sum of torque times output is a physical power, if the outputs
+                are velocities.
 
         Returns:
             The least eigenvalue over frequency, which determines passivity, and related

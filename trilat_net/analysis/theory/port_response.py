@@ -142,11 +142,11 @@ class PoleAtZero(NamedTuple):
     def of_loop(cls, loop: LinearLoop) -> "PoleAtZero":
         """Finds whether constant torques make the velocities of coupled arms grow.
 
-        This is so if the response Y(s), velocity per torque, has a pole at zero. For example, a
-        free mass m has Y(s) = 1 / (m s). A characteristic root at zero alone is not sufficient.
-        The arms have many of these roots, because they can rest in several poses, and a resting
-        arm has no velocity. The pole is found by Cauchy's integral along a small circle around
-        zero, with the radius `ZERO_ROOT_RADIUS_PER_S`.
+        The velocities grow if the response Y(s), velocity per torque, has a pole at zero. For
+        example, a free mass m has Y(s) = 1 / (m s). A characteristic root at zero alone is not
+        sufficient. The arms have many of these roots, because they can rest in several poses,
+        and a resting arm has no velocity. The pole is found by Cauchy's integral along a small
+        circle around zero, with the radius `ZERO_ROOT_RADIUS_PER_S`.
 
         Args:
             loop: Linear model of the coupled arms.
@@ -613,7 +613,7 @@ class Transparency(NamedTuple):
             The transparency along each joint of the operator's site.
 
         Raises:
-            UsageError: There is no such site, or both are the same.
+            UsageError: There is no such site, or the two sites are the same.
         """
         low, high = _SHOWN_HZ
         decades = np.log10(high / low)

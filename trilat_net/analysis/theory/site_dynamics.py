@@ -106,8 +106,8 @@ class ArgumentLayout:
         """Returns where each state and input of a site is stored in one vector.
 
         A site is a process that runs one arm. The vector is the argument of the functions that
-        compute how fast the states change. If a user wrote the control law, the numbers that
-        the law stores take the place of the parameter estimates.
+        compute how fast the states change. If a user wrote the control law, the values that the
+        law stores take the place of the parameter estimates.
 
         Args:
             site: Setup of the site.
@@ -171,7 +171,7 @@ class SiteRates(NamedTuple):
         """Computes how fast the states of a site change, and the torques that act on its arm.
 
         A site is a process that runs one arm. Its states are joint angles, joint velocities and
-        parameter estimates. Operators and environments, such as walls, act as they do in the
+        parameter estimates. Operators and environments, such as walls, act as defined in the
         setup. The equations are those of the site's control law and of the dynamics of its arm
         (docs/reference/laws.md).
 

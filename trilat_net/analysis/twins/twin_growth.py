@@ -417,10 +417,10 @@ class TwinGrowth(NamedTuple):
         Args:
             scenario: The description of the experiment.
             twins: The twins.
-            counts_from_s: Time from which the run counts, in s. The second half of the time
-                after it is judged.
-            quiet_from_s: Time from which nobody acts on the run, and its control loop does not
-                change, in s. Departures from a rest are searched from there on.
+            counts_from_s: Time after which the run is considered, in s. The second half of the
+                time after it is judged.
+            quiet_from_s: Time after which no operator acts on the run and its control loop does
+                not change, in s. Departures from rest are searched for after this time.
         """
         t_s = twins.paths[0].t_s
         has_motion = twins.speed.any(axis=1) | np.isfinite(twins.paths[0].largest).any(axis=1)

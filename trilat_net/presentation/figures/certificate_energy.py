@@ -22,7 +22,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from ...analysis import Certificate, EnergyBalance, ObservedEnergy, certify
+from ...analysis import Certificate, EnergyBalance, ObservedEnergy, certify_log
 from ...core import Array
 from ...log import Log
 from ...own_code import may_run_user_laws

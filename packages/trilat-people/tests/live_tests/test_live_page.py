@@ -52,8 +52,8 @@ def start_live(stage: Stage, scenario: str, *options: str) -> Process:
     )
 
 
-def assert_energies_are_those_of(log: Log, energies: list[list[float]]) -> None:
-    """V on the page is that of `certify` at the same instants."""
+def assert_energies_match(log: Log, energies: list[list[float]]) -> None:
+    """Asserts that the energies on the page are those of `certify` at the same times."""
     balance = EnergyBalance.of_energies(SiteEnergy.by_site(log))
     t_s, V, supplied = np.array(energies).T
     rows = np.searchsorted(balance.t_s, t_s - 1e-9)
