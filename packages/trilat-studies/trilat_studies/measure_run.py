@@ -1269,61 +1269,6 @@ class _MeasuredRun:
         )
 
 
-def measure_log(log: Log, expect: Expect | None = None) -> RunMetrics:
-    """Computes errors, torques and other quantities of a recorded run from its log.
-
-    Args:
-        log: Log of the run.
-        expect: Expectations (limits of the metrics) that replace those of the log's scenario.
-            None uses those of the scenario.
-
-    Raises:
-        LogError: A record cannot be read.
-    """
-    scenario = log.scenario
-    if expect is not None:
-        scenario = msgspec.structs.replace(scenario, expect=expect)
-    ticks_at_end = {}
-    for event in log.events:
-        if event.kind == "end":
-            ticks_at_end[event.member] = event.ticks
-    diverged_at_s = log.diverged_s
-    site_stats = {name: SiteStats(scenario, name) for name in log.sites}
-    missing = 0
-    for name, stats in site_stats.items():
-        site_log = log[name]
-        used_by_peer = [site_log.used[peer] for peer in site_log.peers]
-        batch = RecordBatch(
-            t_ns=site_log.t_ns,
-            q=site_log.q,
-            qd=site_log.qd,
-            e=site_log.e,
-            tau=site_log.tau,
-            tau_x=site_log.tau_x,
-            used=np.array(used_by_peer).T,
-        )
-        stats.add(batch)
-        expected = scenario.ticks(name)
-        if diverged_at_s is not None:
-            # A run that diverged ends early, in the tick that its sites announced.
-            expected = ticks_at_end.get(name, 0)
-        missing += max(0, expected - len(site_log))
-
-    late_samples = 0
-    for sample in find_absent_samples(log):
-        if sample.arrived_tick is not None:
-            late_samples += 1
-    metrics = _compute_run_metrics(
-        scenario,
-        site_stats,
-        diverged_at_s=diverged_at_s,
-        late_samples=late_samples,
-        missing=missing,
-    )
-    expected_metrics = LogMetrics.measure_run(log, scenario.expect.metrics)
-    return msgspec.structs.replace(metrics, metrics=expected_metrics)
-
-
 class ExpectationResult(msgspec.Struct, frozen=True):
     """Result of comparing one metric of a run with the limit that the scenario states for it.
 
