@@ -330,7 +330,7 @@ class SiteParts:
         publish = self.bus.publisher(self._key(channel))
 
         def store_and_publish(payloads: list[bytes]) -> None:
-            """Stores messages to send them again later, and publishes them in larger blocks.
+            """Stores messages for requests to send them again, and publishes them in blocks.
 
             Args:
                 payloads: The encoded messages.

@@ -510,7 +510,11 @@ def test_added_members_meet_the_others(tmp_path: Path) -> None:
     ends = read_member_keys(folder / "m2").ends
     done = trilat("keys", "add", "keys", "s", "--host", "192.0.2.9", cwd=tmp_path)
     assert done.code == 0, done
-    for path in ("keys/s: for s", "keys/m1/members.json: for m1", "keys/m2/members.json"):
+    for path in (
+        "keys/s: keys for s",
+        "m1/members.json: list of members for m1",
+        "keys/m2/members.json",
+    ):
         assert path in done.out
 
     after = read_files(folder)
