@@ -1,4 +1,4 @@
-"""A recorder killed twenty times at random moments; and a disk that is full, against one that is not."""
+"""Kills a recorder twenty times at random moments, and compares sessions with a full disk and with free space."""
 
 import random
 import tempfile
@@ -62,7 +62,7 @@ def _full_disks() -> list[str]:
 
 
 def _on_disk(mib: int) -> tuple[int, int, int]:
-    """Returns what the sites say at the end: samples missing, ticks begun late, samples late."""
+    """Returns the sites' final counts of missing samples, ticks that began late, and late samples."""
     with tempfile.TemporaryDirectory() as folder:
         stage = Stage(Path(folder))
         place = Path(folder) / "disk"

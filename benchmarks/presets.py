@@ -1,4 +1,4 @@
-"""Every preset as a live session over Zenoh, ten seconds each, against virtual time."""
+"""Compares ten seconds of every preset as a live session over Zenoh with virtual time."""
 
 import shutil
 import tempfile

@@ -1,6 +1,7 @@
-"""Verifying a log by compiled code against reading and executing its records one by one.
+"""Compares verifying a log by compiled code with reading and executing its records one by one.
 
-Both ways are timed in turn in one process. The ratio is that of processor times.
+Both methods are measured alternately in one process. The result is the ratio of their processor
+times.
 """
 
 import statistics
@@ -32,7 +33,7 @@ def run() -> list[str]:
 
 
 def _compare(name: str, path: Path) -> str:
-    """Times both ways for one log, in turn."""
+    """Measures both methods alternately for one log."""
     records = verification.verify(open_log(path)).identical  # compiles
     pairs = []
     for _ in range(ROUNDS):
@@ -59,7 +60,7 @@ def verify_singly(path: Path) -> verification.VerifyResult:
 
 
 def _processor_s(call: Callable[[], object]) -> float:
-    """Returns the processor time of a call, s."""
+    """Returns the processor time of a call, in s."""
     begun = time.process_time()
     call()
     return time.process_time() - begun

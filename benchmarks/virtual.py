@@ -1,4 +1,4 @@
-"""`trilat sim paper` with its full log against real time and where its time goes; then verify."""
+"""Measures the speed of `trilat sim paper` with its full log, its parts, and then the speed of verify."""
 
 import io
 
@@ -38,7 +38,7 @@ def run() -> list[str]:
 
 
 def time_writing(scenario: Scenario) -> tuple[float, float]:
-    """Returns what encoding all records of a run takes, and writing them, s."""
+    """Returns the times to encode and to write all records of a run, in s."""
     steps = list(virtual.execute_virtual(scenario))
 
     def encode() -> list[tuple[str, bytes, int, int]]:
@@ -67,7 +67,7 @@ def time_writing(scenario: Scenario) -> tuple[float, float]:
 
 
 def time_checking(scenario: Scenario) -> tuple[float, float]:
-    """Returns what reading a log takes, and verifying it, s."""
+    """Returns the times to read and to verify a log, in s."""
     stream = io.BytesIO()
     virtual.write_virtual_log(scenario, stream)
 
@@ -75,7 +75,7 @@ def time_checking(scenario: Scenario) -> tuple[float, float]:
         stream.seek(0)
         log = open_log(stream)
         for name in log.sites:
-            log[name].states  # noqa: B018 - reading is what is timed
+            log[name].states  # noqa: B018 - the reading is measured
 
     def check() -> None:
         stream.seek(0)

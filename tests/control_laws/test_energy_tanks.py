@@ -82,7 +82,7 @@ def test_a_tank_sends_at_most_its_energy() -> None:
     lines = describe_law_conditions(
         make_energy_pair({**TANKS, "packet_1_s": 2000.0}, clamped=False, duration_s=1.0)
     )
-    assert "does not hold: a tank sends 2 of its energy a tick" in lines[0]
+    assert "does not hold: a tank sends 2 times its energy per tick" in lines[0]
 
 
 SEEDS = [

@@ -128,7 +128,7 @@ def test_other_sessions_are_refused_with_differences(
         make_bytes_of_messages(make_whole_bytes(), [], session=session, scenario=scenario)
     )
     with pytest.raises(
-        LogError, match=rf"two\.mcap: is not a part of the session in .*one\.mcap: {named}"
+        LogError, match=rf"two\.mcap is not a part of the session in .*one\.mcap: {named}"
     ):
         open_log(first, two)
 

@@ -450,4 +450,4 @@ def test_exit_codes_give_the_outcome(
 def test_an_unfinished_log_is_named_where_it_is(command: list[str], tmp_path: Path) -> None:
     write_log(tmp_path, make_chunked_bytes()[:-60], "run.mcap.active")
     done = trilat(*command, "run.mcap", cwd=tmp_path)
-    done.refuses("run.mcap: cannot be read", "trilat log recover run.mcap.active")
+    done.refuses("run.mcap cannot be read", "trilat log recover run.mcap.active")

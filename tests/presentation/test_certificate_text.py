@@ -236,7 +236,7 @@ def test_short_runs_state_their_length_once() -> None:
     short = replace(certificate, end=end, roots=slow)
     needed_s = 8.0 * np.log(2.0) / 0.25 + end.quiet_from_s
     assert describe_judgement(short) == (
-        f"open: the run is too short to tell; a run of {needed_s:.3g} s would"
+        f"open: the run is too short to tell; a run of {needed_s:.3g} s would be long enough"
     )
     long = replace(short, end=end._replace(lasts_s=needed_s))
     assert "too short" not in describe_judgement(long)

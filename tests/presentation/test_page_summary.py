@@ -78,7 +78,7 @@ def test_stable_run_names_its_proof() -> None:
 
 def test_lasting_errors_are_explained() -> None:
     certificate = make_certificate(EndBehaviour.CONVERGED, 2 * SETTLED_ERROR_RAD)
-    assert certificate.headline().startswith("stable: at rest, with errors that stay; ")
+    assert certificate.headline().startswith("stable: at rest, with remaining errors; ")
     html = verdict_text(certificate)
     speed_rad_s = certificate.end.end_speed_rad_s
     assert f"no joint was faster than {speed_rad_s:.2g} rad/s, and errors stay" in html

@@ -285,7 +285,7 @@ def test_skipped_ticks_count_as_missing_nowhere(tmp_path: Path) -> None:
     assert isinstance(summary, list)
     (of_recorder,) = [line for line in summary if line.startswith("recorder: s:")]
     assert f", {skipped} skipped" in of_recorder
-    assert "not made" not in of_recorder
+    assert "not executed" not in of_recorder
     phrase = "of them late by a period or more"
     assert any(f"{phrase}, {skipped} of them skipped" in line for line in session.said)
     assert any(
@@ -297,7 +297,7 @@ def test_skipped_ticks_count_as_missing_nowhere(tmp_path: Path) -> None:
 
     late = rewrite_log(log, change=delay)
     page = render_loops(late, summarise_run(late))
-    assert "; 4 ticks began a period or more late and were made all the same; " in page
+    assert "; 4 ticks began a period or more late and were executed nevertheless; " in page
     assert f"{skipped} ticks were skipped." in page
 
 

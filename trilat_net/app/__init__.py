@@ -1,4 +1,4 @@
-"""What users start: the command line, the Python interface, a demo, and checks of the machine.
+"""The parts that users start: the command line, the Python interface, a demo, and checks.
 
 `cli` contains the `trilat` command, and `api` the functions of the package trilat_net. Each
 parses its arguments and calls the packages that do the work.

@@ -1,4 +1,4 @@
-"""Computes which messages of the other arms a controller used and a user saw, without the run.
+"""Computes which messages of other arms a controller used and a user saw, without a run.
 
 In each control period, an arm sends its state to the other arms. These messages are delayed and
 lost at random, but the random numbers follow from a seed in the scenario, the description of
@@ -6,8 +6,8 @@ the experiment. They can therefore be drawn again. For example, a report can sho
 saw although the log does not contain it.
 
 Invariant:
-    - What a user sees depends only on the scenario, its seed and the number of the control
-      period.
+    - The picture that a user sees depends only on the scenario, its seed and the number of the
+      control period.
 """
 
 from collections.abc import Mapping
@@ -62,7 +62,7 @@ def count_silences(used: IntArray, receiver_hz: int, silence_ns: int) -> int:
     Args:
         used: Number of the sample in use in every tick. -1 before the first sample.
         receiver_hz: Tick rate of the site, in Hz.
-        silence_ns: Longest time without a new sample that does not count, in ns.
+        silence_ns: Longest time without a new sample that is not counted as a silence, in ns.
     """
     new_sample_ticks = np.flatnonzero(np.diff(used, prepend=-1) > 0)
     if not len(new_sample_ticks):
@@ -117,12 +117,12 @@ class PictureDelay:
         self._shown = dict.fromkeys(self._links, -1)
 
     def advance_to(self, tick: int, used: Mapping[str, int]) -> Mapping[str, int]:
-        """Returns which state of each other arm the user sees in one control period.
+        """Returns the state of each other arm that the user sees in one control period.
 
         The states are called samples, and the other arms peers.
 
         Args:
-            tick: The tick. It must not be before that of the previous call.
+            tick: The tick. It must not be earlier than the tick of the previous call.
             used: For each peer, the sample that the controller uses in this tick.
 
         Returns:
@@ -140,9 +140,9 @@ class PictureDelay:
         return {**used, **self._shown}
 
     def list_shown_samples(self, ticks: int) -> dict[str, IntArray]:
-        """Returns which state of each other arm the user sees in each control period of a run.
+        """Returns the states of the other arms that the user sees in all control periods.
 
-        The picture is delayed, so that it shows states of earlier periods.
+        The picture is delayed, so it shows states of earlier periods.
 
         Args:
             ticks: Number of control periods of the user's site, from the start of the run.

@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 
 
 MAX_SEEDS = 100_000
-"""Largest number of seeds that --seeds may name."""
+"""Largest number of seeds in the option --seeds."""
 
 
 @options.command("jitter --seeds 1..20 --junit out.xml", page="docs/tutorials/lab.md")
@@ -88,7 +88,7 @@ def test_command(
         )
     check_workers(jobs, on)
     if junit is not None and (junit.is_dir() or not os.access(junit.parent, os.W_OK)):
-        raise UsageError(f"{junit}: cannot be written")
+        raise UsageError(f"{junit} cannot be written")
     trials = _list_trials(scenarios or [], parse_seeds(seeds), overrides or [], live=live)
     began_unix_ns = SystemClock().unix_ns()
     with terminal.lines_aside(as_json):
@@ -104,13 +104,13 @@ def parse_seeds(text: str | None) -> list[int]:
     """Parses a list of random seeds, written as 1..20 or 1,5,9 or 1..3,8.
 
     Args:
-        text: The text. None if the user gave no seeds.
+        text: The text. `None` if the user gave no seeds.
 
     Returns:
         The seeds. Empty if there is no text.
 
     Raises:
-        UsageError: The text is not of that form, or names more than `MAX_SEEDS` seeds.
+        UsageError: The text does not have this form, or names more than `MAX_SEEDS` seeds.
     """
     if text is None:
         return []
@@ -141,9 +141,9 @@ def _list_trials(
     """Lists the trials of a test: each scenario with each seed.
 
     Args:
-        sources: Names or paths of the scenarios. Empty selects all shipped scenarios that have
-            expectations.
-        seeds: The seeds. Empty uses those of each scenario.
+        sources: Names or paths of the scenarios. If empty, all shipped scenarios that have
+            expectations are selected.
+        seeds: The seeds. If empty, each scenario's own seed is used.
         overrides: Overrides of all scenarios.
         live: True if the trials run live over a network.
     """
@@ -164,11 +164,12 @@ def _list_trials(
 def _run_virtual(trials: "list[Trial]", jobs: int | None, on: str | None) -> "TrialReport":
     """Runs trials in virtual time, and shows their progress.
 
-    In a terminal it is a bar, otherwise a line for each scenario whose trials have all ended.
+    In a terminal, the progress is a bar. Otherwise it is a line for each scenario whose trials
+    have all ended.
 
     Args:
         trials: The trials.
-        jobs: Number of processes. None uses one per core.
+        jobs: Number of processes. If `None`, there is one per core.
         on: Address of a Dask scheduler that executes the trials instead.
     """
     from .trials import run_trials
@@ -203,7 +204,7 @@ def _run_live(trials: "list[Trial]") -> "TrialReport":
     side.
 
     Args:
-        trials: The trials: a scenario with a seed each.
+        trials: The trials, each a scenario with a seed.
 
     Returns:
         The report, with the time that each trial took.
@@ -234,8 +235,8 @@ def _run_tuning(
 
     Args:
         plan: The laws and the procedure.
-        folder: Folder of the results. None uses the next free one.
-        jobs: Number of processes. None uses one per core.
+        folder: Folder of the results. If `None`, the next free folder is used.
+        jobs: Number of processes. If `None`, there is one per core.
         on: Address of a Dask scheduler that executes the runs instead.
         force: True to replace existing files.
         as_json: True to print the result as JSON.
@@ -362,7 +363,7 @@ def compare_command(
 )
 def tune_command(
     arm: Annotated[
-        Path, value("--arm", "URDF", "URDF file of the arm, or name of a shipped one.")
+        Path, value("--arm", "URDF", "URDF file of the arm, or name of a shipped URDF.")
     ],
     delay: Annotated[str, value("--delay", "40ms|measured:SESSION|CSV")],
     law: Annotated[
@@ -437,8 +438,8 @@ def tune_command(
 def _measure_delay(text: str, reach: options.Reach) -> str:
     """Returns a delay as `tune_arm` accepts it, and measures it if it names a running session.
 
-    The delay of a session is that of its slowest link. If the session measures no link, it is
-    half of the longest round trip from this machine, at the 99th percentile.
+    The delay of a session is the delay of its slowest link. If the session measures no link, it
+    is half of the longest round trip from this machine. Both are 99th percentiles.
 
     Args:
         text: A delay such as "40ms", a file, or "measured:SESSION".
@@ -464,7 +465,7 @@ def _measure_delay(text: str, reach: options.Reach) -> str:
         0.5 * member["rtt_us"]["p99"] for member in measurement.members if member["answers"]
     ]
 
-    # Half a round trip stands for the delay only if no delays of links were reported.
+    # Half a round trip is used as the delay only if no delays of links were reported.
     delays_us = [max(link["delay_us"], link["delay_max_us"]) for link in measurement.links]
     if delays_us:
         return f"{max(delays_us):.0f}us"
@@ -480,9 +481,9 @@ def _tune_bench(laws: list[str], study: str, jobs: int | None, on: str | None) -
     interrupted tuning.
 
     Args:
-        laws: Names of the laws. Empty selects all laws of the study.
+        laws: Names of the laws. If empty, all laws of the study are selected.
         study: Name of the study.
-        jobs: Number of processes. None uses one per core.
+        jobs: Number of processes. If `None`, there is one per core.
         on: Address of a Dask scheduler that executes the runs instead.
 
     Raises:
@@ -527,7 +528,7 @@ def _run_bench(
 
     Args:
         folder: Folder of the benchmark.
-        jobs: Number of processes. None uses one per core.
+        jobs: Number of processes. If `None`, there is one per core.
         on: Address of a Dask scheduler that executes the runs instead.
         confirm: Accepted for older commands, see `run_bench`.
     """

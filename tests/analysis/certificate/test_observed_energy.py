@@ -121,7 +121,7 @@ def test_code_from_outside_runs_only_on_request() -> None:
     silent = {"sites.s.control.law": "tests.line_law:Silent", "duration_s": 0.1}
     mixed = simulate_scenario(load_scenario(log.scenario, silent))
     assert ObservedEnergy.of_log(mixed, own_laws=True).text.endswith(
-        "the law of s declares none"
+        "the law of s declares no energies"
     )
 
 

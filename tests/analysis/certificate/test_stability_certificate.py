@@ -97,7 +97,9 @@ def test_external_arms_are_judged_with_identified_theta() -> None:
         make_arm_external(rewrite_log(make_free_log(), change=change), known=True)
     )
     assert certificate.verdict.finding is StabilityFinding.NOT_JUDGED
-    assert "the external arm of s does not move as its theta says" in certificate.verdict.text
+    assert (
+        "the external arm of s does not move according to its theta" in certificate.verdict.text
+    )
 
 
 def test_a_record_without_neighbours_is_no_period() -> None:

@@ -1,8 +1,8 @@
 """Shows the progress of commands with many runs, and runs a scenario live for such a command.
 
 A sweep or a tuning may take hours. `show_progress` shows a bar in a terminal. In a file or a
-pipe it prints at most ten lines with the remaining time. If the number of all items grows, as
-in a sweep that is refined, it prints up to ten more.
+pipe it prints at most ten lines with the remaining time. If the total number of items grows, as
+in a sweep that is refined, it prints up to ten more lines.
 """
 
 from collections.abc import Callable, Iterator
@@ -55,9 +55,9 @@ def show_progress(
     def show_line(done: int, total: int) -> None:
         """Prints a line with the remaining time, about once per tenth of the items.
 
-        The remaining time follows from the mean duration of the items since the first call. No
-        line is printed at the first call, where this duration is unknown, nor after the last
-        item.
+        The remaining time is estimated from the mean duration of the items since the first
+        call. No line is printed at the first call, where this duration is unknown, nor after
+        the last item.
 
         Args:
             done: Number of finished items.
@@ -88,7 +88,8 @@ def show_progress(
 def run_in_own_folder(scenario: "Scenario", label: str, folder_name: str) -> "SessionResult":
     """Runs a scenario live, and stores its results in a new folder.
 
-    Commands that run several scenarios use it, so that results do not replace each other.
+    Commands that run several scenarios use this function, so that results do not replace each
+    other.
 
     Args:
         scenario: The scenario.

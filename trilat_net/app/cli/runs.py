@@ -106,7 +106,7 @@ def sim_command(
 
 
 def _describe_length(scenario: "Scenario", path: Path) -> str:
-    """Returns a phrase on how long a simulated run is and which arms it has.
+    """Returns a phrase that states how long a simulated run is and which arms it has.
 
     A run that diverged is shorter than planned, and the phrase says so.
 
@@ -308,9 +308,9 @@ def metrics_command(
     """Computes all metrics that apply to a run.
 
     The ten most important numbers are printed, each with the site, link or wall that has the
-    largest. With --all, tables cover tracking, effort, energies, force sharing, impedance,
-    walls, learning and the network, with a column for each site, link and wall. A dash marks a
-    missing value; if the run could have the value, the reason is given.
+    largest value. With --all, tables cover tracking, effort, energies, force sharing,
+    impedance, walls, learning and the network, with a column for each site, link and wall. A
+    dash marks a missing value; if the run could have the value, the reason is given.
     docs/reference/metrics.md has every formula.
     """
     from ...analysis import compute_log_metrics
@@ -395,7 +395,7 @@ def figure_command(
 def _list_figures(log: "Log", *, as_json: bool) -> None:
     """Prints the names of all figures that a command can draw from a log.
 
-    Figures that the log has no data for follow, with the reason.
+    Figures for which the log has no data follow, with the reason.
 
     Args:
         log: The log.
@@ -609,10 +609,10 @@ def _parse_pose(text: str | None) -> tuple[float, ...] | None:
     """Parses the joint angles that a user gave on the command line, such as "0.1,0.3".
 
     Args:
-        text: The text. None if the user gave no pose.
+        text: The text. `None` if the user gave no pose.
 
     Returns:
-        The angles in rad. None if there is no text.
+        The angles in rad. `None` if there is no text.
 
     Raises:
         UsageError: A part of the text is not a number.

@@ -76,7 +76,7 @@ def _put_gradients(
     a: Array,
     gradient: Array,
 ) -> None:
-    """Writes Y'r of each of K poses into `gradient`, shape (K, 10 n).
+    """Writes Y'r for each of K poses into `gradient`, shape (K, 10 n).
 
     Y'r is the direction in which the adaptive law changes the parameter estimates, with the
     regressor Y and the velocity error r = qd - v. The motion has the shape (K, n).

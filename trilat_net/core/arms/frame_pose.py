@@ -12,7 +12,7 @@ from .chain import Matrix, Three, multiply_matrices, multiply_vector
 from .elementary import sincos
 
 _plain_sincos = getattr(sincos, "py_func", sincos)
-"""The function `sincos` as plain Python. Its compilation would take longer than the reading."""
+"""The function `sincos` as plain Python. Compiling it takes longer than reading a file."""
 
 
 class FramePose(NamedTuple):
@@ -47,7 +47,7 @@ class FramePose(NamedTuple):
         """Returns the product of two poses, which places one frame inside another.
 
         The pose `inner` is expressed in the frame of this pose. The result is the same frame,
-        expressed where this pose is expressed.
+        expressed in the frame in which this pose is expressed.
         """
         x, y, z = self.turn(inner.origin_m)
         ox, oy, oz = self.origin_m

@@ -28,15 +28,15 @@ class LinkSchedule:
 
     Every arm's process sends its state (a sample) once per control period. The arrival times
     follow from the delays and losses in the description of the experiment, and are computed by
-    the same function as during a run. Each model of delay applies to messages sent at its first
-    time or later.
+    the same function as during a run. Each delay model applies to messages that are sent at or
+    after its start time.
 
     Args:
         setup: Setup of the link, as the kernel reads it.
         changed_models: Models of delay and loss that the link gets by changes during the run.
 
     Attributes:
-        models: All models of the link, in the order of their first stamps.
+        models: All models of the link, in the order of their start times.
         row: State of the link: a row of the array that the kernel reads.
     """
 
@@ -50,7 +50,8 @@ class LinkSchedule:
                     points.append((int(t_us), int(delay_us)))
             models.append(model)
         models += changed_models
-        # The sort is stable: of two models with the same first stamp, the changed one applies.
+        # The sort is stable, so if two models have the same start time, the changed model
+        # applies.
         models.sort(key=lambda model: model.from_ns)
         self.models = np.array(models, LINK_MODEL_DTYPE)
         self._points = np.array([*points, *setup.outages], dtype=np.int64).reshape(-1, 2)
@@ -110,7 +111,7 @@ class LinkSchedule:
         samples = np.arange(int(self.row.scheduled) + 1, end)
         due_ns = self.draw(end)
         stamp_ns = samples * NS_PER_S // int(self.row.rate_hz)
-        # A sample never comes into use at the time of its own stamp.
+        # A sample never comes into use at its own sending time.
         ticks = first_ticks(np.maximum(due_ns, stamp_ns + 1), receiver_hz)
         is_delivered = due_ns != LOST
         return samples[is_delivered], ticks[is_delivered]

@@ -161,13 +161,13 @@ def make_wrong_script(wrong: DeviceState) -> Script:
 @pytest.mark.parametrize(
     ("wrong", "counted"),
     [
-        (DeviceState((9.0, 9.0, 9.0), ZERO, HELD), "dropped 2 jumps, 0 unreadable"),
-        (DeviceState((1e300, -1e308, 0.0), ZERO, HELD), "dropped 2 jumps, 0 unreadable"),
-        (DeviceState((math.nan, 0.0, 0.0), ZERO, HELD), "dropped 0 jumps, 3 unreadable"),
-        (DeviceState((0.3, -0.12, math.inf), ZERO, HELD), "dropped 0 jumps, 3 unreadable"),
+        (DeviceState((9.0, 9.0, 9.0), ZERO, HELD), "dropped: 2 jumps, 0 unreadable"),
+        (DeviceState((1e300, -1e308, 0.0), ZERO, HELD), "dropped: 2 jumps, 0 unreadable"),
+        (DeviceState((math.nan, 0.0, 0.0), ZERO, HELD), "dropped: 0 jumps, 3 unreadable"),
+        (DeviceState((0.3, -0.12, math.inf), ZERO, HELD), "dropped: 0 jumps, 3 unreadable"),
         (
             DeviceState((0.3, -0.12, 0.15), (math.nan, 0.0, 0.0), HELD),
-            "dropped 0 jumps, 3 unreadable",
+            "dropped: 0 jumps, 3 unreadable",
         ),
     ],
 )
@@ -256,7 +256,8 @@ def test_silent_devices_need_their_button_anew(fault: str, tmp_path: Path) -> No
     assert verify(session.log).passed
     if fault == "raises":
         assert (
-            sum("the device is silent; the arm is let go" in line for line in session.said) == 1
+            sum("the device is silent; the arm is released" in line for line in session.said)
+            == 1
         )
         assert session.device.entered == 2
 
@@ -267,7 +268,7 @@ def test_lost_devices_are_reported_and_tried_again(tmp_path: Path) -> None:
 
     session = DeviceSession(tmp_path, script)
     assert [line for line in session.said if "no service" in line] == [
-        "m1: no service; the arm is let go, and the device is tried again"
+        "m1: no service; the arm is released, and the device is tried again"
     ]
     assert session.device.entered > 2
     assert session.changes == []

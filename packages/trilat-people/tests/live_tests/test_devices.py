@@ -102,7 +102,7 @@ def test_a_haply_leads_and_renders_its_reaction(held: Held) -> None:
     assert np.linalg.norm(forces, axis=1).max() == pytest.approx(1.5)
     assert np.abs(forces[:, 1]).max() == 0.0
     assert np.abs(part.tau_x[mine]).max() > 1.0
-    assert "from its place to the force of it p50" in held.said[-1]
+    assert "round trip from device position to rendered force: p50" in held.said[-1]
     texts = [event.text.partition(" at t")[0] for event in log.events if event.kind == "hand"]
     assert (texts[0], texts[-1]) == (
         "m1: HaplyInverse3 takes hold",
@@ -116,7 +116,7 @@ def test_silent_haply_lets_go_until_its_button(held: Held) -> None:
     held.circles()
     until(lambda: len(held.service.asked) > 500, 60.0)
     held.service.silent.set()
-    held.process.prints("is silent; the arm is let go")
+    held.process.prints("is silent; the arm is released")
     held.service.silent.clear()
     until(lambda: sum("takes hold" in line for line in held.said) == 2, 30.0)
     log = held.led()
@@ -132,7 +132,7 @@ def test_a_killed_service_leads_again_after_return(held: Held) -> None:
     held.circles()
     until(lambda: len(held.service.asked) > 500, 60.0)
     held.service.kill()
-    held.process.prints("the arm is let go, and the device is tried again")
+    held.process.prints("the arm is released, and the device is tried again")
     with HaplyService(held.service.port) as again:
         until(lambda: len(again.asked) > 100, 60.0)
         again.place_m, again.pressed = circle, {"a"}
@@ -143,7 +143,7 @@ def test_a_killed_service_leads_again_after_return(held: Held) -> None:
         f"m1: HaplyInverse3 {what}" for what in ("takes hold", "lets go", "takes hold")
     ]
     closed = f"m1: the service at {held.service.address} has closed the connection"
-    assert f"{closed}; the arm is let go, and the device is tried again" in held.said
+    assert f"{closed}; the arm is released, and the device is tried again" in held.said
 
 
 @pytest.mark.long

@@ -197,7 +197,7 @@ def test_the_opening_names_axes_laws_and_seeds(tmp_path: Path) -> None:
         "trio: 174 cells (29 x 3 x laws pd_d, adaptive), 10 seeds each where anything is random",
         "  over control.Kd=0.2:3:0.1: 0.2, 0.3, ..., 3.0",
         "  over link.delay_ms=0:40:20: 0, 20, 40",
-        "  0.5 s each, an undecided one up to 1 s",
+        "  0.5 s each, undecided runs up to 1 s",
     ]
 
 
@@ -217,7 +217,7 @@ def test_a_summary_counts_every_run_once(tmp_path: Path) -> None:
 
     text = "\n".join(others)
     assert "undecided after 0.5 s and continued, the longest to 4 s" in text
-    assert "in 1 cell nothing is random: one seed was run there" in text
+    assert "nothing is random in 1 cell: only one seed was run there" in text
     assert "stable with some seeds and not with others" in text
     assert "95 % interval" in text
     assert "all in places.csv" in text
