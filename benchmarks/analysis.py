@@ -32,7 +32,7 @@ def lap(what):
     print(f"{what}={now - last:.3f}")
     last = now
 from trilat_net.presentation.page import write_report
-from trilat_net.analysis.certificate.stability_certificate import certify
+from trilat_net.analysis.certificate.stability_certificate import certify_log
 from trilat_net import open_log, verify
 from trilat_net.execution.virtual_comparison import simulate_without_operators
 from trilat_net.analysis.metrics.log_metrics import compute_log_metrics
@@ -41,9 +41,9 @@ log = open_log(sys.argv[1])
 lap("opening")
 compute_log_metrics(log).to_dict()
 lap("metrics")
-certify(log)
+certify_log(log)
 lap("certificate")
-write_report(log, Path(sys.argv[2]), certificate=certify(log))
+write_report(log, Path(sys.argv[2]), certificate=certify_log(log))
 lap("report")
 simulate_without_operators(log)
 lap("twin")

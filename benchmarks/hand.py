@@ -13,7 +13,7 @@ import numpy as np
 import trilat_net
 from tests.live.processes import HOLDER, PAPER, Session, Stage, connection_options
 from tests.sites.devices import HaplyService
-from trilat_net.execution.verification import verify
+from trilat_net.execution.verification import verify_log
 from trilat_net.log.log_reader import Log, open_log
 from trilat_net.net import topics
 from trilat_net.net.connection import Connection
@@ -165,7 +165,7 @@ def _describe_flood(log: Log, flooded: tuple[int, int, int]) -> list[str]:
     before = (part.t_ns < begun_ns - epoch_ns - 2_000_000_000) & (part.t_s > 2.0)
     p99 = [float(np.percentile(part.late_us[rows], 99)) for rows in (during, before)]
     refused = {k: v for k, v in log.link_stats("s")[-1].dropped.items() if k.startswith("hand")}
-    found, missing = verify(log), sum(map(log.missing, log.sites))
+    found, missing = verify_log(log), sum(map(log.missing, log.sites))
     return [
         f"flood of {sent / (ended_ns - begun_ns) * 1e9:.0f} messages/s for {FLOOD_S:g} s at s: p99 lateness "
         f"{p99[0]:.0f} us, before {p99[1]:.0f} us; refused {refused}",

@@ -34,11 +34,11 @@ def run() -> list[str]:
 
 def _compare(name: str, path: Path) -> str:
     """Measures both methods alternately for one log."""
-    records = verification.verify(open_log(path)).identical  # compiles
+    records = verification.verify_log(open_log(path)).identical  # compiles
     pairs = []
     for _ in range(ROUNDS):
         fast_s = min(
-            _processor_s(lambda: verification.verify(open_log(path))) for _ in range(3)
+            _processor_s(lambda: verification.verify_log(open_log(path))) for _ in range(3)
         )
         pairs.append((fast_s, _processor_s(lambda: verify_singly(path))))
     ratio = statistics.median(single_s / fast_s for fast_s, single_s in pairs)
@@ -56,7 +56,7 @@ def verify_singly(path: Path) -> verification.VerifyResult:
         mock.patch.object(mcap_reader, "_BLOCK_BYTES", 1 << 40),
         mock.patch.object(site_log, "index_records", return_value=None),
     ):
-        return verification.verify(open_log(path))
+        return verification.verify_log(open_log(path))
 
 
 def _processor_s(call: Callable[[], object]) -> float:

@@ -3,7 +3,7 @@
 import io
 
 from trilat_net.execution import virtual
-from trilat_net.execution.verification import verify
+from trilat_net.execution.verification import verify_log
 from trilat_net.log.log_reader import open_log
 from trilat_net.log.log_writer import LogWriter
 from trilat_net.log.provenance import collect_provenance
@@ -79,6 +79,6 @@ def time_checking(scenario: Scenario) -> tuple[float, float]:
 
     def check() -> None:
         stream.seek(0)
-        verify(open_log(stream))
+        verify_log(open_log(stream))
 
     return best_s(read), best_s(check)

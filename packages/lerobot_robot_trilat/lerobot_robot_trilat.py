@@ -348,7 +348,7 @@ def run_policy(
     return count
 
 
-def load_policy(folder: str) -> Callable[[dict[str, list[float]]], list[float]]:
+def _load_policy(folder: str) -> Callable[[dict[str, list[float]]], list[float]]:
     """Loads a trained policy that `lerobot-train` has stored in a folder.
 
     Args:
@@ -390,7 +390,7 @@ def load_policy(folder: str) -> Callable[[dict[str, list[float]]], list[float]]:
     return decide
 
 
-def main() -> None:
+def _main() -> None:
     """Runs a trained policy, which moves an arm of a running teleoperation session.
 
     This is the command `python -m lerobot_robot_trilat`.
@@ -408,7 +408,7 @@ def main() -> None:
     parser.add_argument("--duration", type=float, default=30.0, help="duration, s")
     parser.add_argument("--fps", type=int, default=30, help="decisions per second")
     options = parser.parse_args()
-    decide = load_policy(options.folder)
+    decide = _load_policy(options.folder)
     config = TrilatRobotConfig(
         session=options.session,
         scenario=options.scenario,
@@ -427,4 +427,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    _main()

@@ -33,7 +33,7 @@ from trilat_net.analysis.link_summary import summarise_links
 from trilat_net.core.step.site_step import Site
 from trilat_net.core.step.ticks import LifeReason, Mode, TickInput
 from trilat_net.errors import ScenarioError, SessionError
-from trilat_net.execution.verification import verify
+from trilat_net.execution.verification import verify_log
 from trilat_net.execution.virtual_comparison import compare_with_virtual
 from trilat_net.log.log_reader import Log
 from trilat_net.net import topics
@@ -149,7 +149,7 @@ def test_external_measurements_are_the_record_and_drive(tmp_path: Path) -> None:
 def assert_reproduced(log: Log) -> None:
     """Asserts that the log is executed again, and equals virtual time fed with the log, bit for bit."""
     assert log.complete
-    verdict = verify(log)
+    verdict = verify_log(log)
     assert verdict.whole_run
     assert verdict.identical == verdict.records == sum(len(log[name]) for name in log.sites)
     assert compare_with_virtual(log).fed.identical == verdict.records
@@ -474,7 +474,7 @@ def test_killed_sites_return_with_their_arm(tmp_path: Path) -> None:
     assert set(log["m"].mode[gone[0] + 72 : first]) == {"hold"}
     assert np.abs(np.diff(part.tau[again], axis=0)).max() <= 2.0 * (1.0 + 1e-9)  # 2000 N m/s
     assert log.complete
-    result = verify(log)
+    result = verify_log(log)
     assert (result.differing, result.unjudged, result.gaps) == (0, 0, [])
     assert result.absences == [("s", *gone)]
 

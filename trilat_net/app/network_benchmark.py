@@ -340,7 +340,7 @@ def _run_local_far_end(duration_s: float) -> Iterator[tuple[list[str], Path]]:
             child.wait()
 
 
-class _ScenarioNeeds(NamedTuple):
+class NetworkNeeds(NamedTuple):
     """Demands of a scenario on the network: message size, message rate and largest delay.
 
     The demands are computed from the rate of the control loops, and from the delays for which
@@ -370,53 +370,103 @@ class _ScenarioNeeds(NamedTuple):
     stable_ms: list[list[float]] | None
     words: str
 
+    @classmethod
+    def of_scenario(cls, scenario: Scenario) -> "NetworkNeeds":
+        """Computes the delay, message size and message rate that a scenario demands.
 
-def find_needs(scenario: Scenario) -> _ScenarioNeeds:
-    """Computes which delay, message size and message rate a scenario demands of the network.
+        The delays for which the control loop is stable are computed by its linear analysis,
+        which takes as long as the command `trilat linear`.
 
-    The delays for which the control loop is stable are computed by its linear analysis, which
-    takes as long as the command `trilat linear`.
+        Args:
+            scenario: The scenario, which describes the arms, their links and the run.
+        """
+        links = list(scenario.links.values())
+        held_ms = []
+        for link in links:
+            constant_ms = link.delay_ms if isinstance(link, ConstantDelay) else 0.0
+            held_ms.append(max(link.playout_ms, constant_ms))
+        rates_hz = [site.rate_hz for site in scenario.sites.values()]
+        # Links whose delay the benchmark measures are analysed with a delay of 1 ms: their
+        # actual delay is the result of the benchmark.
+        overrides = ["link.model=constant", "link.delay_ms=1"] if scenario.measured else []
 
-    Args:
-        scenario: The scenario, which describes the arms, their links and the run.
-    """
-    links = list(scenario.links.values())
-    held_ms = []
-    for link in links:
-        constant_ms = link.delay_ms if isinstance(link, ConstantDelay) else 0.0
-        held_ms.append(max(link.playout_ms, constant_ms))
-    rates_hz = [site.rate_hz for site in scenario.sites.values()]
-    # Links whose delay the benchmark measures are analysed with a delay of 1 ms: their actual
-    # delay is the result of the benchmark.
-    overrides = ["link.model=constant", "link.delay_ms=1"] if scenario.measured else []
+        in_use_ms: float | None = None
+        stable_ms: list[list[float]] | None = None
+        try:
+            require_libraries("scipy")
+            # Imported here because the far end does not need SciPy.
+            from ..analysis import analyse_linear_loop
 
-    in_use_ms: float | None = None
-    stable_ms: list[list[float]] | None = None
-    try:
-        require_libraries("scipy")
-        # Imported here because the far end does not need SciPy.
-        from ..analysis import analyse_linear_loop
+            loop = analyse_linear_loop(load_scenario(scenario, overrides))
+        except (ScenarioError, RunFailed, UsageError) as error:
+            description = f"the linear theory does not cover its delay margin: {error}"
+        else:
+            description = loop.margin.description
+            stable_ms = [
+                [1e3 * interval.low_s, 1e3 * interval.high_s]
+                for interval in loop.margin.intervals
+            ]
+            if not overrides:
+                in_use_ms = 1e3 * float(loop.conditions.age_s.max())
 
-        loop = analyse_linear_loop(load_scenario(scenario, overrides))
-    except (ScenarioError, RunFailed, UsageError) as error:
-        description = f"the linear theory does not cover its delay margin: {error}"
-    else:
-        description = loop.margin.description
-        stable_ms = [
-            [1e3 * interval.low_s, 1e3 * interval.high_s] for interval in loop.margin.intervals
-        ]
-        if not overrides:
-            in_use_ms = 1e3 * float(loop.conditions.age_s.max())
+        return cls(
+            sample_bytes=_measure_sample(scenario),
+            rate_hz=max(rates_hz),
+            playout_ms=min((link.playout_ms for link in links), default=0.0),
+            held_ms=min(held_ms, default=0.0),
+            in_use_ms=in_use_ms,
+            stable_ms=stable_ms,
+            words=description,
+        )
 
-    return _ScenarioNeeds(
-        sample_bytes=_measure_sample(scenario),
-        rate_hz=max(rates_hz),
-        playout_ms=min((link.playout_ms for link in links), default=0.0),
-        held_ms=min(held_ms, default=0.0),
-        in_use_ms=in_use_ms,
-        stable_ms=stable_ms,
-        words=description,
-    )
+    def judge(self, row: Mapping[str, Any]) -> dict[str, Any]:
+        """Judges whether a network is good enough for a scenario.
+
+        A sample is the state that a site publishes in each tick, a period of its control loop.
+        The receiver uses it from its first tick after the sample has arrived. Samples therefore
+        have an age of whole ticks. The 99th percentile of the network delay counts. It has no
+        effect if it is shorter than the time for which the scenario itself holds samples. The
+        network is good if the loop is stable at that age, and if at most `MAX_LOST` of the
+        samples are lost.
+
+        Args:
+            row: Measurement at the scenario's own message size and rate.
+
+        Returns:
+            The fields of a verdict, as `trilat ping --benchmark --json` prints them. Times are
+            `None` if no message came back.
+        """
+        fields = {
+            "transport": row["transport"],
+            "good": False,
+            "lost_share": row["lost"] / row["sent"],
+        }
+
+        one_way_us = row["one_way_us"]
+        if one_way_us is None:
+            unknown = dict.fromkeys(("p99_ms", "age_ms", "spare_ms", "playout_ms"))
+
+            return {**fields, "hidden": False, **unknown}
+
+        period_ms = 1e3 / self.rate_hz
+        p99_ms = one_way_us["p99"] / 1e3
+        # 1e-9 absorbs the rounding error of a delay of exactly a whole number of ticks.
+        arrival_ms = max(p99_ms, self.held_ms)
+        age_ticks = max(1, math.ceil(arrival_ms / period_ms - 1e-9))
+        age_ms = max(period_ms * age_ticks, self.in_use_ms or 0.0)
+        is_hidden = p99_ms <= self.held_ms
+        # Upper end of the stable interval that contains the age, if there is one.
+        limits_ms = [high for low, high in self.stable_ms or [] if low <= age_ms <= high]
+        is_tolerated = is_hidden if self.stable_ms is None else bool(limits_ms)
+        return {
+            **fields,
+            "good": is_tolerated and fields["lost_share"] <= MAX_LOST,
+            "hidden": is_hidden,
+            "p99_ms": p99_ms,
+            "age_ms": age_ms,
+            "spare_ms": limits_ms[0] - age_ms if limits_ms else None,
+            "playout_ms": math.ceil(one_way_us["max"] / 1e3),
+        }
 
 
 def _measure_sample(scenario: Scenario) -> int:
@@ -442,56 +492,6 @@ def _measure_sample(scenario: Scenario) -> int:
     return len(msgspec.msgpack.encode(sample))
 
 
-def judge_network(needs: _ScenarioNeeds, row: Mapping[str, Any]) -> dict[str, Any]:
-    """Judges whether a network is good enough for a scenario.
-
-    A sample is the state that a site publishes in each tick, a period of its control loop. The
-    receiver uses it from its first tick after the sample has arrived. Samples therefore have an
-    age of whole ticks. The 99th percentile of the network delay counts. It has no effect if it
-    is shorter than the time for which the scenario itself holds samples. The network is good if
-    the loop is stable at that age, and if at most `MAX_LOST` of the samples are lost.
-
-    Args:
-        needs: Requirements of the scenario.
-        row: Measurement at the scenario's own message size and rate.
-
-    Returns:
-        The fields of a verdict, as `trilat ping --benchmark --json` prints them. Times are
-        `None` if no message came back.
-    """
-    fields = {
-        "transport": row["transport"],
-        "good": False,
-        "lost_share": row["lost"] / row["sent"],
-    }
-
-    one_way_us = row["one_way_us"]
-    if one_way_us is None:
-        unknown = dict.fromkeys(("p99_ms", "age_ms", "spare_ms", "playout_ms"))
-
-        return {**fields, "hidden": False, **unknown}
-
-    period_ms = 1e3 / needs.rate_hz
-    p99_ms = one_way_us["p99"] / 1e3
-    # 1e-9 absorbs the rounding error of a delay of exactly a whole number of ticks.
-    arrival_ms = max(p99_ms, needs.held_ms)
-    age_ticks = max(1, math.ceil(arrival_ms / period_ms - 1e-9))
-    age_ms = max(period_ms * age_ticks, needs.in_use_ms or 0.0)
-    is_hidden = p99_ms <= needs.held_ms
-    # Upper end of the stable interval that contains the age, if there is one.
-    limits_ms = [high for low, high in needs.stable_ms or [] if low <= age_ms <= high]
-    is_tolerated = is_hidden if needs.stable_ms is None else bool(limits_ms)
-    return {
-        **fields,
-        "good": is_tolerated and fields["lost_share"] <= MAX_LOST,
-        "hidden": is_hidden,
-        "p99_ms": p99_ms,
-        "age_ms": age_ms,
-        "spare_ms": limits_ms[0] - age_ms if limits_ms else None,
-        "playout_ms": math.ceil(one_way_us["max"] / 1e3),
-    }
-
-
 @dataclass(frozen=True, repr=False)
 class NetworkBenchmark(Result):
     """Result of measuring whether the network is good enough for a scenario.
@@ -504,14 +504,15 @@ class NetworkBenchmark(Result):
         duration_s: Duration of all cases together, in s.
         needs: Requirements of the scenario.
         rows: Measurements, one row per message size, message rate and transport.
-        judged: Verdict for each transport on whether it is good enough, see `judge_network`.
+        judged: Verdict for each transport on whether it is good enough, see
+            `NetworkNeeds.judge`.
         connect: Endpoints of the far end on another machine. Empty if both ends ran on this
             machine, and no network was measured.
     """
 
     scenario: str
     duration_s: float
-    needs: _ScenarioNeeds
+    needs: NetworkNeeds
     rows: list[dict[str, Any]]
     judged: list[dict[str, Any]]
     connect: tuple[str, ...] = ()
@@ -598,7 +599,7 @@ def ping_benchmark(
         RunFailed: No far end replies at an endpoint.
     """
     loaded_scenario = load_scenario(scenario, set)
-    needs = find_needs(loaded_scenario)
+    needs = NetworkNeeds.of_scenario(loaded_scenario)
     far_endpoints = tuple(connect or ())
     with ExitStack() as stack:
         if not connect:
@@ -615,7 +616,7 @@ def ping_benchmark(
     for row in rows:
         row_case = (row["bytes"], row["rate_hz"])
         if row_case == scenario_case:
-            verdicts.append(judge_network(needs, row))
+            verdicts.append(needs.judge(row))
     return NetworkBenchmark(
         loaded_scenario.name, duration_s, needs, rows, verdicts, far_endpoints
     )
@@ -624,7 +625,7 @@ def ping_benchmark(
 def _measure_endpoint(
     endpoint: str,
     keys: MemberKeys | None,
-    needs: _ScenarioNeeds,
+    needs: NetworkNeeds,
     case_s: float,
 ) -> Iterator[dict[str, Any]]:
     """Measures round trips to another machine, with all message sizes and rates.

@@ -30,7 +30,7 @@ __all__ = [
     "check_log_files",
     "describe_rerun_changes",
     "rerun",
-    "verify",
+    "verify_log",
     # Twins
     "LEAST_PUSH",
     "MOST_PUSH",
@@ -47,7 +47,7 @@ if TYPE_CHECKING:
     from .rerun_execution import describe_rerun_changes
     from .twins import LEAST_PUSH, MOST_PUSH, PUSH_RAD, SMALLEST, Push, TwinPath, Twins
     from .unwritten_run import simulate_columns
-    from .verification import verify
+    from .verification import verify_log
     from .virtual import (
         SimulatedLog,
         check_virtual,
@@ -66,7 +66,7 @@ else:
             "rerun_execution": "describe_rerun_changes",
             "twins": "LEAST_PUSH MOST_PUSH PUSH_RAD Push SMALLEST TwinPath Twins",
             "unwritten_run": "simulate_columns",
-            "verification": "verify",
+            "verification": "verify_log",
             "virtual": (
                 "SimulatedLog check_virtual execute_virtual record_virtual simulate_scenario"
             ),

@@ -9,7 +9,7 @@ Invariant:
       and bodies move in the video.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -160,18 +160,3 @@ def _draw_arm(axes: Axes, points_m: Array, colour: str) -> None:
     joints_m = points_m[1:]
     axes.plot(*joints_m.T, linestyle="none", marker="o", markersize=4.0, color=colour)
     axes.plot(0.0, 0.0, **_BASE)
-
-
-def is_position(goal: Sequence[float] | Array, end_effector_m: Array) -> bool:
-    """Returns True if the goal of a task can be drawn as a point in space.
-
-    Goals may also be other quantities, such as joint angles.
-
-    Args:
-        goal: Numbers that describe the goal.
-        end_effector_m: Position of the end effector, in m.
-
-    Returns:
-        True if the goal has as many numbers as the position.
-    """
-    return np.shape(goal) == np.shape(end_effector_m)

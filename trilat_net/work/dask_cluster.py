@@ -101,45 +101,56 @@ class WorkerRequirements(NamedTuple):
     identity: WorkerIdentity
     laws: tuple[tuple[str, str], ...] = ()
 
+    def explain_unfit_worker(self, identity: WorkerIdentity, lacks: Sequence[str]) -> str:
+        """Explains why a worker of a cluster may not run items of a study.
 
-def explain_unfit_worker(
-    required: WorkerRequirements, identity: WorkerIdentity, lacks: Sequence[str]
-) -> str:
-    """Explains why a worker of a cluster may not run items of a study.
+        A worker must have the same source files, the same versions of packages, the same
+        floating point results, and the same files of control laws as the process that started
+        the study. Its Git commit may differ, since commits can differ in documentation only. If
+        the source files differ, the explanation also names the commits, as a hint.
 
-    A worker must have the same source files, the same versions of packages, the same floating
-    point results, and the same files of control laws as the process that started the study.
-    Its Git commit may differ, since commits can differ in documentation only. If the source
-    files differ, the explanation also names the commits, as a hint.
+        Args:
+            identity: Versions and other properties of the worker.
+            lacks: Imported control laws whose file the worker does not have.
 
-    Args:
-        required: Requirements on a worker.
-        identity: Versions and other properties of the worker.
-        lacks: Imported control laws whose file the worker does not have.
+        Returns:
+            The end of a sentence that begins with "the worker". Empty if the worker may run
+            items.
+        """
+        local = self.identity
+        differing = [
+            name for name in local if name != "commit" and identity.get(name) != local[name]
+        ]
+        if differing:
+            if "source files" in differing:
+                differing.append("commit")
+            remote_text = _list_properties(identity, differing)
+            local_text = _list_properties(local, differing)
+            return (
+                f"has {remote_text}, but the study needs {local_text}; "
+                "results from both cannot be mixed"
+            )
 
-    Returns:
-        The end of a sentence that begins with "the worker". Empty if the worker may run items.
-    """
-    local = required.identity
-    differing = [
-        name for name in local if name != "commit" and identity.get(name) != local[name]
-    ]
-    if differing:
-        if "source files" in differing:
-            differing.append("commit")
-        remote_text = _list_properties(identity, differing)
-        local_text = _list_properties(local, differing)
-        return (
-            f"has {remote_text}, but the study needs {local_text}; results from both cannot "
-            "be mixed"
-        )
+        if lacks:
+            return (
+                f"lacks the control law {', '.join(lacks)}, or has another file of it: "
+                "put the file that the scenario names into the worker's folder or PYTHONPATH"
+            )
+        return ""
 
-    if lacks:
-        return (
-            f"lacks the control law {', '.join(lacks)}, or has another file of it: "
-            "put the file that the scenario names into the worker's folder or PYTHONPATH"
-        )
-    return ""
+    def check_this_worker(self) -> None:
+        """Checks that this worker of a cluster would compute the same results as the study.
+
+        A worker that joins during the study must check itself, because the results of different
+        program versions must not be mixed.
+
+        Raises:
+            UsageError: This process differs. The message names the worker and the differences.
+        """
+        reason = self.explain_unfit_worker(describe_worker(), find_missing_laws(self.laws))
+        if reason:
+            worker = _import_distributed().get_worker()
+            raise UsageError(f"the worker {worker.address} {reason}")
 
 
 def _list_properties(identity: WorkerIdentity, names: Sequence[str]) -> str:
@@ -164,25 +175,6 @@ def find_missing_laws(laws: Sequence[tuple[str, str]]) -> list[str]:
         if local_sha256 != sha256:
             missing.append(code)
     return missing
-
-
-def check_this_worker(required: WorkerRequirements) -> None:
-    """Checks that this worker of a cluster would compute the same results as the study.
-
-    A worker that joins during the study must check itself, because the results of different
-    program versions must not be mixed.
-
-    Args:
-        required: Versions of the program and its packages, and files of control laws, that
-            every worker must have.
-
-    Raises:
-        UsageError: This process differs. The message names the worker and the differences.
-    """
-    reason = explain_unfit_worker(required, describe_worker(), find_missing_laws(required.laws))
-    if reason:
-        worker = _import_distributed().get_worker()
-        raise UsageError(f"the worker {worker.address} {reason}")
 
 
 def _make_probe() -> Callable[
@@ -310,7 +302,7 @@ class DaskCluster:
             if isinstance(answer, BaseException):
                 raise UsageError(f"the worker {worker} does not report its version: {answer}")
             identity, missing_laws = answer
-            reason = explain_unfit_worker(required, identity, missing_laws)
+            reason = required.explain_unfit_worker(identity, missing_laws)
             if reason:
                 raise UsageError(f"the worker {worker} {reason}")
         return required

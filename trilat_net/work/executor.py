@@ -34,7 +34,7 @@ from ..files import require_libraries
 from ..net import SystemClock
 from ..own_code import CodeConsents, allowed_code, allowing_any_settings
 from ..workers import count_cores, worker_pool
-from .dask_cluster import DaskCluster, WorkerRequirements, check_this_worker
+from .dask_cluster import DaskCluster, WorkerRequirements
 
 T = TypeVar("T")
 R = TypeVar("R")
@@ -112,7 +112,7 @@ def run_batch(
         UsageError: This worker does not meet the requirements.
     """
     if required is not None:
-        check_this_worker(required)
+        required.check_this_worker()
     clock = SystemClock()
     start_ns = clock.monotonic_ns()
     results: list[Any] = []

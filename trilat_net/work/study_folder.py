@@ -144,7 +144,7 @@ def _read_key(text: bytes, kind: type[E]) -> _RunKey:
         return _RunKey(entry.cell, entry.seed)
 
 
-class StoredRuns(Mapping[tuple[Any, int], E]):
+class _StoredRuns(Mapping[tuple[Any, int], E]):
     """Finished runs of a study by cell and seed, which are read from the journal when needed.
 
     Only the offsets of the lines are in memory, about 120 bytes for each run, so that a study
@@ -223,7 +223,7 @@ class RunJournal(Generic[E]):
         self._path = path
         self._study = study
         self._remedy = remedy
-        self.done: StoredRuns[E] = StoredRuns(path, kind)
+        self.done: _StoredRuns[E] = _StoredRuns(path, kind)
 
         # Read the runs that an interrupted study has stored already.
         offset = 0

@@ -302,7 +302,7 @@ class DominanceTopic:
             self._change(requested)
 
 
-class SilenceNotice:
+class _SilenceNotice:
     """Composes notices for the user while a robot sends no measurement.
 
     The first notice is due after `FIRST_NOTICE_NS` without a measurement, and further notices
@@ -411,7 +411,7 @@ class RobotArm:
 
         self._commands = commands
         self._clock = clock
-        self.silence = SilenceNotice(joints, clock)
+        self.silence = _SilenceNotice(joints, clock)
         self._sender = _SingleSender(clock)
         self._lock = threading.Lock()
         # Process start (boot) and tick of the record whose torque was published last.
@@ -431,7 +431,7 @@ class RobotArm:
             ValueError: The message cannot be read, or two programs publish.
         """
         self.silence.note_message()
-        state = cdr.read_joint_state(data)
+        state = cdr.RosJoints.read(data)
         known_names = {name for names in self._joints for name in names}
         is_other_robot = bool(state.names) and known_names.isdisjoint(state.names)
         if is_other_robot:
@@ -585,7 +585,7 @@ def read_joint_target(joints: JointNames, data: bytes) -> list[float]:
     Raises:
         ValueError: The message cannot be read, or lacks a joint.
     """
-    state = cdr.read_joint_state(data)
+    state = cdr.RosJoints.read(data)
     indices = _find_joint_indices(joints, state)
     return _check_finite([state.position[index] for index in indices])
 

@@ -827,6 +827,147 @@ class RunMetrics(msgspec.Struct, frozen=True, kw_only=True):
     windows: tuple[dict[str, Range], ...] = ()
     metrics: dict[str, Metric] = {}
 
+    @classmethod
+    def of_virtual_run(cls, scenario: Scenario) -> "RunMetrics":
+        """Runs a scenario in virtual time and returns the metrics of the run.
+
+        The records are discarded as soon as their statistics are known, so long runs need
+        little memory. All records are kept only if the scenario limits a metric of
+        `docs/reference/metrics.md`, because these metrics are computed from a complete log.
+
+        Args:
+            scenario: Scenario to run: arms, control laws, links and duration.
+        """
+        if scenario.expect.metrics:
+            return RunMetrics.of_log(simulate_scenario(scenario))
+        measured = _MeasuredRun(scenario)
+        if measured.compiled is None:
+            return measured.measure_ticks()
+        measured.compiled.finish()
+        return measured.measure_compiled(measured.compiled.run)
+
+    @classmethod
+    def of_virtual_runs(
+        cls,
+        scenarios: Sequence[Scenario],
+    ) -> "Iterator[tuple[int, RunMetrics, str]]":
+        """Runs several scenarios in virtual time, as many as possible at once.
+
+        Scenarios that differ only in numbers are computed together with vector instructions.
+        The metrics equal those of `of_virtual_run` bit for bit.
+
+        Args:
+            scenarios: The scenarios.
+
+        Yields:
+            The index of a scenario; the metrics of its run; and the property because of which
+            the run was computed alone, or an empty text.
+        """
+        indices = []
+        measured_runs = []
+        compiled_runs = []
+        for index, scenario in enumerate(scenarios):
+            measured = None if scenario.expect.metrics else _MeasuredRun(scenario)
+            if measured is None:
+                yield index, RunMetrics.of_virtual_run(scenario), NEEDS_LOG
+            elif measured.compiled is None:
+                yield index, measured.measure_ticks(), measured.obstacle
+            else:
+                indices.append(index)
+                measured_runs.append(measured)
+                compiled_runs.append(measured.compiled)
+        for position, obstacle in _finish_together(compiled_runs):
+            run = compiled_runs[position].run
+            yield indices[position], measured_runs[position].measure_compiled(run), obstacle
+
+    @classmethod
+    def of_log(cls, log: Log, expect: Expect | None = None) -> "RunMetrics":
+        """Computes errors, torques and other quantities of a recorded run from its log.
+
+        Args:
+            log: Log of the run.
+            expect: Expectations (limits of the metrics) that replace those of the log's
+                scenario. If `None`, the scenario's expectations are used.
+
+        Raises:
+            LogError: A record cannot be read.
+        """
+        scenario = log.scenario
+        if expect is not None:
+            scenario = msgspec.structs.replace(scenario, expect=expect)
+        ticks_at_end = {}
+        for event in log.events:
+            if event.kind == "end":
+                ticks_at_end[event.member] = event.ticks
+        diverged_at_s = log.diverged_s
+        site_stats = {name: SiteStats(scenario, name) for name in log.sites}
+        missing = 0
+        for name, stats in site_stats.items():
+            site_log = log[name]
+            used_by_peer = [site_log.used[peer] for peer in site_log.peers]
+            batch = RecordBatch(
+                t_ns=site_log.t_ns,
+                q=site_log.q,
+                qd=site_log.qd,
+                e=site_log.e,
+                tau=site_log.tau,
+                tau_x=site_log.tau_x,
+                used=np.array(used_by_peer).T,
+            )
+            stats.add(batch)
+            expected = scenario.ticks(name)
+            if diverged_at_s is not None:
+                # A run that diverged ends early, at the tick that its sites announced.
+                expected = ticks_at_end.get(name, 0)
+            missing += max(0, expected - len(site_log))
+
+        late_samples = 0
+        for sample in find_absent_samples(log):
+            if sample.arrived_tick is not None:
+                late_samples += 1
+        metrics = _compute_run_metrics(
+            scenario,
+            site_stats,
+            diverged_at_s=diverged_at_s,
+            late_samples=late_samples,
+            missing=missing,
+        )
+        expected_metrics = measure_run(log, scenario.expect.metrics)
+        return msgspec.structs.replace(metrics, metrics=expected_metrics)
+
+    def compare_with(self, expect: Expect) -> "list[ExpectationResult]":
+        """Compares the metrics of a run with the expectations that its scenario states.
+
+        If the run diverged, which means that an arm left its limits, the expectation `stable`
+        is always reported, even if the scenario does not state it.
+
+        Args:
+            expect: Expectations of the scenario, for example the largest permitted error.
+
+        Returns:
+            For each expectation, whether the run met it, and the measured value. The results
+            are in the order of the attributes of `Expect`.
+        """
+        outcomes = list(_evaluate_stability(expect, self))
+        for key in _LIMITS:
+            limit = getattr(expect, key)
+            if limit is not None:
+                measured = _read_metric(key, self)
+                outcomes.append(_compare_with_limit(key, measured, limit))
+
+        outcomes += _evaluate_poses(expect, self)
+        if expect.no_gaps:
+            gaps = ExpectationResult(
+                key="no_gaps",
+                held=self.missing == 0,
+                measured=f"{self.missing} missing",
+                limit="0 missing",
+            )
+            outcomes.append(gaps)
+        outcomes += _evaluate_windows(expect, self)
+        outcomes += _evaluate_metrics(expect, self)
+        return outcomes
+
 
 def _compute_run_metrics(
     scenario: Scenario,
@@ -1027,58 +1168,6 @@ NEEDS_LOG = "metrics that need a log"
 """Reason why a run cannot be computed together with others: its metrics need its whole log."""
 
 
-def measure_virtual_run(scenario: Scenario) -> RunMetrics:
-    """Runs a scenario in virtual time and returns the metrics of the run.
-
-    The records are discarded as soon as their statistics are known, so long runs need little
-    memory. All records are kept only if the scenario limits a metric of
-    `docs/reference/metrics.md`, because these metrics are computed from a complete log.
-
-    Args:
-        scenario: Scenario to run: arms, control laws, links and duration.
-    """
-    if scenario.expect.metrics:
-        return measure_log(simulate_scenario(scenario))
-    measured = _MeasuredRun(scenario)
-    if measured.compiled is None:
-        return measured.measure_ticks()
-    measured.compiled.finish()
-    return measured.measure_compiled(measured.compiled.run)
-
-
-def measure_virtual_runs(
-    scenarios: Sequence[Scenario],
-) -> Iterator[tuple[int, RunMetrics, str]]:
-    """Runs several scenarios in virtual time, as many as possible at once.
-
-    Scenarios that differ only in numbers are computed together with vector instructions. The
-    metrics equal those of `measure_virtual_run` bit for bit.
-
-    Args:
-        scenarios: The scenarios.
-
-    Yields:
-        The index of a scenario; the metrics of its run; and the property because of which the
-        run was computed alone, or an empty text.
-    """
-    indices = []
-    measured_runs = []
-    compiled_runs = []
-    for index, scenario in enumerate(scenarios):
-        measured = None if scenario.expect.metrics else _MeasuredRun(scenario)
-        if measured is None:
-            yield index, measure_virtual_run(scenario), NEEDS_LOG
-        elif measured.compiled is None:
-            yield index, measured.measure_ticks(), measured.obstacle
-        else:
-            indices.append(index)
-            measured_runs.append(measured)
-            compiled_runs.append(measured.compiled)
-    for position, obstacle in _finish_together(compiled_runs):
-        run = compiled_runs[position].run
-        yield indices[position], measured_runs[position].measure_compiled(run), obstacle
-
-
 class _EvenBatches:
     """Passes records on in batches of `BATCH_RECORDS`, from batches of any size.
 
@@ -1183,61 +1272,6 @@ class _MeasuredRun:
         )
 
 
-def measure_log(log: Log, expect: Expect | None = None) -> RunMetrics:
-    """Computes errors, torques and other quantities of a recorded run from its log.
-
-    Args:
-        log: Log of the run.
-        expect: Expectations (limits of the metrics) that replace those of the log's scenario.
-            If `None`, the scenario's expectations are used.
-
-    Raises:
-        LogError: A record cannot be read.
-    """
-    scenario = log.scenario
-    if expect is not None:
-        scenario = msgspec.structs.replace(scenario, expect=expect)
-    ticks_at_end = {}
-    for event in log.events:
-        if event.kind == "end":
-            ticks_at_end[event.member] = event.ticks
-    diverged_at_s = log.diverged_s
-    site_stats = {name: SiteStats(scenario, name) for name in log.sites}
-    missing = 0
-    for name, stats in site_stats.items():
-        site_log = log[name]
-        used_by_peer = [site_log.used[peer] for peer in site_log.peers]
-        batch = RecordBatch(
-            t_ns=site_log.t_ns,
-            q=site_log.q,
-            qd=site_log.qd,
-            e=site_log.e,
-            tau=site_log.tau,
-            tau_x=site_log.tau_x,
-            used=np.array(used_by_peer).T,
-        )
-        stats.add(batch)
-        expected = scenario.ticks(name)
-        if diverged_at_s is not None:
-            # A run that diverged ends early, at the tick that its sites announced.
-            expected = ticks_at_end.get(name, 0)
-        missing += max(0, expected - len(site_log))
-
-    late_samples = 0
-    for sample in find_absent_samples(log):
-        if sample.arrived_tick is not None:
-            late_samples += 1
-    metrics = _compute_run_metrics(
-        scenario,
-        site_stats,
-        diverged_at_s=diverged_at_s,
-        late_samples=late_samples,
-        missing=missing,
-    )
-    expected_metrics = measure_run(log, scenario.expect.metrics)
-    return msgspec.structs.replace(metrics, metrics=expected_metrics)
-
-
 class ExpectationResult(msgspec.Struct, frozen=True):
     """Result of comparing one metric of a run with the limit that the scenario states for it.
 
@@ -1260,41 +1294,6 @@ class ExpectationResult(msgspec.Struct, frozen=True):
     limit: str
     margin: float | None = None
     value: float | None = None
-
-
-def evaluate_expectations(expect: Expect, metrics: RunMetrics) -> list[ExpectationResult]:
-    """Compares the metrics of a run with the expectations that its scenario states.
-
-    If the run diverged, which means that an arm left its limits, the expectation `stable` is
-    always reported, even if the scenario does not state it.
-
-    Args:
-        expect: Expectations of the scenario, for example the largest permitted error.
-        metrics: Metrics of the run.
-
-    Returns:
-        For each expectation, whether the run met it, and the measured value. The results are in
-        the order of the attributes of `Expect`.
-    """
-    outcomes = list(_evaluate_stability(expect, metrics))
-    for key in _LIMITS:
-        limit = getattr(expect, key)
-        if limit is not None:
-            measured = _read_metric(key, metrics)
-            outcomes.append(_compare_with_limit(key, measured, limit))
-
-    outcomes += _evaluate_poses(expect, metrics)
-    if expect.no_gaps:
-        gaps = ExpectationResult(
-            key="no_gaps",
-            held=metrics.missing == 0,
-            measured=f"{metrics.missing} missing",
-            limit="0 missing",
-        )
-        outcomes.append(gaps)
-    outcomes += _evaluate_windows(expect, metrics)
-    outcomes += _evaluate_metrics(expect, metrics)
-    return outcomes
 
 
 def _evaluate_stability(expect: Expect, metrics: RunMetrics) -> Iterator[ExpectationResult]:

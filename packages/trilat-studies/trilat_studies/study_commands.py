@@ -19,12 +19,15 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from trilat_net.app import flag, options, run_in_own_folder, show_progress, value
+from trilat_net.app import flag, options, show_progress, value
 from trilat_net.errors import UsageError, count_nouns, format_wall_time
 from trilat_net.net import SystemClock
 from trilat_net.presentation import terminal_output as terminal
 
 if TYPE_CHECKING:
+    from trilat_net.app import SessionResult
+    from trilat_net.scenario import Scenario
+
     from .bench import BenchResults
     from .bench.bench_run import BenchFolder
     from .trials import Trial, TrialReport, TrialResult
@@ -79,8 +82,6 @@ def test_command(
     from trilat_net.files import write_whole
     from trilat_net.work import check_workers
 
-    from .trials import encode_junit_xml
-
     if live and on is not None:
         raise UsageError(
             "--on distributes runs in virtual time and cannot be combined with --live: leave "
@@ -95,7 +96,7 @@ def test_command(
         report = _run_live(trials) if live else _run_virtual(trials, jobs, on)
     terminal.print_result(report, as_json=as_json)
     if junit is not None:
-        write_whole(junit, encode_junit_xml(report, began_unix_ns, platform.node()))
+        write_whole(junit, report.encode_junit_xml(began_unix_ns, platform.node()))
     if not report.held:
         raise typer.Exit(1)
 
@@ -209,17 +210,42 @@ def _run_live(trials: "list[Trial]") -> "TrialReport":
     Returns:
         The report, with the time that each trial took.
     """
-    from .trials import TrialReport, evaluate_live_log
+    from .trials import TrialReport
 
     clock = SystemClock()
     start_ns = clock.monotonic_ns()
     results = []
     for trial in trials:
         began_ns = clock.monotonic_ns()
-        outcome = run_in_own_folder(trial.scenario, str(trial), f"test-{trial}")
+        outcome = _run_in_own_folder(trial.scenario, str(trial), f"test-{trial}")
         wall_s = (clock.monotonic_ns() - began_ns) * 1e-9
-        results.append(evaluate_live_log(trial, outcome.log, outcome.problems, wall_s))
+        results.append(trial.evaluate_live_log(outcome.log, outcome.problems, wall_s))
     return TrialReport(results, (clock.monotonic_ns() - start_ns) * 1e-9)
+
+
+def _run_in_own_folder(scenario: "Scenario", label: str, folder_name: str) -> "SessionResult":
+    """Runs a scenario live, and stores its results in a new folder.
+
+    Results of several scenarios do not replace each other.
+
+    Args:
+        scenario: The scenario.
+        label: Name of the run in the printed line.
+        folder_name: Name of the folder, to which a number is added.
+
+    Raises:
+        typer.Exit: The session was interrupted.
+    """
+    from trilat_net.app import run_demo
+    from trilat_net.files import make_results_folder
+
+    folder = make_results_folder(None, folder_name, force=False)
+    terminal.print_text(f"{label}: {scenario.duration_s:g} s live, into {folder}")
+    outcome = run_demo(scenario, folder, terminal.out)
+    if outcome.interrupted:
+        terminal.err.print("interrupted")
+        raise typer.Exit(128 + outcome.interrupted)
+    return outcome
 
 
 def _run_tuning(

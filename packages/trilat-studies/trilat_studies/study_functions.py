@@ -166,10 +166,10 @@ def margin(
         UsageError: The range does not have the form KEY=LOW:HIGH.
     """
     from .sweep import plan_sweep
-    from .sweep.margin_search import SweepMargins, parse_search_range, search_margins
+    from .sweep.margin_search import SearchRange, SweepMargins, search_margins
     from .sweep.sweep_plan import list_axes
 
-    search_range = parse_search_range(along, tolerance)
+    search_range = SearchRange.parse(along, tolerance)
     axes = [*list_axes(over), search_range.format_axis()]
     overrides = _list_override_texts(set, duration_s)
     plan = plan_sweep(scenario, overrides, over=axes, seeds=seeds, laws=laws)

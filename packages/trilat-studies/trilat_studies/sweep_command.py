@@ -86,7 +86,7 @@ def _draw_map(
     from .sweep import read_results
     from .sweep.fixed_gains import FAIR_COMPARISON
     from .sweep.map_page import write_map
-    from .sweep.stability_map import build_stability_map
+    from .sweep.stability_map import StabilityMap
 
     size = FigureSize.for_print(COLUMN_IN if width is None else width)
     width_option = [] if width is None else ["--width", f"{width:g}"]
@@ -97,7 +97,7 @@ def _draw_map(
     with show_progress(
         "linear analysis", terminal.print_text, "columns of the map"
     ) as progress:
-        stability_map = build_stability_map(
+        stability_map = StabilityMap.of_sweep(
             results, (command,), jobs, progress, on=on, simulated=simulated
         )
 
@@ -196,9 +196,9 @@ def _run_sweep(
         terminal.print_text(f"  {done_text} done already")
 
     workers = count_workers(jobs, on)
-    estimate = sweep_run.estimate_sweep(plan, finished_runs, workers)
+    estimate = sweep_run.DurationEstimate.of_sweep(plan, finished_runs, workers)
     if not yes:
-        sweep_run.refuse_oversized_sweep(plan, estimate, workers)
+        estimate.refuse_oversized_sweep(plan, workers)
 
     folder = existing_folder or sweep_run.prepare_sweep_folder(plan, path)
     if estimate.seconds:
@@ -334,7 +334,7 @@ def sweep_command(
             link.delay_ms=0:1600:50 or link.order=newest,in_order; repeatable.
         seeds: Number of seeds, or a list of seeds, for example 1..20; default: one.
         law: Control laws, as a further axis of the grid; default: the law of the scenario.
-        longest: Longest run of a cell whose stability is still undecided, s; default: eight
+        longest: Longest run of a cell whose stability is still undecided, in s; default: eight
             times the duration, or the duration with --judge twins.
         judge: Quantity in the map: stability classes (verdict), growth exponents of runs with
             a small push (twins), for which short runs suffice, or growth rates of the linear
@@ -356,7 +356,7 @@ def sweep_command(
         confirm: Former option that ran cells live. Its error names the replacement.
     """
     from .sweep import plan_sweep
-    from .sweep.margin_search import parse_search_range
+    from .sweep.margin_search import SearchRange
 
     used_options = options.list_used_options(context)
     if confirm is not None:
@@ -396,7 +396,7 @@ def sweep_command(
         axes = list(over or [])
         search_range = None
         if margin is not None:
-            search_range = parse_search_range(margin, tolerance)
+            search_range = SearchRange.parse(margin, tolerance)
             axes.append(search_range.format_axis())
         plan = plan_sweep(
             scenario,

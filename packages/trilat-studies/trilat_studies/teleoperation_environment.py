@@ -435,9 +435,15 @@ class TeleoperationEnv(gymnasium.Env[dict[str, Array], Array]):
         scales["target"][:] = self.action_limit
         hand = self.build_hand_site(base).describe()
         scales["pose"][:] = math.pi if hand.mode == "joint" else reach_m
-        is_position = np.shape(self.task.goal) == scene.end_effector_m[self.leads].shape
-        scales["goal"][:] = reach_m if is_position else self.task.bound
+        scales["goal"][:] = reach_m if self._is_goal_position(scene) else self.task.bound
         return scales
+
+    def _is_goal_position(self, scene: Scene) -> bool:
+        """Returns True if the goal of the task has as many numbers as a position.
+
+        Goals may also be numbers of another kind, such as joint angles.
+        """
+        return np.shape(self.task.goal) == scene.end_effector_m[self.leads].shape
 
     def _prepare(self, scenario: Scenario) -> Scenario:
         """Returns a scenario in which only the policy operates the user's arm.
@@ -897,15 +903,12 @@ class TeleoperationEnv(gymnasium.Env[dict[str, Array], Array]):
         if not (self._runs or self._actions):
             raise EpisodeError("there is no episode to draw: call reset first")
         # imported here, because the import of Matplotlib takes a second
-        from trilat_net.presentation import EpisodePicture, is_position
+        from trilat_net.presentation import EpisodePicture
 
         if self._picture is None:
             self._picture = EpisodePicture(self.scenario, self.leads)
         scene = self._build_scene()
-        goal = None
-        end_effector_m = scene.end_effector_m[self.leads]
-        if is_position(self.task.goal, end_effector_m):
-            goal = self.task.goal
+        goal = self.task.goal if self._is_goal_position(scene) else None
         title = f"t = {scene.t_s:.2f} s"
         return self._picture.draw(scene.q, scene.bodies, goal, title)
 

@@ -39,7 +39,7 @@ from msgspec.structs import asdict
 from trilat_net.analysis import find_quantity
 from trilat_net.core import is_core_cached
 from trilat_net.errors import LawFailed, LogError, ScenarioError, TrilatError, count_nouns
-from trilat_net.execution import check_virtual, execute_virtual, verify
+from trilat_net.execution import check_virtual, execute_virtual, verify_log
 from trilat_net.log import open_log
 from trilat_net.net import SystemClock
 from trilat_net.own_code import list_imported_code
@@ -48,14 +48,7 @@ from trilat_net.results import Result
 from trilat_net.scenario import ExperimentText, Scenario, load_scenario, reseed_scenario
 from trilat_net.work import MAX_LOSSES, MeanInterval, WorkerPool, Workers, open_worker_pool
 
-from .measure_run import (
-    ExpectationResult,
-    RunMetrics,
-    evaluate_expectations,
-    measure_log,
-    measure_virtual_run,
-    measure_virtual_runs,
-)
+from .measure_run import ExpectationResult, RunMetrics
 from .run_commands import format_command, list_assignments, set_options
 from .side_by_side import RunKind, count_reasons, describe_runs_alone, prepare_kinds
 
@@ -150,7 +143,7 @@ class Trial(NamedTuple):
         Returns:
             The result of the trial.
         """
-        outcomes = evaluate_expectations(self.scenario.expect, metrics)
+        outcomes = metrics.compare_with(self.scenario.expect)
         return TrialResult(self, outcomes, metrics.simulated_s, wall_s)
 
     def run(self) -> TrialResult:
@@ -161,7 +154,7 @@ class Trial(NamedTuple):
         clock = SystemClock()
         start_ns = clock.monotonic_ns()
         try:
-            metrics = measure_virtual_run(self.scenario)
+            metrics = RunMetrics.of_virtual_run(self.scenario)
         except LawFailed as failed:
             wall_s = (clock.monotonic_ns() - start_ns) * 1e-9
             return TrialResult(self, wall_s=wall_s, error=str(failed))
@@ -181,6 +174,51 @@ class Trial(NamedTuple):
             reasons = "; ".join(result.failures)
             raise AssertionError("\n  ".join([f"{self}: {reasons}", self.again, self.look]))
         return result
+
+    def evaluate_live_log(
+        self, log_file: Path, problems: Sequence[str], wall_s: float
+    ) -> TrialResult:
+        """Compares the run of a live session with the expectations of its scenario.
+
+        Two expectations are added to those of the scenario: that the session ended normally,
+        and that all records are bit for bit the same when they are computed again.
+
+        Args:
+            log_file: Log of the session, which may be missing.
+            problems: Problems of the session, as sentences. Empty if the session ended
+                normally.
+            wall_s: Duration of the session in real time, in s.
+
+        Returns:
+            The result. If the log cannot be read, it contains the reason instead of outcomes.
+        """
+        existing_log = log_file if log_file.exists() else None
+        try:
+            log = open_log(log_file)
+            if not any(len(log[name]) for name in log.sites):
+                raise LogError(f"{log_file}: no records")
+            result = self.evaluate(RunMetrics.of_log(log, self.scenario.expect), wall_s)
+            verdict = verify_log(log)
+        except LogError as error:
+            text = "; ".join([*problems, str(error)])
+            return TrialResult(self, wall_s=wall_s, error=text, log=existing_log)
+
+        session = ExpectationResult(
+            key="session",
+            held=not problems,
+            measured="; ".join(problems) or "ended in order",
+            limit="ends in order",
+        )
+        coverage = "" if verdict.coverage.share == 1.0 else f"; judged {verdict.coverage}"
+        execution = ExpectationResult(
+            key="executed again",
+            held=verdict.passed,
+            measured=f"{verdict.identical} identical{coverage}",
+            limit=count_nouns(verdict.records, "record"),
+        )
+        return result._replace(
+            outcomes=[*result.outcomes, session, execution], log=existing_log
+        )
 
 
 def trials(
@@ -269,50 +307,6 @@ def _check_expectations_reachable(scenario: Scenario, source: str) -> None:
                 f"must not be after the end of the run at {end_s:g} s, not {window.to_s:g}"
             )
             raise ScenarioError(problem, path=f"expect.windows[{n}].to_s", source=source)
-
-
-def evaluate_live_log(
-    trial: Trial, log_file: Path, problems: Sequence[str], wall_s: float
-) -> TrialResult:
-    """Compares the run of a live session with the expectations of its scenario.
-
-    Two expectations are added to those of the scenario: that the session ended normally, and
-    that all records are bit for bit the same when they are computed again.
-
-    Args:
-        trial: The trial, with its scenario.
-        log_file: Log of the session, which may be missing.
-        problems: Problems of the session, as sentences. Empty if the session ended normally.
-        wall_s: Duration of the session in real time, in s.
-
-    Returns:
-        The result. If the log cannot be read, it contains the reason instead of outcomes.
-    """
-    existing_log = log_file if log_file.exists() else None
-    try:
-        log = open_log(log_file)
-        if not any(len(log[name]) for name in log.sites):
-            raise LogError(f"{log_file}: no records")
-        result = trial.evaluate(measure_log(log, trial.scenario.expect), wall_s)
-        verdict = verify(log)
-    except LogError as error:
-        text = "; ".join([*problems, str(error)])
-        return TrialResult(trial, wall_s=wall_s, error=text, log=existing_log)
-
-    session = ExpectationResult(
-        key="session",
-        held=not problems,
-        measured="; ".join(problems) or "ended in order",
-        limit="ends in order",
-    )
-    coverage = "" if verdict.coverage.share == 1.0 else f"; judged {verdict.coverage}"
-    execution = ExpectationResult(
-        key="executed again",
-        held=verdict.passed,
-        measured=f"{verdict.identical} identical{coverage}",
-        limit=count_nouns(verdict.records, "record"),
-    )
-    return result._replace(outcomes=[*result.outcomes, session, execution], log=existing_log)
 
 
 MAX_FAILURES_SHOWN = 5
@@ -540,6 +534,41 @@ class TrialReport(Result):
             for outcome in result.outcomes
         ]
 
+    def encode_junit_xml(self, began_unix_ns: int, host: str) -> bytes:
+        """Encodes the results of trials as a JUnit XML document, which build servers display.
+
+        The document follows Jenkins' `junit-10.xsd`. It has a suite per scenario and a case per
+        run. A case has one `failure` with all unmet expectations, or an `error` if the run has
+        no result.
+
+        Args:
+            began_unix_ns: Start of the trials in Unix time, in ns.
+            host: Name of this machine.
+
+        Returns:
+            The document.
+        """
+        root = Xml.Element(
+            "testsuites", _build_count_attributes(self.results), name="trilat test"
+        )
+        began = datetime.fromtimestamp(began_unix_ns // 10**9, UTC)
+        for name, results in self.scenarios.items():
+            suite = Xml.SubElement(
+                root,
+                "testsuite",
+                _build_count_attributes(results),
+                name=_replace_forbidden(name),
+                skipped="0",
+                timestamp=f"{began:%Y-%m-%dT%H:%M:%S}",
+                hostname=_replace_forbidden(host),
+            )
+            _add_properties(suite, results)
+            for result in results:
+                _add_case(suite, result)
+        Xml.indent(root)
+        document: bytes = Xml.tostring(root, encoding="utf-8", xml_declaration=True)
+        return document + b"\n"
+
 
 LANE_RUNS = 32
 """Number of trials that a worker gets at once, to compute them side by side."""
@@ -607,7 +636,7 @@ def _run_side_by_side(
     scenarios = [items[n].trial.scenario for n in chosen]
     measured: dict[int, tuple[RunMetrics, str]] = {}
     try:
-        for index, metrics, obstacle in measure_virtual_runs(scenarios):
+        for index, metrics, obstacle in RunMetrics.of_virtual_runs(scenarios):
             measured[chosen[index]] = metrics, obstacle
     except _RUN_ERRORS:
         # One by one, only the trial whose run fails has no result.
@@ -771,43 +800,6 @@ def _list_repeat_commands(result: TrialResult) -> list[str]:
 
 # Characters that XML 1.0 forbids, even as character references.
 _NOT_XML = re.compile(r"[^\t\n\r\x20-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
-
-
-def encode_junit_xml(report: TrialReport, began_unix_ns: int, host: str) -> bytes:
-    """Encodes the results of trials as a JUnit XML document, which build servers display.
-
-    The document follows Jenkins' `junit-10.xsd`. It has a suite per scenario and a case per
-    run. A case has one `failure` with all unmet expectations, or an `error` if the run has no
-    result.
-
-    Args:
-        report: The results.
-        began_unix_ns: Start of the trials in Unix time, in ns.
-        host: Name of this machine.
-
-    Returns:
-        The document.
-    """
-    root = Xml.Element(
-        "testsuites", _build_count_attributes(report.results), name="trilat test"
-    )
-    began = datetime.fromtimestamp(began_unix_ns // 10**9, UTC)
-    for name, results in report.scenarios.items():
-        suite = Xml.SubElement(
-            root,
-            "testsuite",
-            _build_count_attributes(results),
-            name=_replace_forbidden(name),
-            skipped="0",
-            timestamp=f"{began:%Y-%m-%dT%H:%M:%S}",
-            hostname=_replace_forbidden(host),
-        )
-        _add_properties(suite, results)
-        for result in results:
-            _add_case(suite, result)
-    Xml.indent(root)
-    document: bytes = Xml.tostring(root, encoding="utf-8", xml_declaration=True)
-    return document + b"\n"
 
 
 def _add_properties(suite: Xml.Element, results: Sequence[TrialResult]) -> None:

@@ -1,7 +1,7 @@
 """Defines the result of judging a run from its log: `Certificate`, with every reason.
 
-`stability_certificate.certify` creates it, and `judge.certify_run` adds the repetitions of the
-run and the characteristic roots. `stability_decision` decides from its evidence.
+`stability_certificate.certify_log` creates it, and `judge.certify_run` adds the repetitions of
+the run and the characteristic roots. `stability_decision` decides from its evidence.
 
 Invariant:
     - Keys of the JSON output end in their unit, and unknown values are null.

@@ -1,6 +1,6 @@
 """Judges from a log whether the run was stable, and explains the judgement.
 
-`certify` is the entry point, and `Certificate` its result. A certificate combines:
+`certify_log` is the entry point, and `Certificate` its result. A certificate combines:
 
 - the conditions (premises) of the stability theorem, which `premises` checks;
 - the energy function V of the stability proof, which must not rise unless an operator or an
@@ -59,7 +59,7 @@ COARSE_TOLERANCE_SHARE = 1e-2
 """Largest tolerance for a rise at which V is still judged, as a share of the scale of V."""
 
 
-def certify(
+def certify_log(
     log: Log,
     *,
     min_coverage: float = MIN_COVERAGE,

@@ -129,7 +129,7 @@ def verify_command(
     virtual: Annotated[bool, flag("--virtual")] = False,
     resume_every: Annotated[int, value("--resume-every", "N", min=0)] = 0,
     *,
-    laws: options.LawFiles,
+    laws: options.LawFileOptions,
     min_coverage: options.MinCoverageOption = options.MIN_COVERAGE,
     as_json: options.JsonOption = False,
 ) -> None:
@@ -208,7 +208,7 @@ def certify_command(
     ] = False,
     everything: options.AllOption = False,
     *,
-    laws: options.LawFiles,
+    laws: options.LawFileOptions,
     as_json: options.JsonOption = False,
 ) -> None:
     """Judges whether a run was stable, and says why.
@@ -260,7 +260,7 @@ _PUSH_HELP = (
 )
 def twin_command(
     files: options.LogsArgument,
-    at_s: Annotated[float, value("--at", "S", "Time of the push, s.")] = 0.0,
+    at_s: Annotated[float, value("--at", "S", "Time of the push, in s.")] = 0.0,
     push: Annotated[
         list[str] | None,
         value("--push", "STATE=SIZE", _PUSH_HELP, autocompletion=options.complete_sites),
@@ -277,7 +277,7 @@ def twin_command(
         Path | None, value("-o --out --output", "FILE", options.FIGURE_HELP)
     ] = None,
     *,
-    laws: options.LawFiles,
+    laws: options.LawFileOptions,
     force: options.ForceOption = False,
     as_json: options.JsonOption = False,
 ) -> None:
@@ -336,7 +336,7 @@ def figure_command(
     folder: Annotated[Path | None, value("--out -o", "DIR")] = None,
     others: Annotated[list[Path] | None, value("--with", "FILE")] = None,
     *,
-    laws: options.LawFiles,
+    laws: options.LawFileOptions,
     listed: Annotated[bool, flag("--list", "Only list the figures.")] = False,
     as_json: Annotated[bool, flag("--json", "Print the list or the paths as JSON.")] = False,
     force: options.ForceOption = False,
@@ -432,7 +432,7 @@ def report_command(
         ),
     ] = None,
     *,
-    laws: options.LawFiles,
+    laws: options.LawFileOptions,
     min_coverage: options.MinCoverageOption = options.MIN_COVERAGE,
     force: options.ForceOption = False,
     png: options.PngOption = False,
@@ -478,7 +478,7 @@ def rerun_command(
     ] = False,
     overrides: options.SetOption = None,
     *,
-    laws: options.LawFiles,
+    laws: options.LawFileOptions,
     output: Annotated[
         Path | None, value("-o --out --output", "FILE", "Write the result as a log.")
     ] = None,
@@ -537,7 +537,7 @@ def linear_command(
         value(
             "--pose",
             "Q1,Q2,...",
-            "Pose of all sites, rad; default: the pose at the end of a run of the scenario.",
+            "Pose of all sites, in rad; default: the pose at the end of a run of the scenario.",
         ),
     ] = None,
     roots: Annotated[int, value("--roots", "N", "Number of roots to print.")] = 6,

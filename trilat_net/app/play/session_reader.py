@@ -92,61 +92,70 @@ class PlaySelection:
         is_after = self.stop_ns is not None and t_ns > self.stop_ns
         return not (is_before or is_after)
 
+    @classmethod
+    def parse(
+        cls,
+        include: Collection[str],
+        exclude: Collection[str],
+        start_s: float | None,
+        stop_s: float | None,
+        duration_s: float | None,
+        time: str,
+    ) -> "PlaySelection":
+        """Parses the options of a command that select which messages of a log are replayed.
 
-def parse_selection(
-    include: Collection[str],
-    exclude: Collection[str],
-    start_s: float | None,
-    stop_s: float | None,
-    duration_s: float | None,
-    time: str,
-) -> PlaySelection:
-    """Parses the options of a command that select which messages of a log are replayed.
+        The user limits the part of the session by `--start`, and by either `--stop` or
+        `--duration`.
 
-    The user limits the part of the session by `--start`, and by either `--stop` or
-    `--duration`.
+        Args:
+            include: Key expressions of `--include`.
+            exclude: Key expressions of `--exclude`.
+            start_s: Value of `--start`, in s after the start of the session. `None` if it is
+                absent.
+            stop_s: Value of `--stop`, in s after the start of the session. `None` if it is
+                absent.
+            duration_s: Value of `--duration`, in s, instead of `stop_s`. `None` if it is
+                absent.
+            time: Value of `--time`, see `PlayTime`.
 
-    Args:
-        include: Key expressions of `--include`.
-        exclude: Key expressions of `--exclude`.
-        start_s: Value of `--start`, in s after the start of the session. `None` if it is
-            absent.
-        stop_s: Value of `--stop`, in s after the start of the session. `None` if it is absent.
-        duration_s: Value of `--duration`, in s, instead of `stop_s`. `None` if it is absent.
-        time: Value of `--time`, see `PlayTime`.
+        Raises:
+            UsageError: The options contradict each other, or an option is not valid.
+        """
+        if time not in get_args(PlayTime):
+            raise UsageError(
+                "--time must be publish (the time at which a message was sent) or log (the "
+                f"time at which it arrived), not {time!r}"
+            )
 
-    Raises:
-        UsageError: The options contradict each other, or an option is not valid.
-    """
-    if time not in get_args(PlayTime):
-        raise UsageError(
-            "--time must be publish (the time at which a message was sent) or log (the time at "
-            f"which it arrived), not {time!r}"
+        for name, seconds in (
+            ("--start", start_s),
+            ("--stop", stop_s),
+            ("--duration", duration_s),
+        ):
+            if seconds is None:
+                continue
+            is_reasonable = math.isfinite(seconds) and abs(seconds) <= 1e9
+            if not is_reasonable:
+                raise UsageError(f"{name} must be a number of seconds, not {seconds:g}")
+
+        if duration_s is not None:
+            if duration_s <= 0:
+                raise UsageError(f"--duration must be more than 0 s, not {duration_s:g}")
+            if stop_s is not None:
+                raise UsageError(
+                    "--stop and --duration set the same limit; give only one of them"
+                )
+            stop_s = (start_s or 0.0) + duration_s
+
+        if start_s is not None and stop_s is not None and stop_s <= start_s:
+            raise UsageError(f"--stop must be after --start ({start_s:g} s), not {stop_s:g} s")
+
+        return cls(
+            channels=ChannelFilter.parse(include, exclude),
+            start_ns=None if start_s is None else round(start_s * NS_PER_S),
+            stop_ns=None if stop_s is None else round(stop_s * NS_PER_S),
+            time=cast(PlayTime, time),
         )
-
-    for name, seconds in (("--start", start_s), ("--stop", stop_s), ("--duration", duration_s)):
-        if seconds is None:
-            continue
-        is_reasonable = math.isfinite(seconds) and abs(seconds) <= 1e9
-        if not is_reasonable:
-            raise UsageError(f"{name} must be a number of seconds, not {seconds:g}")
-
-    if duration_s is not None:
-        if duration_s <= 0:
-            raise UsageError(f"--duration must be more than 0 s, not {duration_s:g}")
-        if stop_s is not None:
-            raise UsageError("--stop and --duration set the same limit; give only one of them")
-        stop_s = (start_s or 0.0) + duration_s
-
-    if start_s is not None and stop_s is not None and stop_s <= start_s:
-        raise UsageError(f"--stop must be after --start ({start_s:g} s), not {stop_s:g} s")
-
-    return PlaySelection(
-        channels=ChannelFilter.parse(include, exclude),
-        start_ns=None if start_s is None else round(start_s * NS_PER_S),
-        stop_ns=None if stop_s is None else round(stop_s * NS_PER_S),
-        time=cast(PlayTime, time),
-    )
 
 
 HORIZON_NS = 70 * NS_PER_S

@@ -464,26 +464,26 @@ class RosJoints(NamedTuple):
     velocity: tuple[float, ...]
     effort: tuple[float, ...]
 
+    @classmethod
+    def read(cls, payload: bytes) -> "RosJoints":
+        """Decodes a `sensor_msgs/msg/JointState`, the usual message with the joints of a robot.
 
-def read_joint_state(payload: bytes) -> RosJoints:
-    """Decodes a `sensor_msgs/msg/JointState`, the usual message with the joints of a robot.
+        Args:
+            payload: The message.
 
-    Args:
-        payload: The message.
-
-    Raises:
-        ValueError: The message cannot be decoded.
-    """
-    reader = _CdrReader(payload)
-    stamp_ns, _ = reader.header()
-    names = [reader.text() for _ in range(reader.count())]
-    return RosJoints(
-        stamp_ns=stamp_ns,
-        names=names,
-        position=reader.floats(),
-        velocity=reader.floats(),
-        effort=reader.floats(),
-    )
+        Raises:
+            ValueError: The message cannot be decoded.
+        """
+        reader = _CdrReader(payload)
+        stamp_ns, _ = reader.header()
+        names = [reader.text() for _ in range(reader.count())]
+        return cls(
+            stamp_ns=stamp_ns,
+            names=names,
+            position=reader.floats(),
+            velocity=reader.floats(),
+            effort=reader.floats(),
+        )
 
 
 def read_float_array(payload: bytes) -> tuple[float, ...]:

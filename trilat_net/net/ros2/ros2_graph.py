@@ -138,24 +138,24 @@ class Attachment(NamedTuple):
         """Encodes the number, time and sender of a message as 33 bytes, as ROS 2 expects."""
         return _ATTACHMENT.pack(self.number, self.sent_unix_ns, _GID_BYTES, self.gid)
 
+    @classmethod
+    def decode(cls, content: Any) -> "Attachment | None":
+        """Reads the number, time and sender that ROS 2 adds to each message over Zenoh.
 
-def parse_attachment(content: Any) -> Attachment | None:
-    """Reads the number, time and sender that ROS 2 adds to each message over Zenoh.
+        Args:
+            content: The bytes, or the `ZBytes` object of Zenoh. None if the message has no
+                attachment.
 
-    Args:
-        content: The bytes, or the `ZBytes` object of Zenoh. None if the message has no
-            attachment.
-
-    Returns:
-        The attachment. None if there is none, or if it does not have the format of ROS.
-    """
-    data = b"" if content is None else bytes(content)
-    if len(data) != _ATTACHMENT.size:
-        return None
-    number, sent_unix_ns, gid_length, gid = _ATTACHMENT.unpack(data)
-    if gid_length != _GID_BYTES:
-        return None
-    return Attachment(number, sent_unix_ns, gid)
+        Returns:
+            The attachment. None if there is none, or if it does not have the format of ROS.
+        """
+        data = b"" if content is None else bytes(content)
+        if len(data) != _ATTACHMENT.size:
+            return None
+        number, sent_unix_ns, gid_length, gid = _ATTACHMENT.unpack(data)
+        if gid_length != _GID_BYTES:
+            return None
+        return cls(number, sent_unix_ns, gid)
 
 
 def find_type_hash(kind: str, distro: str) -> str:
@@ -624,7 +624,7 @@ class Ros2Graph:
 
         def receive_sample(sample: zenoh.Sample) -> None:
             """Passes a ROS 2 program's message to `receive`, and refuses other messages."""
-            attachment = parse_attachment(sample.attachment)
+            attachment = Attachment.decode(sample.attachment)
             if attachment is None:
                 self.refusals.add(f"{topic}: a message without an attachment of ROS")
             else:
@@ -651,7 +651,7 @@ class Ros2Graph:
             """Computes and sends the response to a request (service call) of a ROS program."""
             # A query ends for its sender only when the query object is dropped.
             with query:
-                request = parse_attachment(query.attachment)
+                request = Attachment.decode(query.attachment)
                 if request is None or query.payload is None:
                     self.refusals.add(f"{service}: a request without an attachment of ROS")
                     return

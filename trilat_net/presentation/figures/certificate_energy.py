@@ -22,7 +22,13 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from ...analysis import Certificate, EnergyBalance, ObservedEnergy, certify, find_unjudged_spans
+from ...analysis import (
+    Certificate,
+    EnergyBalance,
+    ObservedEnergy,
+    certify_log,
+    find_unjudged_spans,
+)
 from ...core import Array
 from ...log import Log
 from ...own_code import may_run_user_laws
@@ -128,7 +134,7 @@ def _draw_certificate(log: Log, form: FigureSize) -> Figure:
     figures.
     """
     own_laws = may_run_user_laws(log.scenario)
-    return draw_functional(log, certify(log, own_laws=own_laws), form)
+    return draw_functional(log, certify_log(log, own_laws=own_laws), form)
 
 
 def draw_observed_energy(

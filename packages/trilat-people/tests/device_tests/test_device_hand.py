@@ -18,7 +18,7 @@ from tests.sites.sessions import Session, reach_session
 from trilat_net.app.input_device import DeviceState
 from trilat_net.core.life.live_hand import SILENCE_NS
 from trilat_net.errors import UsageError
-from trilat_net.execution.verification import verify
+from trilat_net.execution.verification import verify_log
 from trilat_net.log.log_reader import Log
 from trilat_net.net.bus import Bus
 from trilat_net.scenario import load_scenario
@@ -98,7 +98,7 @@ def test_devices_lead_arms_as_logs_repeat(tmp_path: Path) -> None:
     moved = session.target[-1] - session.target[0]
     assert moved == pytest.approx([0.0, 0.05], abs=1e-9)
     assert session.changes[0] == "m1: ScriptedDevice takes hold"
-    assert verify(session.log).passed
+    assert verify_log(session.log).passed
 
 
 @pytest.mark.parametrize(
@@ -253,7 +253,7 @@ def test_silent_devices_need_their_button_anew(fault: str, tmp_path: Path) -> No
     held = part.t_s[part.hand[:, 2] > 0.0]
     (rest,) = np.flatnonzero(np.diff(held) > 0.1)
     assert 0.9 < held[rest + 1] - held[rest] < 1.3
-    assert verify(session.log).passed
+    assert verify_log(session.log).passed
     if fault == "raises":
         assert (
             sum("the device is silent; the arm is released" in line for line in session.said)
@@ -354,7 +354,7 @@ def test_repeated_clutching_keeps_the_target_within_reach(tmp_path: Path) -> Non
     # of 2 x 0.5 m/s for the rest of the session: no stroke has to be taken back
     assert back < -0.3
     assert t_s[begun] < 2.2
-    assert verify(session.log).passed
+    assert verify_log(session.log).passed
 
 
 LATER = [pytest.param(gaps, marks=pytest.mark.long) for gaps in ((150, 10), (30, 90))]

@@ -265,6 +265,54 @@ class ExperimentProtocol(Frozen, frozen=True):
             )
             raise UsageError(f"{path}: {error}; the keys of a protocol are {valid}") from None
 
+    def limit_forces(self, scenario: Scenario, group: Sequence[str]) -> dict[str, Any]:
+        """Lowers the force limits of the arms of participants who must not push hard.
+
+        The protocol states these participants and their limits under `force_limit_n`. The
+        result contains the changed settings of their sites (arm controllers).
+
+        Args:
+            scenario: Scenario of the condition.
+            group: Pseudonyms of the participants.
+
+        Returns:
+            The specifications of the sites whose limits change, by the name of the site. Empty
+            if no participant of the group needs a lower limit.
+
+        Raises:
+            ScenarioError: The scenario has no force limit for this site, or already has a lower
+                limit.
+        """
+        limited_sites: dict[str, Any] = {}
+        # The lengths may differ: `_find_problems` reports a group that is too small.
+        for user, name in zip(self.users, group, strict=False):
+            site_settings = scenario.sites[user]
+            limit_n = self.force_limit_n.get(name)
+            live_hand = site_settings.find_live_hand(is_open=True)
+            if limit_n is None or live_hand is None:
+                continue
+
+            key = f"force_limit_n.{name}"
+            if live_hand.mode == "joint":
+                raise ScenarioError(
+                    f"the live hand at {user} has the mode 'joint' and therefore no limit in N",
+                    path=key,
+                )
+            hand_limit_n = live_hand.force_limit_n
+            if hand_limit_n < limit_n:
+                raise ScenarioError(
+                    f"{limit_n:g} N exceeds the limit of the live hand at {user}, "
+                    f"which is {hand_limit_n:g} N",
+                    path=key,
+                )
+
+            limited_hand = replace(live_hand, force_limit_n=limit_n)
+            hands = tuple(
+                limited_hand if hand is live_hand else hand for hand in site_settings.hands
+            )
+            limited_sites[user] = replace(site_settings, hands=hands)
+        return limited_sites
+
 
 class PlannedTrial(NamedTuple):
     """One trial of an experiment, with its participants, condition and place in the order.
@@ -798,7 +846,7 @@ def _check_scenario(scenario: Scenario, protocol: ExperimentProtocol) -> Scenari
         raise ScenarioError("both users must have a share above 0", path=f"dominance.{slave}")
 
     for group in protocol.groups:
-        limit_forces(scenario, protocol, group)
+        protocol.limit_forces(scenario, group)
 
     staircase = protocol.staircase
     if staircase is not None:
@@ -806,58 +854,6 @@ def _check_scenario(scenario: Scenario, protocol: ExperimentProtocol) -> Scenari
         for value in (staircase.standard, largest_value):
             load_scenario(scenario, {staircase.key: value})
     return scenario
-
-
-def limit_forces(
-    scenario: Scenario, protocol: ExperimentProtocol, group: Sequence[str]
-) -> dict[str, Any]:
-    """Lowers the force limits of the arms of participants who must not push hard.
-
-    The protocol states these participants and their limits under `force_limit_n`. The result
-    contains the changed settings of their sites (arm controllers).
-
-    Args:
-        scenario: Scenario of the condition.
-        protocol: Design of the experiment: conditions, task and participants.
-        group: Pseudonyms of the participants.
-
-    Returns:
-        The specifications of the sites whose limits change, by the name of the site. Empty if
-        no participant of the group needs a lower limit.
-
-    Raises:
-        ScenarioError: The scenario has no force limit for this site, or already has a lower
-            limit.
-    """
-    limited_sites: dict[str, Any] = {}
-    # The lengths may differ: `_find_problems` reports a group that is too small.
-    for user, name in zip(protocol.users, group, strict=False):
-        site_settings = scenario.sites[user]
-        limit_n = protocol.force_limit_n.get(name)
-        live_hand = site_settings.find_live_hand(is_open=True)
-        if limit_n is None or live_hand is None:
-            continue
-
-        key = f"force_limit_n.{name}"
-        if live_hand.mode == "joint":
-            raise ScenarioError(
-                f"the live hand at {user} has the mode 'joint' and therefore no limit in N",
-                path=key,
-            )
-        hand_limit_n = live_hand.force_limit_n
-        if hand_limit_n < limit_n:
-            raise ScenarioError(
-                f"{limit_n:g} N exceeds the limit of the live hand at {user}, "
-                f"which is {hand_limit_n:g} N",
-                path=key,
-            )
-
-        limited_hand = replace(live_hand, force_limit_n=limit_n)
-        hands = tuple(
-            limited_hand if hand is live_hand else hand for hand in site_settings.hands
-        )
-        limited_sites[user] = replace(site_settings, hands=hands)
-    return limited_sites
 
 
 def list_orders(design: str, conditions: Sequence[str], seed: int) -> list[tuple[str, ...]]:

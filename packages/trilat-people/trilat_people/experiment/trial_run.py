@@ -32,14 +32,14 @@ from trilat_net.analysis import (
 )
 from trilat_net.core import Array
 from trilat_net.errors import LogError
-from trilat_net.execution import FusedRun, record_virtual, verify
+from trilat_net.execution import FusedRun, record_virtual, verify_log
 from trilat_net.files import digest_file
 from trilat_net.log import Ints, Log, SiteLog, open_log
 from trilat_net.records import NS_PER_S
 from trilat_net.scenario import Change, HandPlayer, HandSite, Scenario, parse_scenario
 
 from .movement_measures import energy_j, measure_pair, movement_time_s, path_length_m, sparc
-from .protocol import ExperimentProtocol, PlannedTrial, limit_forces
+from .protocol import ExperimentProtocol, PlannedTrial
 from .synthetic_participant import ParticipantModel, SyntheticParticipant
 from .tasks import Outcome, TrialGoal
 
@@ -200,7 +200,7 @@ class ExperimentTrial:
             f"protocol sha256 {digest}"
         )
 
-        limited_sites = limit_forces(scenario, protocol, planned.group)
+        limited_sites = protocol.limit_forces(scenario, planned.group)
         self.scenario = replace(
             scenario,
             duration_s=self.longest_s + REST_S,
@@ -322,7 +322,7 @@ class ExperimentTrial:
             LogError: The records cannot be reproduced, or they end before the trial does.
         """
         log = open_log(path)
-        if not verify(log).passed:
+        if not verify_log(log).passed:
             raise LogError(f"{path}: the records differ from those of a repeated run")
 
         outcome = self._judge_log(log)

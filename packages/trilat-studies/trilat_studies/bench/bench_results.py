@@ -404,6 +404,14 @@ class BenchResults(Result):
         """
         return next(self.select(task, law, link), None)
 
+    def encode_runs(self) -> str:
+        """Encodes all simulations of a benchmark as a CSV table, one line per simulation."""
+        cells = {cell.name: cell for cell in self.plan.cells}
+        rows = [
+            _build_cell_columns(cells[run.name]) | msgspec.to_builtins(run) for run in self.runs
+        ]
+        return encode_csv(rows, [*_CELL_COLUMNS, *BenchRun.__struct_fields__])
+
 
 def _list_used_gains(results: BenchResults) -> list[TunedGains]:
     """Returns the tuned gains with which the control laws were simulated, without repetitions.
@@ -811,19 +819,6 @@ def build_bench_page(
     parts.append("## Gains")
     parts.append(_tabulate_gains(results).markdown())
     return "\n\n".join(parts) + "\n"
-
-
-def encode_runs(results: BenchResults) -> str:
-    """Encodes all simulations of a benchmark as a CSV table, one line per simulation.
-
-    Args:
-        results: Results of the suite or of a part of it.
-    """
-    cells = {cell.name: cell for cell in results.plan.cells}
-    rows = [
-        _build_cell_columns(cells[run.name]) | msgspec.to_builtins(run) for run in results.runs
-    ]
-    return encode_csv(rows, [*_CELL_COLUMNS, *BenchRun.__struct_fields__])
 
 
 _FORMER_KEYS = ("reflected", "reflected_half", "observed", "least_j")

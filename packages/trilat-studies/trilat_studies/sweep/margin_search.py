@@ -217,6 +217,38 @@ class SearchRange(NamedTuple):
         high = format_override_value(self.high)
         return f"{self.key}={low},{high}"
 
+    @classmethod
+    def parse(cls, text: str, tolerance: float = MARGIN_TOLERANCE) -> "SearchRange":
+        """Parses the setting and range of a search for limits, such as "control.d=0.2:3".
+
+        Args:
+            text: Text of the form KEY=FROM:TO.
+            tolerance: Largest width of an edge, as a fraction of its value.
+
+        Raises:
+            UsageError: The text does not have this form, or the tolerance is not within (0, 1).
+        """
+        key, _, ends = text.partition("=")
+        low, colon, high = ends.partition(":")
+        try:
+            search_range = cls(key.strip(), float(low), float(high), tolerance)
+        except ValueError:
+            raise UsageError(
+                f"--margin must have the form KEY=FROM:TO, as in control.d=0.2:3, not {text!r}"
+            ) from None
+
+        if not 0.0 < tolerance < 1.0:
+            raise UsageError(
+                f"--tolerance must be a fraction of the value at the edge, as in 0.005, "
+                f"not {tolerance:g}"
+            )
+
+        is_rising = -float("inf") < search_range.low < search_range.high < float("inf")
+        if not colon or not search_range.key or not is_rising:
+            form = "KEY=FROM:TO with FROM below TO, as in control.d=0.2:3"
+            raise UsageError(f"--margin must have the form {form}, not {text!r}")
+        return search_range
+
 
 class _MarginItem(NamedTuple):
     """Task for a worker process: find the limits of stability at one grid point of a sweep.
@@ -264,38 +296,6 @@ class GridPointMargin(NamedTuple):
     linear: tuple[float, ...]
     remark: str
     closed: float | None
-
-
-def parse_search_range(text: str, tolerance: float = MARGIN_TOLERANCE) -> SearchRange:
-    """Parses the setting and range of a search for limits, such as "control.d=0.2:3".
-
-    Args:
-        text: Text of the form KEY=FROM:TO.
-        tolerance: Largest width of an edge, as a fraction of its value.
-
-    Raises:
-        UsageError: The text does not have this form, or the tolerance is not within (0, 1).
-    """
-    key, _, ends = text.partition("=")
-    low, colon, high = ends.partition(":")
-    try:
-        search_range = SearchRange(key.strip(), float(low), float(high), tolerance)
-    except ValueError:
-        raise UsageError(
-            f"--margin must have the form KEY=FROM:TO, as in control.d=0.2:3, not {text!r}"
-        ) from None
-
-    if not 0.0 < tolerance < 1.0:
-        raise UsageError(
-            f"--tolerance must be a fraction of the value at the edge, as in 0.005, "
-            f"not {tolerance:g}"
-        )
-
-    is_rising = -float("inf") < search_range.low < search_range.high < float("inf")
-    if not colon or not search_range.key or not is_rising:
-        form = "KEY=FROM:TO with FROM below TO, as in control.d=0.2:3"
-        raise UsageError(f"--margin must have the form {form}, not {text!r}")
-    return search_range
 
 
 def search_margins(

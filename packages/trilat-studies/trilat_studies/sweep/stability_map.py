@@ -1274,87 +1274,92 @@ class StabilityMap(NamedTuple):
     title: str
     fixed: tuple[str, ...] = ()
 
+    @classmethod
+    def of_sweep(
+        cls,
+        results: SweepResults,
+        commands: tuple[str, ...],
+        jobs: int | None = None,
+        progress: Progress = ignore_progress,
+        *,
+        linearly: bool = True,
+        on: Workers = None,
+        simulated: SweepResults | None = None,
+    ) -> "StabilityMap":
+        """Builds the stability map of a sweep: the results of its runs, and limits from theory.
 
-def build_stability_map(
-    results: SweepResults,
-    commands: tuple[str, ...],
-    jobs: int | None = None,
-    progress: Progress = ignore_progress,
-    *,
-    linearly: bool = True,
-    on: Workers = None,
-    simulated: SweepResults | None = None,
-) -> StabilityMap:
-    """Builds the stability map of a sweep: the results of its runs, and limits from theory.
+        The map shows with which values of two parameters a scenario is stable. Limits from
+        theory are drawn as lines. They are computed only if the map has two numeric axes.
 
-    The map shows with which values of two parameters a scenario is stable. Limits from theory
-    are drawn as lines. They are computed only if the map has two numeric axes.
+        Args:
+            results: Results of the sweep: its plan and one row per run.
+            commands: Commands that create the map. The page of the map shows them.
+            jobs: Number of worker processes for the linear analysis. If `None`, all cores are
+                used.
+            progress: Function that is called while the linear analysis runs.
+            linearly: True to add the line on which the linearised loop becomes unstable. This
+                line takes most of the time.
+            on: Workers that compute the linear analysis. If `None`, processes on this computer
+                are started.
+            simulated: Another sweep over the same axes, whose measured limits are drawn as
+                well.
 
-    Args:
-        results: Results of the sweep: its plan and one row per run.
-        commands: Commands that create the map. The page of the map shows them.
-        jobs: Number of worker processes for the linear analysis. If `None`, all cores are used.
-        progress: Function that is called while the linear analysis runs.
-        linearly: True to add the line on which the linearised loop becomes unstable. This line
-            takes most of the time.
-        on: Workers that compute the linear analysis. If `None`, processes on this computer are
-            started.
-        simulated: Another sweep over the same axes, whose measured limits are drawn as well.
+        Returns:
+            The map.
 
-    Returns:
-        The map.
+        Raises:
+            UsageError: There is nothing to draw, there would be too many panels, or the other
+                sweep has other axes.
+        """
+        plan = results.plan
+        plane = _build_plane_of_sweep(results)
+        if simulated is not None:
+            plane = _add_simulated_edges(plane, _build_plane_of_sweep(simulated))
+        stability_map = cls(
+            plane=plane,
+            lines=((),) * len(plane.panels),
+            remarks=(),
+            commands=commands,
+            title=plan.base.title or plan.base.name,
+            fixed=tuple(describe_fixed_gains(plan)),
+        )
+        x = plane.x.thin_out(plan.refine)
+        y = plane.y.thin_out(plan.refine)
+        if not y.key or len(y.values) < 2:
+            return stability_map
 
-    Raises:
-        UsageError: There is nothing to draw, there would be too many panels, or the other sweep
-            has other axes.
-    """
-    plan = results.plan
-    plane = _build_plane_of_sweep(results)
-    if simulated is not None:
-        plane = _add_simulated_edges(plane, _build_plane_of_sweep(simulated))
-    stability_map = StabilityMap(
-        plane=plane,
-        lines=((),) * len(plane.panels),
-        remarks=(),
-        commands=commands,
-        title=plan.base.title or plan.base.name,
-        fixed=tuple(describe_fixed_gains(plan)),
-    )
-    x = plane.x.thin_out(plan.refine)
-    y = plane.y.thin_out(plan.refine)
-    if not y.key or len(y.values) < 2:
-        return stability_map
+        loaders = [make_panel_loader(plan, panel, x.key, y.key) for panel in plane.panels]
+        fine = _choose_columns(loaders, x, y)
+        panel_lines = []
+        for panel, load in zip(plane.panels, loaders, strict=True):
+            measured_line = _trace_zero_exponent(plane, panel)
+            closed_form_line = MapLine.trace_closed_form(
+                load, x._replace(values=fine.values), y
+            )
+            if closed_form_line is not None:
+                closed_form_line = closed_form_line.thin_out(fine)
+            panel_lines.append([measured_line, closed_form_line])
+        remarks = list[str]()
+        # The cells of a sweep that is judged linearly have the growth rates already.
+        if linearly and not plane.is_linear:
+            tasks = [(load, x_value, y) for load in loaders for x_value in fine.values]
+            with open_worker_pool(jobs, on, most=len(tasks)) as pool:
+                columns = iter(pool.map(_analyse_column, tasks, progress))
+            # The results come in the order of the tasks, panel by panel and column by column.
+            for lines in panel_lines:
+                panel_columns = [next(columns) for _ in fine.values]
+                line, line_remarks = trace_linear_analysis(panel_columns, y)
+                lines.append(None if line is None else line.thin_out(fine))
+                remarks += line_remarks
 
-    loaders = [make_panel_loader(plan, panel, x.key, y.key) for panel in plane.panels]
-    fine = _choose_columns(loaders, x, y)
-    panel_lines = []
-    for panel, load in zip(plane.panels, loaders, strict=True):
-        measured_line = _trace_zero_exponent(plane, panel)
-        closed_form_line = MapLine.trace_closed_form(load, x._replace(values=fine.values), y)
-        if closed_form_line is not None:
-            closed_form_line = closed_form_line.thin_out(fine)
-        panel_lines.append([measured_line, closed_form_line])
-    remarks = list[str]()
-    # The cells of a sweep that is judged linearly have the growth rates already.
-    if linearly and not plane.is_linear:
-        tasks = [(load, x_value, y) for load in loaders for x_value in fine.values]
-        with open_worker_pool(jobs, on, most=len(tasks)) as pool:
-            columns = iter(pool.map(_analyse_column, tasks, progress))
-        # The results come in the order of the tasks, panel by panel and column by column.
-        for lines in panel_lines:
-            panel_columns = [next(columns) for _ in fine.values]
-            line, line_remarks = trace_linear_analysis(panel_columns, y)
-            lines.append(None if line is None else line.thin_out(fine))
-            remarks += line_remarks
-
-    if plan.refine:
-        panel_lines = [
-            [lines[0], *(_spread_line(line, x, y, fine, plane) for line in lines[1:])]
-            for lines in panel_lines
-        ]
-    crossing_lines = [tuple(filter(None, lines)) for lines in panel_lines]
-    distinct_remarks = tuple(dict.fromkeys(remarks))
-    return stability_map._replace(lines=tuple(crossing_lines), remarks=distinct_remarks)
+        if plan.refine:
+            panel_lines = [
+                [lines[0], *(_spread_line(line, x, y, fine, plane) for line in lines[1:])]
+                for lines in panel_lines
+            ]
+        crossing_lines = [tuple(filter(None, lines)) for lines in panel_lines]
+        distinct_remarks = tuple(dict.fromkeys(remarks))
+        return stability_map._replace(lines=tuple(crossing_lines), remarks=distinct_remarks)
 
 
 def _build_plane_of_sweep(results: SweepResults) -> MapPlane:

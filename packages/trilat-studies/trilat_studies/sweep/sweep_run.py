@@ -258,6 +258,82 @@ class DurationEstimate(NamedTuple):
     seconds: float
     entries: list[CellRun]
 
+    @classmethod
+    def of_sweep(
+        cls, plan: SweepPlan, done: Iterable[tuple[int, int]] = (), jobs: int | None = None
+    ) -> "DurationEstimate":
+        """Estimates the duration of a sweep from a few simulations spread over its parameters.
+
+        Args:
+            plan: The sweep: its scenario, axes, control laws and seeds.
+            done: Finished runs, as pairs of cell number and seed. These runs are not repeated.
+            jobs: Number of worker processes of the sweep. If `None`, all cores are used.
+        """
+        finished_runs = set(done)
+        refinement = EdgeRefinement(plan) if plan.refine else None
+        # A refined sweep must run only the cells that it chooses.
+        cells = refinement.list_coarse_cells() if refinement else range(plan.cells)
+        cell_count = refinement.count_most_cells() if refinement else plan.cells
+        last_cell = len(cells) - 1
+        # evenly spread cells without repetitions
+        probe_cells = dict.fromkeys(
+            cells[n * last_cell // (_PROBES - 1)] for n in range(_PROBES)
+        )
+        seed = plan.seeds[0]
+        probes = [
+            CellItem(plan, plan.cell(number), seed)
+            for number in probe_cells
+            if (number, seed) not in finished_runs
+        ]
+        if not probes:
+            runs = max(0, cell_count * len(plan.seeds) - len(finished_runs))
+            return cls(runs, 0.0, [])
+
+        # A short run first compiles the simulation kernel, once for all processes.
+        warm_up_s = min(1.0, plan.base.duration_s)
+        if plan.judge != "linear":
+            with suppress(ScenarioError):
+                warm_up = plan.scenario(*probes[0].cell.overrides, f"duration_s={warm_up_s!r}")
+                sweep_cell.classify_cell(warm_up.text, warm_up_s)
+
+        clock = SystemClock()
+        started_ns = clock.monotonic_ns()
+        entries: list[CellRun] = []
+        elapsed_s = 0.0
+        for probe in probes:
+            entries.append(probe.run())
+            elapsed_s = (clock.monotonic_ns() - started_ns) * 1e-9
+            if elapsed_s >= _PROBING_S:
+                break
+
+        # If nothing is random, a cell is run with one seed only.
+        seeds = len(plan.seeds) if any(entry.random for entry in entries) else 1
+        runs = max(len(entries), cell_count * seeds - len(finished_runs))
+        workers = min(jobs or count_cores(), runs)
+        seconds = elapsed_s / len(entries) * runs / workers
+        return cls(runs, seconds, entries)
+
+    def refuse_oversized_sweep(self, plan: SweepPlan, jobs: int | None = None) -> None:
+        """Rejects a sweep of more than `MAX_RUNS` runs or `MAX_SWEEP_S` seconds.
+
+        Args:
+            plan: The sweep: its scenario, axes, control laws and seeds.
+            jobs: Number of worker processes. If `None`, all cores are used.
+
+        Raises:
+            UsageError: The sweep is too large. The message states its size and duration.
+        """
+        if self.runs <= MAX_RUNS and self.seconds <= MAX_SWEEP_S:
+            return
+        sizes = " x ".join(str(count) for count in plan.shape if count > 1)
+        seeds = f", {count_nouns(len(plan.seeds), 'seed')} each" if len(plan.seeds) > 1 else ""
+        cells = count_nouns(plan.cells, "cell")
+        cores = count_nouns(jobs or count_cores(), "core")
+        raise UsageError(
+            f"{cells} ({sizes}{seeds}) would take about {format_wall_time(self.seconds)} "
+            f"on {cores}; use larger steps for fewer cells, or run the sweep anyway with --yes"
+        )
+
 
 class FinishedSweep(NamedTuple):
     """Results of a finished sweep, with the time and the number of runs that it took.
@@ -478,84 +554,6 @@ def _prepare_lanes(plan: SweepPlan, runs: int) -> bool:
         prepare_lanes(make_run, LANE_RUNS, least_site_ticks=0)
         return True
     return prepare_lanes(make_run, runs, least_site_ticks=math.inf)
-
-
-def estimate_sweep(
-    plan: SweepPlan, done: Iterable[tuple[int, int]] = (), jobs: int | None = None
-) -> DurationEstimate:
-    """Estimates the duration of a sweep from a few simulations spread over its parameters.
-
-    Args:
-        plan: The sweep: its scenario, axes, control laws and seeds.
-        done: Finished runs, as pairs of cell number and seed. These runs are not repeated.
-        jobs: Number of worker processes of the sweep. If `None`, all cores are used.
-    """
-    finished_runs = set(done)
-    refinement = EdgeRefinement(plan) if plan.refine else None
-    # A refined sweep must run only the cells that it chooses.
-    cells = refinement.list_coarse_cells() if refinement else range(plan.cells)
-    cell_count = refinement.count_most_cells() if refinement else plan.cells
-    last_cell = len(cells) - 1
-    # evenly spread cells without repetitions
-    probe_cells = dict.fromkeys(cells[n * last_cell // (_PROBES - 1)] for n in range(_PROBES))
-    seed = plan.seeds[0]
-    probes = [
-        CellItem(plan, plan.cell(number), seed)
-        for number in probe_cells
-        if (number, seed) not in finished_runs
-    ]
-    if not probes:
-        runs = max(0, cell_count * len(plan.seeds) - len(finished_runs))
-        return DurationEstimate(runs, 0.0, [])
-
-    # A short run first compiles the simulation kernel, once for all processes.
-    warm_up_s = min(1.0, plan.base.duration_s)
-    if plan.judge != "linear":
-        with suppress(ScenarioError):
-            warm_up = plan.scenario(*probes[0].cell.overrides, f"duration_s={warm_up_s!r}")
-            sweep_cell.classify_cell(warm_up.text, warm_up_s)
-
-    clock = SystemClock()
-    started_ns = clock.monotonic_ns()
-    entries: list[CellRun] = []
-    elapsed_s = 0.0
-    for probe in probes:
-        entries.append(probe.run())
-        elapsed_s = (clock.monotonic_ns() - started_ns) * 1e-9
-        if elapsed_s >= _PROBING_S:
-            break
-
-    # If nothing is random, a cell is run with one seed only.
-    seeds = len(plan.seeds) if any(entry.random for entry in entries) else 1
-    runs = max(len(entries), cell_count * seeds - len(finished_runs))
-    workers = min(jobs or count_cores(), runs)
-    seconds = elapsed_s / len(entries) * runs / workers
-    return DurationEstimate(runs, seconds, entries)
-
-
-def refuse_oversized_sweep(
-    plan: SweepPlan, expected: DurationEstimate, jobs: int | None = None
-) -> None:
-    """Rejects a sweep of more than `MAX_RUNS` runs or `MAX_SWEEP_S` seconds.
-
-    Args:
-        plan: The sweep: its scenario, axes, control laws and seeds.
-        expected: Estimated duration of the sweep.
-        jobs: Number of worker processes. If `None`, all cores are used.
-
-    Raises:
-        UsageError: The sweep is too large. The message states its size and duration.
-    """
-    if expected.runs <= MAX_RUNS and expected.seconds <= MAX_SWEEP_S:
-        return
-    sizes = " x ".join(str(count) for count in plan.shape if count > 1)
-    seeds = f", {count_nouns(len(plan.seeds), 'seed')} each" if len(plan.seeds) > 1 else ""
-    cells = count_nouns(plan.cells, "cell")
-    cores = count_nouns(jobs or count_cores(), "core")
-    raise UsageError(
-        f"{cells} ({sizes}{seeds}) would take about {format_wall_time(expected.seconds)} "
-        f"on {cores}; use larger steps for fewer cells, or run the sweep anyway with --yes"
-    )
 
 
 def run_sweep(

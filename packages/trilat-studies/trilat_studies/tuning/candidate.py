@@ -893,16 +893,68 @@ class CandidateItem(NamedTuple):
         runs = tuple(seed.texts for seed in seeds)
         return cls(runs, name)
 
-    def measure(self) -> "MeasuredCandidate":
+    def measure(self) -> "_MeasuredCandidate":
         """Runs a candidate, a law with chosen gains, with all of its seeds.
 
         The function depends only on its argument, so any worker process can call it.
         """
         scores = [CandidateScore.measure(text, twin_text) for text, twin_text in self.runs]
-        return MeasuredCandidate(CandidateScore.average(scores))
+        return _MeasuredCandidate(CandidateScore.average(scores))
+
+    @classmethod
+    def measure_together(
+        cls, tasks: "Sequence[CandidateItem]"
+    ) -> "Iterator[_MeasuredCandidate]":
+        """Runs several candidates with all of their seeds, side by side where that is possible.
+
+        Args:
+            tasks: The runs of each candidate.
+
+        Yields:
+            The scores in the order of the candidates, equal to those of
+            `CandidateItem.measure`.
+        """
+        texts = [
+            text
+            for task in tasks
+            if task.is_side_by_side
+            for texts in task.runs
+            for text in texts
+            if text
+        ]
+        scenarios = {text: parse_scenario(text) for text in dict.fromkeys(texts)}
+        measured = {}
+        obstacles = {}
+        chosen = list(scenarios)
+        try:
+            for first in range(0, len(chosen), LANE_RUNS):
+                part = chosen[first : first + LANE_RUNS]
+                runs = WholeRun.simulate_together([scenarios[text] for text in part])
+                for index, run, obstacle in runs:
+                    text = part[index]
+                    measured[text] = _measure_records(scenarios[text], run)
+                    obstacles[text] = obstacle
+        except CodeFailed:
+            # One by one, so that candidates before a candidate whose code fails are kept.
+            for task in tasks:
+                yield task.measure()
+            return
+
+        for task in tasks:
+            if not task.is_side_by_side:
+                yield task.measure()
+                continue
+            scores = [
+                _score_candidate(measured[text], measured[twin_text or text])
+                for text, twin_text in task.runs
+            ]
+            reasons = [obstacles[text] for texts in task.runs for text in texts if text]
+            yield _MeasuredCandidate(
+                CandidateScore.average(scores), tuple(filter(None, reasons))
+            )
 
 
-class MeasuredCandidate(NamedTuple):
+class _MeasuredCandidate(NamedTuple):
     """Score of a candidate, with the reasons why runs of it were computed one by one.
 
     Attributes:
@@ -916,50 +968,3 @@ class MeasuredCandidate(NamedTuple):
 
 LANE_RUNS = 16
 """Number of runs that a worker computes side by side. All their records are in memory."""
-
-
-def measure_candidate_tasks(tasks: Sequence[CandidateItem]) -> Iterator[MeasuredCandidate]:
-    """Runs several candidates with all of their seeds, side by side where that is possible.
-
-    Args:
-        tasks: The runs of each candidate.
-
-    Yields:
-        The scores in the order of the candidates, equal to those of `CandidateItem.measure`.
-    """
-    texts = [
-        text
-        for task in tasks
-        if task.is_side_by_side
-        for texts in task.runs
-        for text in texts
-        if text
-    ]
-    scenarios = {text: parse_scenario(text) for text in dict.fromkeys(texts)}
-    measured = {}
-    obstacles = {}
-    chosen = list(scenarios)
-    try:
-        for first in range(0, len(chosen), LANE_RUNS):
-            part = chosen[first : first + LANE_RUNS]
-            runs = WholeRun.simulate_together([scenarios[text] for text in part])
-            for index, run, obstacle in runs:
-                text = part[index]
-                measured[text] = _measure_records(scenarios[text], run)
-                obstacles[text] = obstacle
-    except CodeFailed:
-        # One by one, so that candidates before a candidate whose code fails are kept.
-        for task in tasks:
-            yield task.measure()
-        return
-
-    for task in tasks:
-        if not task.is_side_by_side:
-            yield task.measure()
-            continue
-        scores = [
-            _score_candidate(measured[text], measured[twin_text or text])
-            for text, twin_text in task.runs
-        ]
-        reasons = [obstacles[text] for texts in task.runs for text in texts if text]
-        yield MeasuredCandidate(CandidateScore.average(scores), tuple(filter(None, reasons)))

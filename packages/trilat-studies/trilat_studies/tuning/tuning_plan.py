@@ -47,7 +47,6 @@ from .candidate import (
     TuningScenario,
     build_twin,
     check_comparable,
-    measure_candidate_tasks,
 )
 from .search_space import (
     PAPER_GAINS,
@@ -532,7 +531,7 @@ class TuningPlan(NamedTuple):
                     CandidateItem.measure,
                     items,
                     report_progress,
-                    together=measure_candidate_tasks if side_by_side else None,
+                    together=CandidateItem.measure_together if side_by_side else None,
                     together_count=LANE_RUNS if side_by_side else 1,
                 )
                 scores = iter([candidate.score for candidate in measured])
