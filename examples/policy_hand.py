@@ -114,7 +114,7 @@ def lead(
     Args:
         session: the running session.
         program: the operator of m2.
-        person: the operator of m1. None if a real person moves m1.
+        person: the operator of m1. `None` if a real person moves m1.
         seconds: duration, s.
         now_s: returns the present time, s.
         wait_s: waits for a time, s.

@@ -87,7 +87,7 @@ class Study(NamedTuple):
 
     Attributes:
         scenario: keys of the scenario in which the task is done.
-        make_task: returns a new task. None selects the task of the environment, reaching.
+        make_task: returns a new task. If `None`, the task is that of the environment, reaching.
         rounds: number of rounds of the evolution strategy.
         pairs: number of pairs of opposite perturbations per round.
         rate: step size of the first round; it falls to zero linearly.

@@ -21,9 +21,9 @@ __all__ = [
 ]
 
 if TYPE_CHECKING:
-    from .backfill import (GapRepair)
-    from .record_process import (ReadScenario, RecordedScenario, record_session)
-    from .site_reception import (AWAY_NS, InboundMessage, InboundQueue, SiteReception)
+    from .backfill import GapRepair
+    from .record_process import ReadScenario, RecordedScenario, record_session
+    from .site_reception import AWAY_NS, InboundMessage, InboundQueue, SiteReception
 else:
     __getattr__ = import_on_use(
         __name__,

@@ -20,11 +20,11 @@ __all__ = [
 ]
 
 if TYPE_CHECKING:
-    from .hand_process import (run_hand)
-    from .loop_rehearsal import (rehearse_loop)
-    from .machine_load import (check_machine_load)
-    from .site_parts import (SiteOptions, warm_up)
-    from .site_process import (run_site)
+    from .hand_process import run_hand
+    from .loop_rehearsal import rehearse_loop
+    from .machine_load import check_machine_load
+    from .site_parts import SiteOptions, warm_up
+    from .site_process import run_site
 else:
     __getattr__ = import_on_use(
         __name__,

@@ -181,53 +181,141 @@ __all__ = [
 ]
 
 if TYPE_CHECKING:
-    from .arms.chain import (COULOMB_SPEED, ChainJoint, LINK_PARAMETERS, Matrix, Three, apply, build_chain, dot, find_acceleration, inverse_dynamics, mass_matrix, multiply, parameter_gradient, place_end_effector, place_joints, propagate_motion, rotate, three)
-    from .arms import chain_stages
-    from .arms.elementary import (sincos, tanh)
-    from .arms.exogenous import (LIVE_KINDS, OWN_KINDS, SCRIPTED_KINDS, TorqueKind, TorqueSource)
-    from .arms.rotation import (relative_rotation, rotation_matrix)
-    from .arms.task_space import (POSE, POSITION)
-    from .arms.two_link_arm import (ArmLinks, forward_kinematics, regressor, theta_from_links)
-    from .arms import two_link_stages
-    from .lanes.lane_episodes import (LaneEpisodes)
-    from .lanes.lane_structure import (describe_structure)
-    from .lanes.run_groups import (RunGroup, group_runs, prepare_lanes)
-    from .lanes.twin_lanes import (LaneEndedError, LaneTwin, TwinLanes, suits_twins)
-    from .life.live_hand import (GRIP_NS, HandCommand, HandInForce, HandMemory, HandReach, HandRules, SILENCE_NS, TAKEN, advance_hand, empty_hand_vector)
-    from .life.own_hand import (HandContext, HandProgram, HandView, OwnHand)
-    from .life.resting import (REST_RATE_1_S)
-    from .life.safeguards import (BLEND_S)
-    from .life.session_life import (HELD_OVERRUN_TICKS)
-    from .links.channel import (LOST, schedule_deliveries)
-    from .links.delay import (DelayKind, LINK_MODEL_DTYPE, LinkModel, MAX_DELAY_US, TraceEnd, draw_pair)
+    from .arms import chain_stages, two_link_stages
+    from .arms.chain import (
+        COULOMB_SPEED,
+        LINK_PARAMETERS,
+        ChainJoint,
+        Matrix,
+        Three,
+        apply,
+        build_chain,
+        dot,
+        find_acceleration,
+        inverse_dynamics,
+        mass_matrix,
+        multiply,
+        parameter_gradient,
+        place_end_effector,
+        place_joints,
+        propagate_motion,
+        rotate,
+        three,
+    )
+    from .arms.elementary import sincos, tanh
+    from .arms.exogenous import LIVE_KINDS, OWN_KINDS, SCRIPTED_KINDS, TorqueKind, TorqueSource
+    from .arms.rotation import relative_rotation, rotation_matrix
+    from .arms.task_space import POSE, POSITION
+    from .arms.two_link_arm import ArmLinks, forward_kinematics, regressor, theta_from_links
+    from .lanes.lane_episodes import LaneEpisodes
+    from .lanes.lane_structure import describe_structure
+    from .lanes.run_groups import RunGroup, group_runs, prepare_lanes
+    from .lanes.twin_lanes import LaneEndedError, LaneTwin, TwinLanes, suits_twins
+    from .life.live_hand import (
+        GRIP_NS,
+        SILENCE_NS,
+        TAKEN,
+        HandCommand,
+        HandInForce,
+        HandMemory,
+        HandReach,
+        HandRules,
+        advance_hand,
+        empty_hand_vector,
+    )
+    from .life.own_hand import HandContext, HandProgram, HandView, OwnHand
+    from .life.resting import REST_RATE_1_S
+    from .life.safeguards import BLEND_S
+    from .life.session_life import HELD_OVERRUN_TICKS
     from .links import dominance
-    from .links.dominance import (ROW_SUM_TOLERANCE, find_balancing_weights, find_reach, is_irreducible, perron_vector)
-    from .links.link import (AHEAD_LIMIT_NS, link_dtype)
-    from .links.philox import (link_key)
-    from .plug.compiled_law import (compiled, plug_law)
-    from .plug.law_channel import (LawChannel, MAX_RECORD_SENT, MAX_SENT, SentVector)
-    from .plug.law_energy import (LawEnergies, LawRecords, PeerRecords, sum_work)
-    from .plug.plugged import (compile_to_address, list_numbers)
-    from .plug.user_law import (LawContext, LawInput, PeerView, UserLaw, UserLawFactory, list_remembered, read_memory)
-    from .step.compiled_run import (CompiledRun)
-    from .step.control import (ROBUST_RESIDUE)
-    from .step.fingerprint import (compute_fingerprint)
-    from .step.jit import (compiling_notice, is_core_cached, leaf, loop_leaf)
-    from .step.recorded_ticks import (RecordedRows, TickRepeater)
-    from .step.run_inputs import (RunInputs)
-    from .step.site_arrays import (MAX_CHANGES, MAX_LINKS_BYTES, MAX_RAMPS, SiteArrays, links_bytes, needed_pages)
-    from .step.site_setup import (ChainSetup, Gains, Law, LinkSetup, MotionLimits, RestGains, Scheme, SiteSetup, StaleAction, StaleRule, TaskSetup, make_layout)
-    from .step.site_step import (Site)
-    from .step.ticks import (BUCKETS_PER_S, CoreChange, DominanceRamp, LifeAlarm, LifeOrder, LifeReason, MAX_ARRIVALS, PlantState, RELEASE_REASONS, TickInput, describe_divergence, describe_mode, find_life_reason, first_tick_at, tick_ns)
-    from .step.vectors import (Array, IntArray, Pair, Points, Row, RowArray, Vector)
+    from .links.channel import LOST, schedule_deliveries
+    from .links.delay import (
+        LINK_MODEL_DTYPE,
+        MAX_DELAY_US,
+        DelayKind,
+        LinkModel,
+        TraceEnd,
+        draw_pair,
+    )
+    from .links.dominance import (
+        ROW_SUM_TOLERANCE,
+        find_balancing_weights,
+        find_reach,
+        is_irreducible,
+        perron_vector,
+    )
+    from .links.link import AHEAD_LIMIT_NS, link_dtype
+    from .links.philox import link_key
+    from .plug.compiled_law import compiled, plug_law
+    from .plug.law_channel import MAX_RECORD_SENT, MAX_SENT, LawChannel, SentVector
+    from .plug.law_energy import LawEnergies, LawRecords, PeerRecords, sum_work
+    from .plug.plugged import compile_to_address, list_numbers
+    from .plug.user_law import (
+        LawContext,
+        LawInput,
+        PeerView,
+        UserLaw,
+        UserLawFactory,
+        list_remembered,
+        read_memory,
+    )
+    from .step.compiled_run import CompiledRun
+    from .step.control import ROBUST_RESIDUE
+    from .step.fingerprint import compute_fingerprint
+    from .step.jit import compiling_notice, is_core_cached, leaf, loop_leaf
+    from .step.recorded_ticks import RecordedRows, TickRepeater
+    from .step.run_inputs import RunInputs
+    from .step.site_arrays import (
+        MAX_CHANGES,
+        MAX_LINKS_BYTES,
+        MAX_RAMPS,
+        SiteArrays,
+        links_bytes,
+        needed_pages,
+    )
+    from .step.site_setup import (
+        ChainSetup,
+        Gains,
+        Law,
+        LinkSetup,
+        MotionLimits,
+        RestGains,
+        Scheme,
+        SiteSetup,
+        StaleAction,
+        StaleRule,
+        TaskSetup,
+        make_layout,
+    )
+    from .step.site_step import Site
+    from .step.ticks import (
+        BUCKETS_PER_S,
+        MAX_ARRIVALS,
+        RELEASE_REASONS,
+        CoreChange,
+        DominanceRamp,
+        LifeAlarm,
+        LifeOrder,
+        LifeReason,
+        PlantState,
+        TickInput,
+        describe_divergence,
+        describe_mode,
+        find_life_reason,
+        first_tick_at,
+        tick_ns,
+    )
+    from .step.vectors import Array, IntArray, Pair, Points, Row, RowArray, Vector
 else:
     __getattr__ = import_on_use(
         __name__,
         {
-            "arms.chain": ("COULOMB_SPEED ChainJoint LINK_PARAMETERS Matrix Three apply build_chain "
-"dot find_acceleration inverse_dynamics mass_matrix multiply "
-"parameter_gradient place_end_effector place_joints propagate_motion rotate "
-"three"),
+            "arms.chain": (
+                "COULOMB_SPEED ChainJoint LINK_PARAMETERS Matrix Three apply build_chain "
+                "dot find_acceleration inverse_dynamics mass_matrix multiply "
+                "parameter_gradient place_end_effector place_joints propagate_motion rotate "
+                "three"
+            ),
             "arms.chain_stages": "chain_stages",
             "arms.elementary": "sincos tanh",
             "arms.exogenous": "LIVE_KINDS OWN_KINDS SCRIPTED_KINDS TorqueKind TorqueSource",
@@ -239,37 +327,51 @@ else:
             "lanes.lane_structure": "describe_structure",
             "lanes.run_groups": "RunGroup group_runs prepare_lanes",
             "lanes.twin_lanes": "LaneEndedError LaneTwin TwinLanes suits_twins",
-            "life.live_hand": ("GRIP_NS HandCommand HandInForce HandMemory HandReach HandRules SILENCE_NS "
-"TAKEN advance_hand empty_hand_vector"),
+            "life.live_hand": (
+                "GRIP_NS HandCommand HandInForce HandMemory HandReach HandRules SILENCE_NS "
+                "TAKEN advance_hand empty_hand_vector"
+            ),
             "life.own_hand": "HandContext HandProgram HandView OwnHand",
             "life.resting": "REST_RATE_1_S",
             "life.safeguards": "BLEND_S",
             "life.session_life": "HELD_OVERRUN_TICKS",
             "links.channel": "LOST schedule_deliveries",
-            "links.delay": ("DelayKind LINK_MODEL_DTYPE LinkModel MAX_DELAY_US TraceEnd draw_pair"),
-            "links.dominance": ("ROW_SUM_TOLERANCE dominance find_balancing_weights find_reach "
-"is_irreducible perron_vector"),
+            "links.delay": (
+                "DelayKind LINK_MODEL_DTYPE LinkModel MAX_DELAY_US TraceEnd draw_pair"
+            ),
+            "links.dominance": (
+                "ROW_SUM_TOLERANCE dominance find_balancing_weights find_reach "
+                "is_irreducible perron_vector"
+            ),
             "links.link": "AHEAD_LIMIT_NS link_dtype",
             "links.philox": "link_key",
             "plug.compiled_law": "compiled plug_law",
             "plug.law_channel": "LawChannel MAX_RECORD_SENT MAX_SENT SentVector",
             "plug.law_energy": "LawEnergies LawRecords PeerRecords sum_work",
             "plug.plugged": "compile_to_address list_numbers",
-            "plug.user_law": ("LawContext LawInput PeerView UserLaw UserLawFactory list_remembered "
-"read_memory"),
+            "plug.user_law": (
+                "LawContext LawInput PeerView UserLaw UserLawFactory list_remembered "
+                "read_memory"
+            ),
             "step.compiled_run": "CompiledRun",
             "step.control": "ROBUST_RESIDUE",
             "step.fingerprint": "compute_fingerprint",
             "step.jit": "compiling_notice is_core_cached leaf loop_leaf",
             "step.recorded_ticks": "RecordedRows TickRepeater",
             "step.run_inputs": "RunInputs",
-            "step.site_arrays": ("MAX_CHANGES MAX_LINKS_BYTES MAX_RAMPS SiteArrays links_bytes needed_pages"),
-            "step.site_setup": ("ChainSetup Gains Law LinkSetup MotionLimits RestGains Scheme SiteSetup "
-"StaleAction StaleRule TaskSetup make_layout"),
+            "step.site_arrays": (
+                "MAX_CHANGES MAX_LINKS_BYTES MAX_RAMPS SiteArrays links_bytes needed_pages"
+            ),
+            "step.site_setup": (
+                "ChainSetup Gains Law LinkSetup MotionLimits RestGains Scheme SiteSetup "
+                "StaleAction StaleRule TaskSetup make_layout"
+            ),
             "step.site_step": "Site",
-            "step.ticks": ("BUCKETS_PER_S CoreChange DominanceRamp LifeAlarm LifeOrder LifeReason "
-"MAX_ARRIVALS PlantState RELEASE_REASONS TickInput describe_divergence "
-"describe_mode find_life_reason first_tick_at tick_ns"),
+            "step.ticks": (
+                "BUCKETS_PER_S CoreChange DominanceRamp LifeAlarm LifeOrder LifeReason "
+                "MAX_ARRIVALS PlantState RELEASE_REASONS TickInput describe_divergence "
+                "describe_mode find_life_reason first_tick_at tick_ns"
+            ),
             "step.vectors": "Array IntArray Pair Points Row RowArray Vector",
         },
     )

@@ -30,7 +30,7 @@ __all__ = [
     "check_log_files",
     "describe_rerun_changes",
     "rerun",
-    "verify",
+    "verify_log",
     # Twins
     "LEAST_PUSH",
     "MOST_PUSH",
@@ -42,15 +42,21 @@ __all__ = [
 ]
 
 if TYPE_CHECKING:
-    from .fused import (FusedRun, check_fusable, explain_not_repeatable)
-    from .log_checks import (LogCheckReport, check_log_files)
-    from .rerun_execution import (describe_rerun_changes)
-    from .twins import (LEAST_PUSH, MOST_PUSH, PUSH_RAD, Push, SMALLEST, TwinPath, Twins)
-    from .unwritten_run import (simulate_columns)
-    from .verification import (verify)
-    from .virtual import (SimulatedLog, check_virtual, execute_virtual, record_virtual, simulate_scenario)
-    from .virtual_comparison import (find_absent_samples, simulate_without_operators)
-    from .what_if import (LinkEffect, Rerun, SiteEffect, rerun)
+    from .fused import FusedRun, check_fusable, explain_not_repeatable
+    from .log_checks import LogCheckReport, check_log_files
+    from .rerun_execution import describe_rerun_changes
+    from .twins import LEAST_PUSH, MOST_PUSH, PUSH_RAD, SMALLEST, Push, TwinPath, Twins
+    from .unwritten_run import simulate_columns
+    from .verification import verify_log
+    from .virtual import (
+        SimulatedLog,
+        check_virtual,
+        execute_virtual,
+        record_virtual,
+        simulate_scenario,
+    )
+    from .virtual_comparison import find_absent_samples, simulate_without_operators
+    from .what_if import LinkEffect, Rerun, SiteEffect, rerun
 else:
     __getattr__ = import_on_use(
         __name__,
@@ -60,9 +66,10 @@ else:
             "rerun_execution": "describe_rerun_changes",
             "twins": "LEAST_PUSH MOST_PUSH PUSH_RAD Push SMALLEST TwinPath Twins",
             "unwritten_run": "simulate_columns",
-            "verification": "verify",
-            "virtual": ("SimulatedLog check_virtual execute_virtual record_virtual "
-"simulate_scenario"),
+            "verification": "verify_log",
+            "virtual": (
+                "SimulatedLog check_virtual execute_virtual record_virtual simulate_scenario"
+            ),
             "virtual_comparison": "find_absent_samples simulate_without_operators",
             "what_if": "LinkEffect Rerun SiteEffect rerun",
         },

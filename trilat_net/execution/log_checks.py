@@ -30,7 +30,7 @@ from ..log import (
     open_log,
 )
 from ..own_code import CodeConsents, allowed_code, find_user_laws
-from .verification import VerifyResult, verify
+from .verification import VerifyResult, verify_log
 from .virtual_comparison import RecordComparison, compare_with_virtual
 
 _MAX_GAPS_NAMED = 60
@@ -125,7 +125,7 @@ class LogCheckReport(CheckReport):
                 controller) that must be compared. A log with a smaller fraction fails even if
                 all compared records agree.
             resume_every: Interval, in ticks, at which a site is restored from the records, see
-                `verify`. 0 means never.
+                `verify_log`. 0 means never.
 
         Returns:
             The findings of all checks.
@@ -134,7 +134,7 @@ class LogCheckReport(CheckReport):
             LogError: A record cannot be read.
             ScenarioError: A user's control law that may run cannot be created.
         """
-        result = verify(log, progress, min_coverage=min_coverage, resume_every=resume_every)
+        result = verify_log(log, progress, min_coverage=min_coverage, resume_every=resume_every)
         findings = list(_check_log(log, result, virtual=virtual, progress=progress))
         if not resume_every:
             findings = [_add_memory_advice(finding, log, result) for finding in findings]

@@ -381,7 +381,7 @@ class _SiteVerifier:
         samples: Samples of all sites for the compiled loop. None if it cannot be used.
         result: Object to which the counts and differences are added.
         resume_every: Interval, in ticks, at which the site is restored from the records, see
-            `verify`. 0 means never.
+            `verify_log`. 0 means never.
     """
 
     def __init__(
@@ -830,7 +830,7 @@ class _SiteVerifier:
         return state.rx, None
 
 
-def verify(
+def verify_log(
     log: Log,
     progress: Progress | None = None,
     *,
@@ -905,7 +905,7 @@ def _execute_sites(
         result: Receives the counts and differences.
         report: Function that is called now and then with the number of records (results of
             control periods) so far.
-        resume_every: See `verify`.
+        resume_every: See `verify_log`.
     """
     # On another platform, each tick is computed from the two records before it.
     samples = make_sample_table(log) if result.whole_run else None

@@ -45,21 +45,45 @@ __all__ = [
 ]
 
 if TYPE_CHECKING:
-    from .adaptive import (Adaptive)
-    from .conditions import (ArmLoad, BlockKey, COMMON_MOTION_SHARE, LawSituation, LinearForm, LinearSituation, StabilityCondition, find_least_reversible)
-    from .interface import (ControlLaw, DAMPING, ERROR_DAMPING, GainRange, LawSettings, TuningRun, TuningSite, check_law_class, format_class_name, make_instance)
-    from .p_d import (PD)
-    from .sent_vectors import (SentVectorSpecs, convert_sends)
-    from .six_channel import (complementary_shares)
+    from .adaptive import Adaptive
+    from .conditions import (
+        COMMON_MOTION_SHARE,
+        ArmLoad,
+        BlockKey,
+        LawSituation,
+        LinearForm,
+        LinearSituation,
+        StabilityCondition,
+        find_least_reversible,
+    )
+    from .interface import (
+        DAMPING,
+        ERROR_DAMPING,
+        ControlLaw,
+        GainRange,
+        LawSettings,
+        TuningRun,
+        TuningSite,
+        check_law_class,
+        format_class_name,
+        make_instance,
+    )
+    from .p_d import PD
+    from .sent_vectors import SentVectorSpecs, convert_sends
+    from .six_channel import complementary_shares
 else:
     __getattr__ = import_on_use(
         __name__,
         {
             "adaptive": "Adaptive",
-            "conditions": ("ArmLoad BlockKey COMMON_MOTION_SHARE LawSituation LinearForm "
-"LinearSituation StabilityCondition find_least_reversible"),
-            "interface": ("ControlLaw DAMPING ERROR_DAMPING GainRange LawSettings TuningRun "
-"TuningSite check_law_class format_class_name make_instance"),
+            "conditions": (
+                "ArmLoad BlockKey COMMON_MOTION_SHARE LawSituation LinearForm "
+                "LinearSituation StabilityCondition find_least_reversible"
+            ),
+            "interface": (
+                "ControlLaw DAMPING ERROR_DAMPING GainRange LawSettings TuningRun "
+                "TuningSite check_law_class format_class_name make_instance"
+            ),
             "p_d": "PD",
             "sent_vectors": "SentVectorSpecs convert_sends",
             "six_channel": "complementary_shares",

@@ -510,8 +510,8 @@ def _describe_stiffest_wall(situation: LawSituation, slave: int) -> str:
     stiffest = min(stiffnesses)
     limit = "of any stiffness" if stiffest == np.inf else f"of up to {stiffest:.4g} N m/rad"
     return (
-        f"with a spring {limit} at the slave, for constant delays of any length, with and without "
-        "the hands at the masters (small gain: sufficient, in continuous time)"
+        f"with a spring {limit} at the slave, for constant delays of any length, with and "
+        "without the hands at the masters (small gain: sufficient, in continuous time)"
     )
 
 

@@ -92,30 +92,72 @@ __all__ = [
 ]
 
 if TYPE_CHECKING:
-    from .accounting import (Account, Coverage, LAST, MIN_COVERAGE, StartGap, describe_unknown_ends)
-    from .data_tables import (Column, Table, UNIT_SUFFIXES)
-    from .findings import (CheckReport, Finding)
-    from .log_file import (LogFile)
-    from .log_layout import (ACTIVE_SUFFIX, ALL_CHANNELS, CHANNEL_TYPES, ChannelFilter, EXECUTED_SITES_KEY, MAX_TIME_NS, RERUN_DRIVER, SCENARIO, SESSION, SITE_CHANNELS, VIZ_ROOT, active_path, find_parts)
-    from .log_reader import (Log, open_log, open_logs, read_link_delays)
-    from .log_signature import (check_signatures, create_signing_keys, sign_log)
-    from .log_writer import (LogParts, LogStorage, LogWriter, MakeViews, PutMessage, ReceiveMessage)
-    from .mcap_reader import (ChannelInfo, McapMessage, McapReader, Progress, read_contents, shift_progress)
-    from .mcap_records import (RecordScanner)
-    from .mcap_writer import (McapWriter, Sink)
-    from .message_identity import (compute_virtual_boot)
-    from .orientations import (MATRIX_ENTRIES, QUATERNION_AXES, QuaternionSigns, choose_nearest_vectors, compute_continuous_vectors, expand_poses)
-    from .packed.indexed_records import (IndexedRecords)
-    from .provenance import (collect_provenance)
-    from .record_columns import (Ints)
-    from .recovery import (Recovery, recover)
-    from .recovery_survey import (RecoverySurvey)
-    from .running_digest import (Integrity)
-    from .session_check import (LogCheckResult, check_file, judge_integrity)
-    from .session_scenario import (SessionScenario)
-    from .site_log import (LazyRecords, RecordsByTick, SiteLog, compute_task_errors)
-    from .unwritten_log import (UnwrittenLog)
-    from .view_rates import (FULL_RATE_HZ, VIZ_HZ)
+    from .accounting import (
+        LAST,
+        MIN_COVERAGE,
+        Account,
+        Coverage,
+        StartGap,
+        describe_unknown_ends,
+    )
+    from .data_tables import UNIT_SUFFIXES, Column, Table
+    from .findings import CheckReport, Finding
+    from .log_file import LogFile
+    from .log_layout import (
+        ACTIVE_SUFFIX,
+        ALL_CHANNELS,
+        CHANNEL_TYPES,
+        EXECUTED_SITES_KEY,
+        MAX_TIME_NS,
+        RERUN_DRIVER,
+        SCENARIO,
+        SESSION,
+        SITE_CHANNELS,
+        VIZ_ROOT,
+        ChannelFilter,
+        active_path,
+        find_parts,
+    )
+    from .log_reader import Log, open_log, open_logs, read_link_delays
+    from .log_signature import check_signatures, create_signing_keys, sign_log
+    from .log_writer import (
+        LogParts,
+        LogStorage,
+        LogWriter,
+        MakeViews,
+        PutMessage,
+        ReceiveMessage,
+    )
+    from .mcap_reader import (
+        ChannelInfo,
+        McapMessage,
+        McapReader,
+        Progress,
+        read_contents,
+        shift_progress,
+    )
+    from .mcap_records import RecordScanner
+    from .mcap_writer import McapWriter, Sink
+    from .message_identity import compute_virtual_boot
+    from .orientations import (
+        MATRIX_ENTRIES,
+        QUATERNION_AXES,
+        QuaternionSigns,
+        choose_nearest_vectors,
+        compute_continuous_vectors,
+        expand_poses,
+    )
+    from .packed.indexed_records import IndexedRecords
+    from .provenance import collect_provenance
+    from .record_columns import Ints
+    from .recovery import Recovery, recover
+    from .recovery_survey import RecoverySurvey
+    from .running_digest import Integrity
+    from .session_check import LogCheckResult, check_file, judge_integrity
+    from .session_scenario import SessionScenario
+    from .site_log import LazyRecords, RecordsByTick, SiteLog, compute_task_errors
+    from .unwritten_log import UnwrittenLog
+    from .view_rates import FULL_RATE_HZ, VIZ_HZ
 else:
     __getattr__ = import_on_use(
         __name__,
@@ -124,18 +166,24 @@ else:
             "data_tables": "Column Table UNIT_SUFFIXES",
             "findings": "CheckReport Finding",
             "log_file": "LogFile",
-            "log_layout": ("ACTIVE_SUFFIX ALL_CHANNELS CHANNEL_TYPES ChannelFilter EXECUTED_SITES_KEY "
-"MAX_TIME_NS RERUN_DRIVER SCENARIO SESSION SITE_CHANNELS VIZ_ROOT "
-"active_path find_parts"),
+            "log_layout": (
+                "ACTIVE_SUFFIX ALL_CHANNELS CHANNEL_TYPES ChannelFilter EXECUTED_SITES_KEY "
+                "MAX_TIME_NS RERUN_DRIVER SCENARIO SESSION SITE_CHANNELS VIZ_ROOT "
+                "active_path find_parts"
+            ),
             "log_reader": "Log open_log open_logs read_link_delays",
             "log_signature": "check_signatures create_signing_keys sign_log",
             "log_writer": "LogParts LogStorage LogWriter MakeViews PutMessage ReceiveMessage",
-            "mcap_reader": ("ChannelInfo McapMessage McapReader Progress read_contents shift_progress"),
+            "mcap_reader": (
+                "ChannelInfo McapMessage McapReader Progress read_contents shift_progress"
+            ),
             "mcap_records": "RecordScanner",
             "mcap_writer": "McapWriter Sink",
             "message_identity": "compute_virtual_boot",
-            "orientations": ("MATRIX_ENTRIES QUATERNION_AXES QuaternionSigns choose_nearest_vectors "
-"compute_continuous_vectors expand_poses"),
+            "orientations": (
+                "MATRIX_ENTRIES QUATERNION_AXES QuaternionSigns choose_nearest_vectors "
+                "compute_continuous_vectors expand_poses"
+            ),
             "packed.indexed_records": "IndexedRecords",
             "provenance": "collect_provenance",
             "record_columns": "Ints",

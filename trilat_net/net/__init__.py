@@ -153,27 +153,123 @@ __all__ = [
 ]
 
 if TYPE_CHECKING:
-    from .arm_client import (ArmClient, Hand, SiteClient, SiteSender, SwitchClient)
-    from .bus import (Bus, Inbox, Query, QueryInbox, StampedInbox, matches_key)
-    from .clock import (Clock, SystemClock, make_system_clock)
-    from .connection import (Connection, ENCRYPTED, ENDS_SOON, default_endpoint, default_endpoints, find_endpoint_addresses, find_free_endpoints, is_loopback, reserve_session_endpoints, run_router)
-    from .discovery import (REPLY_TIMEOUT_S, connect_to_session, find_members, list_past_events, open_playback_bus, refuse_running_session, send_change)
-    from .host_names import (UnknownHost, check_hosts)
-    from .known_sites import (make_site_known, stop_at_once)
-    from .member_keys import (AUTHORITY, CERTIFICATE, HERE, MEMBERS, MemberKeys, PRIVATE_KEY, add_keys, create_keys, read_member_keys, renew_keys)
-    from .membership import (Epoch, EventPublisher, LateSites, MemberQuery, describe_member, liveliness_token, new_boot, read_messages, read_records)
-    from . import messages
-    from .messages import (Event, HALTED_MODES, Info, LinkStats, MODES, MODE_WORDS, ModeMeaning, PeerSample, READABLE, RESTING_MODES, RecorderStats, SENT_TIME_SINCE, STATE_VECTORS, Stamp, State, TASK_VECTORS, TickNumber, VERSION, json_schema)
-    from .offset import (OffsetEstimator, OffsetLimit, exact_offset)
-    from .pinging import (PING_PACE_NS, Pinger, answer_backfill, answer_pings, describe_clocks)
-    from .requests import (ArmEnable, ArmMeasurement, BACKFILL_BYTES, BACKFILL_MESSAGES, Backfill, BackfillRequest, ChangeReply, ChangeRequest, HandMessage, HandViewMessage, OrderName, PeerSeen)
-    from .session import (SessionJoin)
-    from .timing import (ClockNotice, LinkTimingMonitor, LoopStats, PeerClock, SiteTiming, find_turn_ns)
-    from . import topics
-    from .topics import (RECORDER, STATS_PER_SECOND, count_messages, count_under_way, number_message, skipped_numbers)
-    from .wire import (MAX_BYTES, decode, encode, encode_sample, encode_state, join_states, make_decoder, make_reader, split_states)
-    from .zenoh_bus import (RouterSilent, ZenohBus, open_zenoh, read_zenoh_file, share_threads)
-    from .zenoh_config import (BRIDGE, Endpoint, OPERATOR, ROLES, ROUTER, describe_role)
+    from . import messages, topics
+    from .arm_client import ArmClient, Hand, SiteClient, SiteSender, SwitchClient
+    from .bus import Bus, Inbox, Query, QueryInbox, StampedInbox, matches_key
+    from .clock import Clock, SystemClock, make_system_clock
+    from .connection import (
+        ENCRYPTED,
+        ENDS_SOON,
+        Connection,
+        default_endpoint,
+        default_endpoints,
+        find_endpoint_addresses,
+        find_free_endpoints,
+        is_loopback,
+        reserve_session_endpoints,
+        run_router,
+    )
+    from .discovery import (
+        REPLY_TIMEOUT_S,
+        connect_to_session,
+        find_members,
+        list_past_events,
+        open_playback_bus,
+        refuse_running_session,
+        send_change,
+    )
+    from .host_names import UnknownHost, check_hosts
+    from .known_sites import make_site_known, stop_at_once
+    from .member_keys import (
+        AUTHORITY,
+        CERTIFICATE,
+        HERE,
+        MEMBERS,
+        PRIVATE_KEY,
+        MemberKeys,
+        add_keys,
+        create_keys,
+        read_member_keys,
+        renew_keys,
+    )
+    from .membership import (
+        Epoch,
+        EventPublisher,
+        LateSites,
+        MemberQuery,
+        describe_member,
+        liveliness_token,
+        new_boot,
+        read_messages,
+        read_records,
+    )
+    from .messages import (
+        HALTED_MODES,
+        MODE_WORDS,
+        MODES,
+        READABLE,
+        RESTING_MODES,
+        SENT_TIME_SINCE,
+        STATE_VECTORS,
+        TASK_VECTORS,
+        VERSION,
+        Event,
+        Info,
+        LinkStats,
+        ModeMeaning,
+        PeerSample,
+        RecorderStats,
+        Stamp,
+        State,
+        TickNumber,
+        json_schema,
+    )
+    from .offset import OffsetEstimator, OffsetLimit, exact_offset
+    from .pinging import PING_PACE_NS, Pinger, answer_backfill, answer_pings, describe_clocks
+    from .requests import (
+        BACKFILL_BYTES,
+        BACKFILL_MESSAGES,
+        ArmEnable,
+        ArmMeasurement,
+        Backfill,
+        BackfillRequest,
+        ChangeReply,
+        ChangeRequest,
+        HandMessage,
+        HandViewMessage,
+        OrderName,
+        PeerSeen,
+    )
+    from .session import SessionJoin
+    from .timing import (
+        ClockNotice,
+        LinkTimingMonitor,
+        LoopStats,
+        PeerClock,
+        SiteTiming,
+        find_turn_ns,
+    )
+    from .topics import (
+        RECORDER,
+        STATS_PER_SECOND,
+        count_messages,
+        count_under_way,
+        number_message,
+        skipped_numbers,
+    )
+    from .wire import (
+        MAX_BYTES,
+        decode,
+        encode,
+        encode_sample,
+        encode_state,
+        join_states,
+        make_decoder,
+        make_reader,
+        split_states,
+    )
+    from .zenoh_bus import RouterSilent, ZenohBus, open_zenoh, read_zenoh_file, share_threads
+    from .zenoh_config import BRIDGE, OPERATOR, ROLES, ROUTER, Endpoint, describe_role
 else:
     __getattr__ = import_on_use(
         __name__,
@@ -181,31 +277,49 @@ else:
             "arm_client": "ArmClient Hand SiteClient SiteSender SwitchClient",
             "bus": "Bus Inbox Query QueryInbox StampedInbox matches_key",
             "clock": "Clock SystemClock make_system_clock",
-            "connection": ("Connection ENCRYPTED ENDS_SOON default_endpoint default_endpoints "
-"find_endpoint_addresses find_free_endpoints is_loopback "
-"reserve_session_endpoints run_router"),
-            "discovery": ("REPLY_TIMEOUT_S connect_to_session find_members list_past_events "
-"open_playback_bus refuse_running_session send_change"),
+            "connection": (
+                "Connection ENCRYPTED ENDS_SOON default_endpoint default_endpoints "
+                "find_endpoint_addresses find_free_endpoints is_loopback "
+                "reserve_session_endpoints run_router"
+            ),
+            "discovery": (
+                "REPLY_TIMEOUT_S connect_to_session find_members list_past_events "
+                "open_playback_bus refuse_running_session send_change"
+            ),
             "host_names": "UnknownHost check_hosts",
             "known_sites": "make_site_known stop_at_once",
-            "member_keys": ("AUTHORITY CERTIFICATE HERE MEMBERS MemberKeys PRIVATE_KEY add_keys "
-"create_keys read_member_keys renew_keys"),
-            "membership": ("Epoch EventPublisher LateSites MemberQuery describe_member "
-"liveliness_token new_boot read_messages read_records"),
-            "messages": ("Event HALTED_MODES Info LinkStats MODES MODE_WORDS ModeMeaning PeerSample "
-"READABLE RESTING_MODES RecorderStats SENT_TIME_SINCE STATE_VECTORS Stamp "
-"State TASK_VECTORS TickNumber VERSION json_schema messages"),
+            "member_keys": (
+                "AUTHORITY CERTIFICATE HERE MEMBERS MemberKeys PRIVATE_KEY add_keys "
+                "create_keys read_member_keys renew_keys"
+            ),
+            "membership": (
+                "Epoch EventPublisher LateSites MemberQuery describe_member "
+                "liveliness_token new_boot read_messages read_records"
+            ),
+            "messages": (
+                "Event HALTED_MODES Info LinkStats MODES MODE_WORDS ModeMeaning PeerSample "
+                "READABLE RESTING_MODES RecorderStats SENT_TIME_SINCE STATE_VECTORS Stamp "
+                "State TASK_VECTORS TickNumber VERSION json_schema messages"
+            ),
             "offset": "OffsetEstimator OffsetLimit exact_offset",
             "pinging": "PING_PACE_NS Pinger answer_backfill answer_pings describe_clocks",
-            "requests": ("ArmEnable ArmMeasurement BACKFILL_BYTES BACKFILL_MESSAGES Backfill "
-"BackfillRequest ChangeReply ChangeRequest HandMessage HandViewMessage "
-"OrderName PeerSeen"),
+            "requests": (
+                "ArmEnable ArmMeasurement BACKFILL_BYTES BACKFILL_MESSAGES Backfill "
+                "BackfillRequest ChangeReply ChangeRequest HandMessage HandViewMessage "
+                "OrderName PeerSeen"
+            ),
             "session": "SessionJoin",
-            "timing": ("ClockNotice LinkTimingMonitor LoopStats PeerClock SiteTiming find_turn_ns"),
-            "topics": ("RECORDER STATS_PER_SECOND count_messages count_under_way number_message "
-"skipped_numbers topics"),
-            "wire": ("MAX_BYTES decode encode encode_sample encode_state join_states "
-"make_decoder make_reader split_states"),
+            "timing": (
+                "ClockNotice LinkTimingMonitor LoopStats PeerClock SiteTiming find_turn_ns"
+            ),
+            "topics": (
+                "RECORDER STATS_PER_SECOND count_messages count_under_way number_message "
+                "skipped_numbers topics"
+            ),
+            "wire": (
+                "MAX_BYTES decode encode encode_sample encode_state join_states "
+                "make_decoder make_reader split_states"
+            ),
             "zenoh_bus": "RouterSilent ZenohBus open_zenoh read_zenoh_file share_threads",
             "zenoh_config": "BRIDGE Endpoint OPERATOR ROLES ROUTER describe_role",
         },

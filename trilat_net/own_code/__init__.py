@@ -50,20 +50,45 @@ __all__ = [
 ]
 
 if TYPE_CHECKING:
-    from .class_arguments import (make_own_instance)
-    from .code_consent import (LawFiles, allow_logged_code, allow_own_code, find_user_laws, list_imported_code, may_run_user_laws)
-    from .imported_code import (CLASS_PATTERN, CodeConsent, CodeConsents, CodeKey, ImportedLaw, NamedCode, Watch, allowed_code, allowing_any_settings, call_directly, import_class, name_law_classes, read_code)
-    from .sent_channel import (build_channel, check_sends, parse_classes, read_sends)
+    from .class_arguments import make_own_instance
+    from .code_consent import (
+        LawFiles,
+        allow_logged_code,
+        allow_own_code,
+        find_user_laws,
+        list_imported_code,
+        may_run_user_laws,
+    )
+    from .imported_code import (
+        CLASS_PATTERN,
+        CodeConsent,
+        CodeConsents,
+        CodeKey,
+        ImportedLaw,
+        NamedCode,
+        Watch,
+        allowed_code,
+        allowing_any_settings,
+        call_directly,
+        import_class,
+        name_law_classes,
+        read_code,
+    )
+    from .sent_channel import build_channel, check_sends, parse_classes, read_sends
 else:
     __getattr__ = import_on_use(
         __name__,
         {
             "class_arguments": "make_own_instance",
-            "code_consent": ("LawFiles allow_logged_code allow_own_code find_user_laws "
-"list_imported_code may_run_user_laws"),
-            "imported_code": ("CLASS_PATTERN CodeConsent CodeConsents CodeKey ImportedLaw NamedCode Watch "
-"allowed_code allowing_any_settings call_directly import_class "
-"name_law_classes read_code"),
+            "code_consent": (
+                "LawFiles allow_logged_code allow_own_code find_user_laws "
+                "list_imported_code may_run_user_laws"
+            ),
+            "imported_code": (
+                "CLASS_PATTERN CodeConsent CodeConsents CodeKey ImportedLaw NamedCode Watch "
+                "allowed_code allowing_any_settings call_directly import_class "
+                "name_law_classes read_code"
+            ),
             "sent_channel": "build_channel check_sends parse_classes read_sends",
         },
     )

@@ -42,7 +42,6 @@ __all__ = [
     "EpisodePicture",
     "FigureSize",
     "figure",
-    "is_position",
     "style",
     "write_figure",
     "write_figures",
@@ -59,22 +58,26 @@ __all__ = [
 ]
 
 if TYPE_CHECKING:
-    from .appearance import (COLUMN_IN, FigureSize, REPORT_SIZE, SITE_COLOURS)
-    from .certificate_text import (describe_judgement)
-    from .citation import (compose_citation)
-    from .conclusion import (Conclusion, conclude, conclude_files)
-    from .episode_picture import (EpisodePicture, is_position)
-    from .export import (Exporter)
-    from .exports import (list_export_formats)
-    from .figures.registry import (FIGURES, figure, write_figures, write_overlay)
-    from .rerun_viewer import (ViewerOptions, open_rerun)
-    from .result_text import (Block, MARKS, MarkedText, TextTable, compose, format_number)
-    from . import style
-    from .style import (FIGURE_FORMATS, REPORT_DPI, write_figure)
-    from .summary_text import (compose_benchmark, compose_doctor, compose_ping, compose_topic_delays)
-    from . import terminal_output
-    from .terminal_output import (err, print_error, print_json, print_line, print_table)
-    from .viewer_files import (write_foxglove_layout)
+    from . import style, terminal_output
+    from .appearance import COLUMN_IN, REPORT_SIZE, SITE_COLOURS, FigureSize
+    from .certificate_text import describe_judgement
+    from .citation import compose_citation
+    from .conclusion import Conclusion, conclude, conclude_files
+    from .episode_picture import EpisodePicture
+    from .export import Exporter
+    from .exports import list_export_formats
+    from .figures.registry import FIGURES, figure, write_figures, write_overlay
+    from .rerun_viewer import ViewerOptions, open_rerun
+    from .result_text import MARKS, Block, MarkedText, TextTable, compose, format_number
+    from .style import FIGURE_FORMATS, REPORT_DPI, write_figure
+    from .summary_text import (
+        compose_benchmark,
+        compose_doctor,
+        compose_ping,
+        compose_topic_delays,
+    )
+    from .terminal_output import err, print_error, print_json, print_line, print_table
+    from .viewer_files import write_foxglove_layout
 else:
     __getattr__ = import_on_use(
         __name__,
@@ -83,15 +86,19 @@ else:
             "certificate_text": "describe_judgement",
             "citation": "compose_citation",
             "conclusion": "Conclusion conclude conclude_files",
-            "episode_picture": "EpisodePicture is_position",
+            "episode_picture": "EpisodePicture",
             "export": "Exporter",
             "exports": "list_export_formats",
             "figures.registry": "FIGURES figure write_figures write_overlay",
             "rerun_viewer": "ViewerOptions open_rerun",
             "result_text": "Block MARKS MarkedText TextTable compose format_number",
             "style": "FIGURE_FORMATS REPORT_DPI style write_figure",
-            "summary_text": ("compose_benchmark compose_doctor compose_ping compose_topic_delays"),
-            "terminal_output": ("err print_error print_json print_line print_table terminal_output"),
+            "summary_text": (
+                "compose_benchmark compose_doctor compose_ping compose_topic_delays"
+            ),
+            "terminal_output": (
+                "err print_error print_json print_line print_table terminal_output"
+            ),
             "viewer_files": "write_foxglove_layout",
         },
     )

@@ -107,30 +107,79 @@ __all__ = [
 ]
 
 if TYPE_CHECKING:
-    from .arms import (ArmModel, TASK_AXES, read_arm)
-    from .change import (Change, describe_event, find_requester)
-    from .delay_models import (LinkBase)
-    from .delay_models.kernel_delays import (ConstantDelay, NoDelay)
-    from .delay_traces import (TracePoint, import_trace)
-    from .describe import (IRREVERSIBLE_SHARES, ScenarioDifference, compare_scenarios, describe_law, describe_law_conditions, describe_scenario, describe_value, flatten_table, list_arm_notes, list_law_situations)
-    from .expect import (ALL_SITES_QUANTITIES, END_WINDOW_S, Expect, ExpectWindow)
-    from .key_checks import (check_finite, field_names, is_distribution, is_number)
-    from .laws import (BUILT_IN, LAWS)
-    from .link_presets import (GRID_LOSSES_PERCENT, GRID_ROUND_TRIPS_MS)
-    from .operators import (ActorBase)
-    from .operators.kernel_operators import (Chirp, DeviceSettings, JointSpring, LiveHand, Multisine, ViscousEnvironment, Wall)
-    from .operators.program_hand import (FAILED_HAND, HandPlayer, HandSite, POLICY, ProgramHand, make_hand_players, make_hand_program)
-    from .override import (apply_overrides, split_assignment)
-    from .own_plant import (OwnPlant)
-    from .plant_player import (PlantContext, PlantPlayer, make_plant_players)
-    from .run_changes import (LinkTables, make_site_order, parse_core_change, resolve_change, to_core_change)
-    from .sample_uses import (LinkSchedule, PictureDelay, draw_link_samples, draw_used_samples, first_ticks)
-    from .scenario_reader import (ExperimentText, embedded_names_reader, list_shipped, load_scenario, parse_embedded, parse_scenario, read_source, read_template, reseed_scenario)
-    from .scenario_types import (Scenario)
-    from .simulated_arm import (SimulatedArm)
-    from .site_spec import (Limits, SiteSpec)
-    from .skeletons import (name_skeleton_class, new_hand, new_law, new_plant)
-    from .validate import (check_outside_arms)
+    from .arms import TASK_AXES, ArmModel, read_arm
+    from .change import Change, describe_event, find_requester
+    from .delay_models import LinkBase
+    from .delay_models.kernel_delays import ConstantDelay, NoDelay
+    from .delay_traces import TracePoint, import_trace
+    from .describe import (
+        IRREVERSIBLE_SHARES,
+        ScenarioDifference,
+        compare_scenarios,
+        describe_law,
+        describe_law_conditions,
+        describe_scenario,
+        describe_value,
+        flatten_table,
+        list_arm_notes,
+        list_law_situations,
+    )
+    from .expect import ALL_SITES_QUANTITIES, END_WINDOW_S, Expect, ExpectWindow
+    from .key_checks import check_finite, field_names, is_distribution, is_number
+    from .laws import BUILT_IN, LAWS
+    from .link_presets import GRID_LOSSES_PERCENT, GRID_ROUND_TRIPS_MS
+    from .operators import ActorBase
+    from .operators.kernel_operators import (
+        Chirp,
+        DeviceSettings,
+        JointSpring,
+        LiveHand,
+        Multisine,
+        ViscousEnvironment,
+        Wall,
+    )
+    from .operators.program_hand import (
+        FAILED_HAND,
+        POLICY,
+        HandPlayer,
+        HandSite,
+        ProgramHand,
+        make_hand_players,
+        make_hand_program,
+    )
+    from .override import apply_overrides, split_assignment
+    from .own_plant import OwnPlant
+    from .plant_player import PlantContext, PlantPlayer, make_plant_players
+    from .run_changes import (
+        LinkTables,
+        make_site_order,
+        parse_core_change,
+        resolve_change,
+        to_core_change,
+    )
+    from .sample_uses import (
+        LinkSchedule,
+        PictureDelay,
+        draw_link_samples,
+        draw_used_samples,
+        first_ticks,
+    )
+    from .scenario_reader import (
+        ExperimentText,
+        embedded_names_reader,
+        list_shipped,
+        load_scenario,
+        parse_embedded,
+        parse_scenario,
+        read_source,
+        read_template,
+        reseed_scenario,
+    )
+    from .scenario_types import Scenario
+    from .simulated_arm import SimulatedArm
+    from .site_spec import Limits, SiteSpec
+    from .skeletons import name_skeleton_class, new_hand, new_law, new_plant
+    from .validate import check_outside_arms
 else:
     __getattr__ = import_on_use(
         __name__,
@@ -140,25 +189,36 @@ else:
             "delay_models": "LinkBase",
             "delay_models.kernel_delays": "ConstantDelay NoDelay",
             "delay_traces": "TracePoint import_trace",
-            "describe": ("IRREVERSIBLE_SHARES ScenarioDifference compare_scenarios describe_law "
-"describe_law_conditions describe_scenario describe_value flatten_table "
-"list_arm_notes list_law_situations"),
+            "describe": (
+                "IRREVERSIBLE_SHARES ScenarioDifference compare_scenarios describe_law "
+                "describe_law_conditions describe_scenario describe_value flatten_table "
+                "list_arm_notes list_law_situations"
+            ),
             "expect": "ALL_SITES_QUANTITIES END_WINDOW_S Expect ExpectWindow",
             "key_checks": "check_finite field_names is_distribution is_number",
             "laws": "BUILT_IN LAWS",
             "link_presets": "GRID_LOSSES_PERCENT GRID_ROUND_TRIPS_MS",
             "operators": "ActorBase",
-            "operators.kernel_operators": ("Chirp DeviceSettings JointSpring LiveHand Multisine ViscousEnvironment "
-"Wall"),
-            "operators.program_hand": ("FAILED_HAND HandPlayer HandSite POLICY ProgramHand make_hand_players "
-"make_hand_program"),
+            "operators.kernel_operators": (
+                "Chirp DeviceSettings JointSpring LiveHand Multisine ViscousEnvironment Wall"
+            ),
+            "operators.program_hand": (
+                "FAILED_HAND HandPlayer HandSite POLICY ProgramHand make_hand_players "
+                "make_hand_program"
+            ),
             "override": "apply_overrides split_assignment",
             "own_plant": "OwnPlant",
             "plant_player": "PlantContext PlantPlayer make_plant_players",
-            "run_changes": ("LinkTables make_site_order parse_core_change resolve_change to_core_change"),
-            "sample_uses": ("LinkSchedule PictureDelay draw_link_samples draw_used_samples first_ticks"),
-            "scenario_reader": ("ExperimentText embedded_names_reader list_shipped load_scenario "
-"parse_embedded parse_scenario read_source read_template reseed_scenario"),
+            "run_changes": (
+                "LinkTables make_site_order parse_core_change resolve_change to_core_change"
+            ),
+            "sample_uses": (
+                "LinkSchedule PictureDelay draw_link_samples draw_used_samples first_ticks"
+            ),
+            "scenario_reader": (
+                "ExperimentText embedded_names_reader list_shipped load_scenario "
+                "parse_embedded parse_scenario read_source read_template reseed_scenario"
+            ),
             "scenario_types": "Scenario",
             "simulated_arm": "SimulatedArm",
             "site_spec": "Limits SiteSpec",

@@ -1,7 +1,7 @@
 """Completes the table `control` of a scenario: the control law of an arm and its gains.
 
 A scenario is a TOML file that describes an experiment. Its author chooses a built-in law by its
-name, or names a class of Python as "module:Class".
+name, or names a Python class as "module:Class".
 """
 
 import os
@@ -29,7 +29,7 @@ def complete_control(
     Args:
         written: Table `control` of a site as its author wrote it.
         common: Table `control` for all sites. Its gains replace missing gains if it names the
-            same law; other laws have other gains.
+            same law, because other laws have other gains.
         path: Path of the table, for error messages.
         counts: Lengths to which a single number per vector is expanded.
 

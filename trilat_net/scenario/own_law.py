@@ -1,4 +1,4 @@
-"""Reads the part of a scenario that names a user's control law, a class of Python.
+"""Reads the part of a scenario that names a user's control law, a Python class.
 
 A scenario is a TOML file that describes an experiment. The law of an arm is chosen in the table
 `control`, for example by

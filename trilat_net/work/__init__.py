@@ -30,15 +30,26 @@ __all__ = [
 ]
 
 if TYPE_CHECKING:
-    from .executor import (MAX_LOSSES, Progress, WorkerPool, Workers, check_workers, count_workers, ignore_progress, open_worker_pool)
-    from .intervals import (MeanInterval, wilson_interval)
-    from .study_folder import (RunJournal, StudyFolder, build_resume_hint, encode_csv)
+    from .executor import (
+        MAX_LOSSES,
+        Progress,
+        WorkerPool,
+        Workers,
+        check_workers,
+        count_workers,
+        ignore_progress,
+        open_worker_pool,
+    )
+    from .intervals import MeanInterval, wilson_interval
+    from .study_folder import RunJournal, StudyFolder, build_resume_hint, encode_csv
 else:
     __getattr__ = import_on_use(
         __name__,
         {
-            "executor": ("MAX_LOSSES Progress WorkerPool Workers check_workers count_workers "
-"ignore_progress open_worker_pool"),
+            "executor": (
+                "MAX_LOSSES Progress WorkerPool Workers check_workers count_workers "
+                "ignore_progress open_worker_pool"
+            ),
             "intervals": "MeanInterval wilson_interval",
             "study_folder": "RunJournal StudyFolder build_resume_hint encode_csv",
         },

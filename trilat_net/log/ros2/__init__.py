@@ -49,25 +49,54 @@ __all__ = [
 ]
 
 if TYPE_CHECKING:
-    from . import cdr
-    from .cdr import (FLOAT64_ARRAY, JOINT_STATE, POSE, STRING, TRANSFORMS)
-    from .published import (COMMON_TOPICS, SiteMessages, list_log_topics, list_topics, pack_session_diagnostics)
-    from .robot_model import (SPACING_M, WORLD)
-    from . import ros2_messages
-    from .ros2_messages import (EVENTS, FRAMES, LINES, NUMBERS_BY_MODE_WORD, Ros2Channels, Ros2SiteChannels, SENT_PREFIX, SESSION_CHANNELS, pack_event, read_ros2_channels)
-    from .rviz_config import (build_rviz_config, write_rviz_config)
-    from .topic_names import (DIAGNOSTICS, FRAMES_TOPIC, NAMINGS, RobotTable, TopicTable, make_session_name)
+    from . import cdr, ros2_messages
+    from .cdr import FLOAT64_ARRAY, JOINT_STATE, POSE, STRING, TRANSFORMS
+    from .published import (
+        COMMON_TOPICS,
+        SiteMessages,
+        list_log_topics,
+        list_topics,
+        pack_session_diagnostics,
+    )
+    from .robot_model import SPACING_M, WORLD
+    from .ros2_messages import (
+        EVENTS,
+        FRAMES,
+        LINES,
+        NUMBERS_BY_MODE_WORD,
+        SENT_PREFIX,
+        SESSION_CHANNELS,
+        Ros2Channels,
+        Ros2SiteChannels,
+        pack_event,
+        read_ros2_channels,
+    )
+    from .rviz_config import build_rviz_config, write_rviz_config
+    from .topic_names import (
+        DIAGNOSTICS,
+        FRAMES_TOPIC,
+        NAMINGS,
+        RobotTable,
+        TopicTable,
+        make_session_name,
+    )
 else:
     __getattr__ = import_on_use(
         __name__,
         {
             "cdr": "FLOAT64_ARRAY JOINT_STATE POSE STRING TRANSFORMS cdr",
-            "published": ("COMMON_TOPICS SiteMessages list_log_topics list_topics "
-"pack_session_diagnostics"),
+            "published": (
+                "COMMON_TOPICS SiteMessages list_log_topics list_topics "
+                "pack_session_diagnostics"
+            ),
             "robot_model": "SPACING_M WORLD",
-            "ros2_messages": ("EVENTS FRAMES LINES NUMBERS_BY_MODE_WORD Ros2Channels Ros2SiteChannels "
-"SENT_PREFIX SESSION_CHANNELS pack_event read_ros2_channels ros2_messages"),
+            "ros2_messages": (
+                "EVENTS FRAMES LINES NUMBERS_BY_MODE_WORD Ros2Channels Ros2SiteChannels "
+                "SENT_PREFIX SESSION_CHANNELS pack_event read_ros2_channels ros2_messages"
+            ),
             "rviz_config": "build_rviz_config write_rviz_config",
-            "topic_names": ("DIAGNOSTICS FRAMES_TOPIC NAMINGS RobotTable TopicTable make_session_name"),
+            "topic_names": (
+                "DIAGNOSTICS FRAMES_TOPIC NAMINGS RobotTable TopicTable make_session_name"
+            ),
         },
     )

@@ -20,14 +20,24 @@ __all__ = [
 ]
 
 if TYPE_CHECKING:
-    from .ros2_graph import (Attachment, DISTROS, QualityOfService, ROUTER_ADVICE, Refusals, Ros2Graph, TopicPublisher)
-    from .ros2_names import (check_ros_name)
+    from .ros2_graph import (
+        DISTROS,
+        ROUTER_ADVICE,
+        Attachment,
+        QualityOfService,
+        Refusals,
+        Ros2Graph,
+        TopicPublisher,
+    )
+    from .ros2_names import check_ros_name
 else:
     __getattr__ = import_on_use(
         __name__,
         {
-            "ros2_graph": ("Attachment DISTROS QualityOfService ROUTER_ADVICE Refusals Ros2Graph "
-"TopicPublisher"),
+            "ros2_graph": (
+                "Attachment DISTROS QualityOfService ROUTER_ADVICE Refusals Ros2Graph "
+                "TopicPublisher"
+            ),
             "ros2_names": "check_ros_name",
         },
     )
