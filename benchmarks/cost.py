@@ -41,7 +41,7 @@ PROCESSES = "run/processes"
 MS_PER_TICK = 1000.0 / os.sysconf("SC_CLK_TCK")
 
 Usage = Counter[str]
-"""Processor time by thread without its number, ms; and voluntary context switches, by `<thread> switches`."""
+"""Processor time by thread without its number, in ms; and voluntary context switches, by `<thread> switches`."""
 
 
 def run() -> list[str]:

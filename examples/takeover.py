@@ -39,7 +39,7 @@ def run(weights: np.ndarray, seed: int, ramp_s: float | None) -> dict[str, float
     Args:
         weights: weights of the policy.
         seed: seed of the goal and of the network.
-        ramp_s: duration of the change of the lead, s. If `None`, the policy keeps the lead.
+        ramp_s: duration of the change of the lead, in s. If `None`, the policy keeps the lead.
     """
     random = np.random.default_rng(seed)
     base = STUDIES["reach"].scenario

@@ -244,7 +244,7 @@ def report(found: list[dict[str, Any]], measure: str) -> dict[str, tuple[float, 
         measure: meaning of the cost.
 
     Returns:
-        The mean and its interval, mm, by combination.
+        The mean and its interval, in mm, by combination.
     """
     columns = {
         name: np.array([result["costs"][name] for result in found])

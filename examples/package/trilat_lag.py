@@ -40,7 +40,9 @@ def measure_lags(scenario: str, seeds: int = 1, duration_s: float | None = None)
 def lag_command(
     scenario: ScenarioArgument,
     seeds: Annotated[int, value("--seeds", "N", "Number of seeds.")] = 1,
-    duration: Annotated[float | None, value("--duration", "S", "Duration of a run, s.")] = None,
+    duration: Annotated[
+        float | None, value("--duration", "S", "Duration of a run, in s.")
+    ] = None,
     as_json: JsonOption = False,
 ) -> None:
     """Measures how far the slave lags behind, seed by seed."""

@@ -31,7 +31,7 @@ from .timeline import StatedModel, list_changes, list_stated_models
 
 
 class _PredictedDelivery(NamedTuple):
-    """Fate of the first M samples of a link, as the delay model of the link predicts it.
+    """Delivery of the first M samples of a link, as the delay model of the link predicts it.
 
     A sample is the state that a site publishes in one tick. The delay model of the scenario
     emulates delays, losses and changes of order in a repeatable way. Therefore the prediction

@@ -28,7 +28,7 @@ def hand_command(
     ] = "",
     session: Annotated[str | None, value("--session", "ID")] = None,
     join_timeout: Annotated[
-        float, seconds("--join-timeout", "Longest wait for the site, s.")
+        float, seconds("--join-timeout", "Longest wait for the site, in s.")
     ] = 60.0,
     duration: options.DurationOption = None,
     seed: options.SeedOption = None,

@@ -334,7 +334,7 @@ def sweep_command(
             link.delay_ms=0:1600:50 or link.order=newest,in_order; repeatable.
         seeds: Number of seeds, or a list of seeds, for example 1..20; default: one.
         law: Control laws, as a further axis of the grid; default: the law of the scenario.
-        longest: Longest run of a cell whose stability is still undecided, s; default: eight
+        longest: Longest run of a cell whose stability is still undecided, in s; default: eight
             times the duration, or the duration with --judge twins.
         judge: Quantity in the map: stability classes (verdict), growth exponents of runs with
             a small push (twins), for which short runs suffice, or growth rates of the linear

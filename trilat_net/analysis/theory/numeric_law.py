@@ -10,7 +10,7 @@ The results at tick k are the torque tau_k that the law commands and its memory 
 that it stores for the next tick. The arguments are:
 
 - the joint angles q and velocities qd, and the desired angles q_des and velocities qd_des,
-- `felt`, the weighted sum of the received torques ON the other arms,
+- `felt`, the weighted sum of the received torques on the other arms,
 - `peers`, the states of these arms one by one,
 - `torque`, the external torque on the law's own arm.
 

@@ -44,7 +44,7 @@ def site_command(
     *,
     ways: options.MemberOptions,
     join_timeout: Annotated[
-        float, seconds("--join-timeout", "Longest wait for the other sites, s.")
+        float, seconds("--join-timeout", "Longest wait for the other sites, in s.")
     ] = 60.0,
     needs_recorder: options.NeedsRecorderOption = False,
     cpu: Annotated[
@@ -73,7 +73,7 @@ def site_command(
         without: Begin without SITE, which may join later; repeatable. Only the first site
             accepts this option.
         leave_timeout: Longest time to continue after another site has left, if the arms then
-            glide (on_stale.action = "glide"), s; default: until the end of the run.
+            glide (on_stale.action = "glide"), in s; default: until the end of the run.
     """
     from sites import SiteOptions, run_site
 
@@ -167,7 +167,7 @@ def record_command(
     Options:
         output: File of the log; default: SESSION.mcap, or runs/SESSION-N/run.mcap if --conclude
             is used.
-        join_timeout: Longest wait for the session to begin, s; default: no limit.
+        join_timeout: Longest wait for the session to begin, in s; default: no limit.
         concluded: Verify the log at the end, and write a report into its folder.
         include: Record only these channels, for example '**/m1/**'; repeatable.
         exclude: Leave out these channels, for example '**/link'; repeatable.
@@ -640,7 +640,7 @@ def router_command(
         float | None,
         seconds(
             "--until-idle",
-            "End after all members have been absent for this long, s; default: never.",
+            "End after all members have been absent for this long, in s; default: never.",
         ),
     ] = None,
 ) -> None:

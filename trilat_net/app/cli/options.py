@@ -239,7 +239,7 @@ SeedOption = Annotated[
     int | None, typer.Option("--seed", help="Override the seed of the scenario.")
 ]
 DurationOption = Annotated[
-    float | None, value("--duration", "S", "Override the duration of the run, s.")
+    float | None, value("--duration", "S", "Override the duration of the run, in s.")
 ]
 ForceOption = Annotated[bool, flag("--force", "Replace existing files.")]
 ListenOption = Annotated[
@@ -352,13 +352,15 @@ def check_session_name(name: str) -> str:
     return name
 
 
-AnswerOption = Annotated[float, seconds("--timeout", "Longest wait for the first answer, s.")]
+AnswerOption = Annotated[
+    float, seconds("--timeout", "Longest wait for the first answer, in s.")
+]
 ClockOffsetOption = Annotated[
     float,
     value(
         "--clock-offset-s",
         "S",
-        "For tests: offset added to the clock of this machine, s.",
+        "For tests: offset added to the clock of this machine, in s.",
         callback=check_range(-1e6, 1e6, "a number of seconds"),
     ),
 ]

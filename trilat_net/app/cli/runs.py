@@ -260,7 +260,7 @@ _PUSH_HELP = (
 )
 def twin_command(
     files: options.LogsArgument,
-    at_s: Annotated[float, value("--at", "S", "Time of the push, s.")] = 0.0,
+    at_s: Annotated[float, value("--at", "S", "Time of the push, in s.")] = 0.0,
     push: Annotated[
         list[str] | None,
         value("--push", "STATE=SIZE", _PUSH_HELP, autocompletion=options.complete_sites),
@@ -537,7 +537,7 @@ def linear_command(
         value(
             "--pose",
             "Q1,Q2,...",
-            "Pose of all sites, rad; default: the pose at the end of a run of the scenario.",
+            "Pose of all sites, in rad; default: the pose at the end of a run of the scenario.",
         ),
     ] = None,
     roots: Annotated[int, value("--roots", "N", "Number of roots to print.")] = 6,

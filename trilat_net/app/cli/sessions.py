@@ -186,9 +186,9 @@ def ping_command(
         benchmark: Measure the network to --connect EP for this scenario instead, for several
             message sizes, rates and transports. Without --connect, measure this machine alone.
         ros2: Measure the delay of messages of this ROS 2 topic instead.
-        seconds: Total duration of the benchmark, s; default: 24. With --ros2: duration of the
-            measurement, s; default: 5. With --answer: time after which the command ends, s;
-            default: no limit.
+        seconds: Total duration of the benchmark, in s; default: 24. With --ros2: duration of
+            the measurement, in s; default: 5. With --answer: time after which the command
+            ends, in s; default: no limit.
         picture: File for a figure of the benchmark (.png, .svg or .pdf).
         answer: Answer benchmarks from other machines on this endpoint; repeatable.
     """
