@@ -22,16 +22,15 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..core import AHEAD_LIMIT_NS, LOST, Array, DelayKind
+from ..core import AHEAD_LIMIT_NS, LOST, Array, DelayKind, LinkSchedule, first_ticks
 from ..log import Ints, Log, SiteLog
 from ..records import NS_PER_S
-from ..scenario import LinkSchedule, first_ticks
 from .aligned import Bools
 from .timeline import StatedLink, Timeline
 
 
 class _PredictedDelivery(NamedTuple):
-    """Fate of the first M samples of a link, as the delay model of the link predicts it.
+    """Delivery of the first M samples of a link, as the delay model of the link predicts it.
 
     A sample is the state that a site publishes in one tick. The delay model of the scenario
     emulates delays, losses and changes of order in a repeatable way. Therefore the prediction

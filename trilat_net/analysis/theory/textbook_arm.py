@@ -27,8 +27,8 @@ the regressor Y = (J_1' F_1 ... J_n' F_n), the matrix that multiplies the parame
 torque, and the inertia matrix M = sum_i J_i' I_i J_i.
 
 If end effectors instead of joints follow each other, the reference motion is computed as in
-`analysis.following.find_task_reference`. docs/reference/task-space.md has the equations and
-sources.
+`analysis.following.find_task_reference`. docs/reference/task-space.md contains the equations
+and sources.
 
 Invariant:
     - The arithmetic of the compiled simulation is not used.

@@ -235,7 +235,7 @@ def _trace_amplitude(line: _DifferenceLine, to_s: float, step: int) -> tuple[Arr
     """Computes the points of a line that shows the difference between a run and its twin.
 
     A twin is a repetition of the run that received a small push. The difference is known in
-    intervals of 50 ms, and a point has the largest difference of several intervals. A
+    intervals of 50 ms, and a point shows the largest difference of several intervals. A
     difference that has decayed to rounding errors is pushed again. The line is interrupted
     between the parts (legs) from one push to the next.
 
