@@ -22,13 +22,13 @@ from trilat_net.analysis.link_summary import (
     predict_delivery,
     summarise_links,
 )
+from trilat_net.core.links import link_schedule as module
 from trilat_net.core.links.channel import LOST
+from trilat_net.core.links.link_schedule import first_ticks
 from trilat_net.core.step.site_step import Site
 from trilat_net.core.step.ticks import first_tick_at
 from trilat_net.errors import LogError
 from trilat_net.scenario import load_scenario, parse_scenario
-from trilat_net.scenario import sample_uses as module
-from trilat_net.scenario.sample_uses import first_ticks
 
 PERIOD_MS = 1.0
 

@@ -22,10 +22,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..core import AHEAD_LIMIT_NS, LOST, Array, DelayKind
+from ..core import AHEAD_LIMIT_NS, LOST, Array, DelayKind, LinkSchedule, first_ticks
 from ..log import Ints, Log, SiteLog
 from ..records import NS_PER_S
-from ..scenario import LinkSchedule, first_ticks
 from .aligned import Bools
 from .timeline import StatedModel, list_changes, list_stated_models
 

@@ -54,12 +54,9 @@ __all__ = [
     # Links and delays
     "ConstantDelay",
     "LinkBase",
-    "LinkSchedule",
     "NoDelay",
     "PictureDelay",
-    "draw_link_samples",
     "draw_used_samples",
-    "first_ticks",
     # Operators and environments
     "FAILED_HAND",
     "POLICY",
@@ -157,13 +154,7 @@ if TYPE_CHECKING:
         resolve_change,
         to_core_change,
     )
-    from .sample_uses import (
-        LinkSchedule,
-        PictureDelay,
-        draw_link_samples,
-        draw_used_samples,
-        first_ticks,
-    )
+    from .sample_uses import PictureDelay, draw_used_samples
     from .scenario_reader import (
         ExperimentText,
         embedded_names_reader,
@@ -212,9 +203,7 @@ else:
             "run_changes": (
                 "LinkTables make_site_order parse_core_change resolve_change to_core_change"
             ),
-            "sample_uses": (
-                "LinkSchedule PictureDelay draw_link_samples draw_used_samples first_ticks"
-            ),
+            "sample_uses": "PictureDelay draw_used_samples",
             "scenario_reader": (
                 "ExperimentText embedded_names_reader list_shipped load_scenario "
                 "parse_embedded parse_scenario read_source read_template reseed_scenario"
