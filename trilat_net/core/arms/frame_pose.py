@@ -1,4 +1,4 @@
-"""Computes with frames of bodies: products of poses, and inertias that move with their frame.
+"""Computes products of the poses of frames, and expresses inertias in other frames.
 
 The functions are plain Python, because the files of arms are read before any code is compiled.
 
@@ -46,8 +46,8 @@ class FramePose(NamedTuple):
     def __matmul__(self, inner: "FramePose") -> "FramePose":
         """Returns the product of two poses, which places one frame inside another.
 
-        The pose `inner` is expressed in the frame of this pose. The result is the same frame,
-        expressed in the frame in which this pose is expressed.
+        The pose `inner` is relative to the frame of this pose. The result is the pose of the
+        inner frame, relative to the frame to which this pose is relative.
         """
         x, y, z = self.turn(inner.origin_m)
         ox, oy, oz = self.origin_m
@@ -55,15 +55,15 @@ class FramePose(NamedTuple):
         return FramePose(rotation, (ox + x, oy + y, oz + z))
 
     def turn(self, vector: Three) -> Three:
-        """Returns a vector in the axes in which this pose is expressed.
+        """Rotates a vector from the axes of this frame to the axes of the outer frame.
 
         Args:
-            vector: The vector in the axes of the frame.
+            vector: The vector in the axes of this frame.
         """
         return multiply_vector(self.rotation, vector)
 
     def place_body(self, mass: float, tensor: Matrix) -> tuple[float, ...]:
-        """Returns the inertial parameters of a body in the frame that expresses this pose.
+        """Returns the inertial parameters of a body in the outer frame of this pose.
 
         The tensor I about the centre of mass is rotated, R I R^T, and moved to the origin of
         the other frame by the parallel axis theorem.
