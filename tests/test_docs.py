@@ -57,6 +57,7 @@ from trilat_net.files import find_page
 from trilat_net.log import accounting, log_file, mcap_reader, mcap_records, site_log
 from trilat_net.net import arm_client, offset, requests, session, timing, zenoh_config
 from trilat_net.scenario import laws, link_presets, operators, written_tables
+from trilat_net.scenario.delay_models import DELAY_MODELS
 from trilat_net.work import dask_cluster, executor
 
 ROOT = Path(__file__).parents[1]
@@ -409,6 +410,19 @@ def test_operators_environments_and_laws_stand_in_tables() -> None:
     assert [
         kind for kind in (*kinds, *laws.LAWS) if kind != "own" and f"| `{kind}` |" not in text
     ] == []
+
+
+def test_delay_models_and_formats_stand_in_pages() -> None:
+    links_page = (ROOT / "docs/reference/links.md").read_text(encoding="utf-8")
+    with (ROOT / "docs/data/delay-models.csv").open(newline="", encoding="utf-8") as stream:
+        listed_models = {row["model"] for row in csv.DictReader(stream)}
+    assert [model for model in DELAY_MODELS if f"`{model}`" not in links_page] == []
+    assert DELAY_MODELS.keys() - listed_models == set()
+
+    tools_page = (ROOT / "docs/logs/log-tools.md").read_text(encoding="utf-8")
+    exports = sorted((ROOT / "trilat_net/presentation/exports").glob("[!_]*.py"))
+    assert exports
+    assert [path.stem for path in exports if f"`{path.stem}`" not in tools_page] == []
 
 
 def test_threats_of_the_security_page_name_tests() -> None:

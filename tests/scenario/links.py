@@ -1,4 +1,4 @@
-"""Strategies for links: every delay model, with every optional key."""
+"""Strategies for links: every delay model that the kernel computes, with every optional key."""
 
 from typing import Any
 

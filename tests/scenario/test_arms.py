@@ -20,6 +20,7 @@ from trilat_net.scenario import load_scenario, parse_embedded
 from trilat_net.scenario.describe import list_arm_notes
 from trilat_net.scenario.named_files import SHIPPED_FOLDER
 from trilat_net.scenario.scenario_reader import reseed_scenario
+from trilat_net.scenario.simulated_arm import SimulatedArm
 from trilat_net.scenario.urdf import MAX_CHARACTERS, read_urdf
 
 ARM6, ARM7 = ((SHIPPED_FOLDER / f"arm{n}.urdf").read_text(encoding="utf-8") for n in (6, 7))
@@ -410,3 +411,15 @@ def test_joint_hands_stay_between_stops_and_limits() -> None:
     assert reach.find_nearest([-9.0] * 6) == (-1.0,) * 6
     planar = REACHES["planar"].find_joint_reach(MotionLimits(q_max=(1.0, 2.0)))
     assert planar.find_nearest([5.0, -5.0]) == (1.0, -5.0)
+
+
+@pytest.mark.parametrize("assign", [True, False])
+def test_changed_parameters_of_simulated_arms_act(assign: bool) -> None:
+    arm = SimulatedArm(load_scenario("two_sites"), "s")
+    effect = arm.accelerate([1.0, -0.5]) - arm.accelerate([0.0, 0.0])
+    if assign:
+        arm.theta = 2.0 * arm.theta
+    else:
+        arm.theta *= 2.0
+    heavy_effect = arm.accelerate([1.0, -0.5]) - arm.accelerate([0.0, 0.0])
+    np.testing.assert_allclose(heavy_effect, 0.5 * effect, rtol=1e-12)

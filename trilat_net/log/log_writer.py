@@ -439,7 +439,8 @@ class LogParts:
         opened: Function that opens a file by its path. If None, `LogFile` is used.
 
     Attributes:
-        current_accounts: Function that returns the accounts to write at the end of a full part.
+        current_accounts: Function that returns the accounts, which are the numbers of received
+            and missing messages of each topic. They are written at the end of a full part.
 
     Raises:
         UsageError: The name is in use, or the file cannot be created.

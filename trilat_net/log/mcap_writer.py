@@ -264,9 +264,9 @@ class McapWriter:
 
         Args:
             channel_id: Number of the channel, from `register_channel`.
-            log_time: Time of the arrival, in ns.
+            log_time: Time at which the message arrived, in ns.
             data: Bytes of the message.
-            publish_time: Time of the sending, in ns.
+            publish_time: Time at which the message was sent, in ns.
             sequence: Sequence number of the message.
         """
         chunk = self._open_chunk

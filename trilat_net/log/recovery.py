@@ -152,10 +152,10 @@ class Recovery(Result):
         self.lost_bytes += size
 
     def facts(self) -> dict[str, str]:
-        """Returns the recovered data and the losses as strings by name, for the recovered file.
+        """Returns a summary of what was recovered and what was lost, as strings by name.
 
-        They are stored as metadata of this file: the source file, the losses and the missing
-        records. A reader can thus recognise it as a recovered log.
+        The summary is stored as metadata in the recovered file: the source file, the losses
+        and the missing records. A reader can thus recognise the file as a recovered log.
         """
         losses = self.lost[:_MAX_LISTED_LOSSES]
         unlisted = len(self.lost) - len(losses)

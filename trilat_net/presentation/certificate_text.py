@@ -147,8 +147,9 @@ class CertificateLine(NamedTuple):
     """One line of a stability certificate: a sentence with a mark such as "ok" or "FAIL".
 
     Attributes:
-        mark: "ok" if the sentence supports that the run was stable, "FAIL" if it contradicts
-            it, "open" if it leaves the question open, and "note" for other sentences.
+        mark: "ok" if the sentence is evidence that the run was stable, "FAIL" if it is
+            evidence against it, "open" if it leaves the question open, and "note" for other
+            sentences.
         text: The sentence.
     """
 

@@ -74,7 +74,7 @@ def _describe_scans(analysis: LinearAnalysis) -> Iterator[str]:
 
 
 def describe_equilibrium(analysis: LinearAnalysis) -> Iterator[str]:
-    """Yields lines about the pose of rest (equilibrium) about which the arms were linearised.
+    """Yields lines that describe the equilibrium pose at which the arms were linearised.
 
     The lines state how the equilibrium was computed, its residual, and the pose of each arm. If
     all arms have the same joint angles, a single line states these angles.

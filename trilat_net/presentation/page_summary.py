@@ -81,9 +81,9 @@ The clause about a run that converged contains values, see `_explain_end`.
 
 
 def render_verdict(log: Log, certificate: Certificate, findings: Sequence[Finding]) -> Markup:
-    """Renders the judgement whether a run was stable, with the evidence for it.
+    """Renders the verdict on whether a run was stable, with the evidence for it.
 
-    The page of a run begins with this judgement.
+    The page of a run begins with this verdict.
 
     Args:
         log: Log of the run.

@@ -429,8 +429,8 @@ def add_joint_panels(
 ) -> _JointPanels:
     """Adds a panel per joint to a figure, and optionally a wide panel below them.
 
-    Two joints share their value axis. More joints have an axis each, because the torques of
-    wrists are much smaller than those of shoulders.
+    Two joints share one value axis. If there are more, each joint has its own, because the
+    torques of wrists are much smaller than those of shoulders.
 
     Args:
         figure: The Matplotlib figure.

@@ -132,10 +132,10 @@ def dotted_key(path: str) -> str:
 
 
 class Draws:
-    """Draws the numbers of a scenario whose author stated random distributions.
+    """Draws a number from each random distribution that a scenario states.
 
-    It also remembers them, so that the resolved scenario, in which every value is a number,
-    also states the distributions.
+    The object also records the distribution of each number, so that the resolved scenario
+    contains both the numbers and their distributions.
 
     Args:
         seed: Seed of the scenario.

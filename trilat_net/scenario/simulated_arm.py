@@ -51,7 +51,15 @@ class SimulatedArm:
         self.qd = np.array(spec.qd0_rad_s)
         self.chain = model.chain
         self.theta = heavier * model.theta
-        self._dynamics = ChainDynamics(self.chain, self.theta)
+
+    @property
+    def theta(self) -> Array:
+        return self._theta
+
+    @theta.setter
+    def theta(self, theta: Array) -> None:
+        self._theta = theta
+        self._dynamics = ChainDynamics(self.chain, theta)
 
     def accelerate(self, torque: ArrayLike) -> Array:
         """Computes the joint accelerations that a torque would cause, without moving the arm.

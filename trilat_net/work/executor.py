@@ -324,7 +324,7 @@ class WorkerPool:
             The number of an item, counted from 0, and its result.
 
         Raises:
-            RunFailed: An item killed its workers, or no workers are left.
+            RunFailed: An item crashed the workers that ran it, or no workers are left.
             UsageError: A worker does not meet the requirements.
         """
         if self._executor is None:
@@ -374,7 +374,7 @@ class WorkerPool:
         Args:
             function: Function at module level, so that another process can import it.
             items: The items, each of which is the argument of one call.
-            progress: Function that is called whenever an item has ended.
+            progress: Function that is called each time an item is finished.
             together: Function that replaces `function` for several items at once.
             together_count: Number of items that `together` should get.
 
@@ -382,7 +382,7 @@ class WorkerPool:
             The results in the order of the items. Empty if there are no items.
 
         Raises:
-            RunFailed: An item killed its workers, or no workers are left.
+            RunFailed: An item crashed the workers that ran it, or no workers are left.
             UsageError: A worker does not meet the requirements.
         """
         results: dict[int, R] = {}

@@ -360,13 +360,13 @@ class TwinGrowth(NamedTuple):
 
         Args:
             log: The log of the run.
-            end: The end of the run, which states the start of the judged part.
-            count: Number of twins. `None` for one push of every joint.
+            end: How the run ended, and from what time on it is judged.
+            count: Number of twins. If `None`, enough to push each joint (`Push.choose`).
             own_laws: True to run the code of control laws that are not part of this program.
 
         Returns:
-            The growth of the pushes. If the run cannot be repeated, the result contains no
-            pushes, and the reason.
+            How the effects of the pushes grow. If the run cannot be repeated, the result
+            contains no pushes and states the reason.
 
         Raises:
             LogError: A record cannot be read.
@@ -391,9 +391,9 @@ class TwinGrowth(NamedTuple):
 
         Args:
             scenario: The description of the experiment.
-            end: The end of the run, which states the start of the judged part.
+            end: How the run ended, and from what time on it is judged.
             duration_s: Length of the run, in s.
-            count: Number of twins. `None` for one push of every joint.
+            count: Number of twins. If `None`, enough to push each joint (`Push.choose`).
 
         Raises:
             ScenarioError: The scenario cannot run in virtual time.

@@ -350,9 +350,10 @@ def figure_command(
         width_in: Width of the figures in inches: one or two columns of a paper.
         folder: Folder for the figures; default: the name of FILE with -figures in place of
             .mcap.
-        others: Draw this log together with FILE in the same panels; repeatable. The figures are
-            overlay (largest values of all sites, a color per run), positions, tracking_errors
-            and control_torques (dashed lines). Their legend names the differing settings.
+        others: Draw this log together with FILE in the same panels; repeatable. Works for the
+            figures overlay (largest values of all sites, one color per run), positions,
+            tracking_errors and control_torques (dashed lines). The legend lists the settings
+            that differ.
     """
     log = laws.open(file)
     if listed:

@@ -183,8 +183,9 @@ def ping_command(
     any message type (docs/sessions/ros2.md).
 
     Options:
-        benchmark: Measure the network to --connect EP for this scenario instead, for several
-            message sizes, rates and transports. Without --connect, measure this machine alone.
+        benchmark: Instead, measure whether the network to --connect EP is good enough for this
+            scenario, for several message sizes, rates and transports. Without --connect,
+            measure this machine alone.
         ros2: Measure the delay of messages of this ROS 2 topic instead.
         seconds: Total duration of the benchmark, in s; default: 24. With --ros2: duration of
             the measurement, in s; default: 5. With --answer: time after which the command

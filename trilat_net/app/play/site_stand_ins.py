@@ -88,8 +88,8 @@ class PlayedHistory:
     Recorders request lost messages of a real session in the same way.
 
     Args:
-        kept_ns: Duration of the log for which messages are stored, in ns. If `None`, all
-            messages are stored.
+        kept_ns: How long a message is stored after it is played, in ns of the log's time. If
+            `None`, all messages are stored.
 
     Attributes:
         next_numbers: Number that follows the last played message, by channel.

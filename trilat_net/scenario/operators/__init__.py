@@ -60,7 +60,7 @@ class ActorBase(fields.Frozen, frozen=True, tag_field="kind"):
     """Base of all operators (models of persons) and environments, which push an arm.
 
     A subclass describes one kind by its keys in a scenario file, and converts them to numbers
-    for the compiled simulation. A file of this folder with such a class adds a kind.
+    for the compiled simulation. To add a kind, put a file with a subclass in this folder.
     """
 
     group: ClassVar[str] = "hands"

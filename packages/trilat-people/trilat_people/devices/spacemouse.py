@@ -79,8 +79,8 @@ class SpaceMouse:
     def read(self) -> DeviceState:
         """Returns the present state of the device, whose cap a person pushes by hand.
 
-        The deflection of the cap is a velocity. The method integrates the velocity to obtain a
-        position.
+        The deflection of the cap is read as a velocity, which this method integrates to obtain
+        a position.
 
         Returns:
             The position relative to the position at the time of connection, the velocity, and

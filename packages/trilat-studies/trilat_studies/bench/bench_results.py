@@ -287,8 +287,8 @@ class BenchCellResult(NamedTuple):
 
         Returns:
             The mean. With at least `LEAST_SEEDS` runs, it has a 95 % confidence interval.
-            `None` if a run lacks the quantity, or if the slave should touch a wall but missed
-            it in a run.
+            `None` if a run lacks the quantity, or if the slave was supposed to touch a wall
+            and did not in at least one run.
         """
         values = [getattr(run, quantity) for run in self.runs]
         if None in values or self.masked:

@@ -416,7 +416,7 @@ def measure_exponent(scenario: Scenario) -> float | None:
     A twin is a second execution of the run with a small push. The difference between the twin
     and the run changes as exp(exponent t), where t is the time, see `analysis.twin_growth`.
     Several twins are run. The result is the largest of their rates over the later part of the
-    run, which is also used to judge runs.
+    run, the part over which runs are judged.
 
     Args:
         scenario: Scenario of the run.
