@@ -54,6 +54,7 @@ class SimulatedArm:
 
     @property
     def theta(self) -> Array:
+        """Inertial parameters of the links, ten per link, see `core.chain`."""
         return self._theta
 
     @theta.setter
