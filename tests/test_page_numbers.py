@@ -447,7 +447,7 @@ PAGES: dict[str, dict[str, Make]] = {
     "docs/tutorials/lab-answers.md": LAB,
     "docs/theory/port-results.md": PORTS,
     "docs/studies/ports.md": {
-        "not passive at {}-{} Hz; least eigenvalue {} at {} Hz; {} N m s/rad more": list_lacking_numbers,
+        "not passive at {}-{} Hz; least eigenvalue {} at {} Hz; adding {} N m s/rad": list_lacking_numbers,
     },
     "docs/reference/laws-adaptive.md": {"towards one pose: {} N m/rad": lambda: [G**2 * 1.2]},
     "docs/theory/linear-method.md": LINEAR_METHOD,

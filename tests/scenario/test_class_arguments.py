@@ -43,7 +43,7 @@ def test_unknown_arguments_are_named_with_known_ones() -> None:
         (Any1, {"K": "abc"}, "its argument K must be a number, but is 'abc'"),
         (Any1, {"K": [1.0]}, "its argument K must be a number"),
         (Any1, {"name": 3}, "its argument name must be a text, but is 3"),
-        (Needs, {}, "needs a value of its argument K"),
+        (Needs, {}, "needs a value for its argument K"),
         (Needs, {"K": 1, "count": "many"}, "its argument count must be a number"),
         (Needs, {"K": 1, "other": 2}, "takes the arguments K, count, name"),
     ],
