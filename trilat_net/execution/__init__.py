@@ -29,12 +29,9 @@ __all__ = [
     "group_runs",
     "prepare_lanes",
     # Execution of a log
-    "LinkEffect",
     "LogCheckReport",
     "Rerun",
-    "SiteEffect",
     "check_log_files",
-    "describe_rerun_changes",
     "rerun",
     "verify",
     # Twins
@@ -53,7 +50,6 @@ if TYPE_CHECKING:
     from .lanes.lane_structure import describe_structure
     from .lanes.run_groups import RunGroup, group_runs, prepare_lanes
     from .log_checks import LogCheckReport, check_log_files
-    from .rerun_execution import describe_rerun_changes
     from .twins import LEAST_PUSH, MOST_PUSH, PUSH_RAD, SMALLEST, Push, TwinPath, Twins
     from .unwritten_run import simulate_columns
     from .verification import verify
@@ -65,7 +61,7 @@ if TYPE_CHECKING:
         simulate_scenario,
     )
     from .virtual_comparison import find_absent_samples, simulate_without_operators
-    from .what_if import LinkEffect, Rerun, SiteEffect, rerun
+    from .what_if import Rerun, rerun
 else:
     __getattr__ = import_on_use(
         __name__,
@@ -75,7 +71,6 @@ else:
             "lanes.lane_structure": "describe_structure",
             "lanes.run_groups": "RunGroup group_runs prepare_lanes",
             "log_checks": "LogCheckReport check_log_files",
-            "rerun_execution": "describe_rerun_changes",
             "twins": "LEAST_PUSH MOST_PUSH PUSH_RAD Push SMALLEST TwinPath Twins",
             "unwritten_run": "simulate_columns",
             "verification": "verify",
@@ -83,6 +78,6 @@ else:
                 "SimulatedLog check_virtual execute_virtual record_virtual simulate_scenario"
             ),
             "virtual_comparison": "find_absent_samples simulate_without_operators",
-            "what_if": "LinkEffect Rerun SiteEffect rerun",
+            "what_if": "Rerun rerun",
         },
     )

@@ -40,12 +40,12 @@ from ..log import (
     VIZ_HZ,
     Account,
     Log,
+    LogContents,
     LogFile,
     LogWriter,
     Sink,
     collect_provenance,
     compute_virtual_boot,
-    read_contents,
 )
 from ..net import (
     SENT_TIME_SINCE,
@@ -726,7 +726,7 @@ class SimulatedLog(Log):
         stream = io.BytesIO()
         write(stream, 0.0)
         stream.seek(0)
-        super().__init__(read_contents(stream, "log", trusted=True))
+        super().__init__(LogContents.read(stream, "log", trusted=True))
         self._write = write
 
     def save(self, path: str | Path, *, force: bool = False) -> Path:

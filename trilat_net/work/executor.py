@@ -507,7 +507,7 @@ def open_worker_pool(
     on: Workers = None,
     *,
     most: int | None = None,
-    laws: Sequence[Any] = (),
+    laws: Sequence[tuple[str, str]] = (),
     hint: str = "",
 ) -> Iterator[WorkerPool]:
     """Starts the worker processes of a study, or connects to those of a cluster.
@@ -520,7 +520,8 @@ def open_worker_pool(
             this process.
         on: Workers to use instead of processes of this machine.
         most: Number of items, so that no more processes are started.
-        laws: Imported control laws that the items need. Each worker must have their files.
+        laws: Name of each imported class that the items need, with the SHA-256 of its file.
+            Each worker must have the files.
         hint: Advice for the user that follows the message about a dead worker.
 
     Raises:

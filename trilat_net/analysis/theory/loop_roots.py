@@ -40,7 +40,7 @@ from ...scenario import ConstantDelay, LinkBase, Scenario
 from ..blas_threads import limit_blas_threads
 from ..decision_facts import LoopRoots
 from ..delay_period import find_final_link, is_ending_trace
-from ..dominance_history import has_program_hand, list_program_sites
+from ..dominance_history import list_program_sites
 from ..run_end import SETTLED_SPEED_RAD_S, RunTrace, trace_log
 from ..timeline import list_effective_commands, recorded_end_s
 from .characteristic_roots import Spectrum, compute_delay_spectrum
@@ -241,7 +241,7 @@ def find_run_loop(scenario: Scenario, run: FusedRun) -> _EndLoop:
             theta_hat.append(record[columns["theta_hat"]])
         state = _choose_end_state(ended, trace, theta_hat)
     loop = _build_end_loop(final, state, trace, own_laws=True)
-    programs = [site for site in scenario.names if has_program_hand(scenario, site)]
+    programs = [site for site in scenario.names if scenario.sites[site].has_program_hand]
     return loop._replace(programs=tuple(programs))
 
 
