@@ -8,8 +8,8 @@ from trilat_studies.sweep.sweep_plan import plan_sweep
 
 import trilat_net as tn
 from trilat_net.analysis import SETTLED_ERROR_RAD, RunTrace, judge_virtual_run
+from trilat_net.core.lanes.run_groups import group_runs
 from trilat_net.execution.fused import FusedRun
-from trilat_net.execution.lanes.run_groups import group_runs
 
 CELLS = 64
 DURATION_S = 20.0

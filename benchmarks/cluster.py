@@ -14,7 +14,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from trilat_studies.sweep import plan_sweep
-from trilat_studies.sweep.sweep_run import CellItem, run_cell
+from trilat_studies.sweep.sweep_run import CellItem
 
 from trilat_net.work.executor import open_worker_pool, run_batch
 from trilat_net.workers import worker_pool
@@ -63,9 +63,9 @@ def started_cluster(folder: Path) -> Iterator[str]:
 
 def pool_cells_per_s(tasks: list[CellItem], on: str | None) -> float:
     with open_worker_pool(None if on else WORKERS, on) as pool:
-        pool.map(run_cell, tasks[:WARMED])
+        pool.map(CellItem.run, tasks[:WARMED])
         begun = time.perf_counter()
-        pool.map(run_cell, tasks)
+        pool.map(CellItem.run, tasks)
         return len(tasks) / (time.perf_counter() - begun)
 
 
@@ -84,7 +84,7 @@ def plain_cells_per_s(tasks: list[CellItem]) -> float:
         for share in (tasks[:WARMED], tasks):
             began = time.perf_counter()
             parts = [
-                executor.submit(run_batch, run_cell, share[n::WORKERS], None, {})
+                executor.submit(run_batch, CellItem.run, share[n::WORKERS], None, {})
                 for n in range(WORKERS)
             ]
             for part in parts:
@@ -96,7 +96,7 @@ def run() -> list[str]:
     sweep = plan_sweep("free", ["duration_s=20.0"], over=[OVER], longest_s=20.0)
     tasks = [CellItem(sweep, sweep.cell(n), sweep.seeds[0]) for n in range(sweep.cells)]
     for task in tasks[:3]:
-        run_cell(task)
+        task.run()
     rounds = [
         (plain_cells_per_s(tasks), pool_cells_per_s(tasks, None), cluster_cells_per_s(tasks))
         for _ in range(REPEATS)

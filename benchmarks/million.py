@@ -14,7 +14,7 @@ from trilat_studies.sweep import prepare_sweep_folder, run_sweep, sweep_run
 from trilat_studies.sweep.sweep_cell import CellRun
 from trilat_studies.sweep.sweep_plan import plan_sweep
 from trilat_studies.sweep.sweep_results import summarize_sweep
-from trilat_studies.sweep.sweep_run import CellItem, open_sweep_folder, run_cell
+from trilat_studies.sweep.sweep_run import CellItem, open_sweep_folder
 
 SIDE = 1000
 """Number of values of each of the two axes."""
@@ -31,7 +31,7 @@ def run() -> list[str]:
         over=[f"control.Kd=2:{2 + (SIDE - 1) / 1000}:0.001", f"control.Kp=1:{SIDE}:1"],
         longest_s=0.05,
     )
-    real = run_cell(CellItem(plan, plan.cell(0), 1))
+    real = CellItem(plan, plan.cell(0), 1).run()
     before_mb = _read_mb("VmRSS")
     times_s = [time.process_time()]
     part = plan.cells // PARTS
@@ -47,7 +47,8 @@ def run() -> list[str]:
 
     lane_site_ticks = sweep_run.LANE_SITE_TICKS
     sweep_run.LANE_SITE_TICKS = 10**12  # the judge answers for one cell at a time
-    sweep_run.run_cell = answer
+    run_cell = CellItem.run
+    CellItem.run = answer  # type: ignore[method-assign]
     try:
         with tempfile.TemporaryDirectory() as scratch:
             folder = prepare_sweep_folder(plan, Path(scratch) / "sweep")
@@ -62,7 +63,7 @@ def run() -> list[str]:
             summary_s = time.process_time() - swept_s
             count = len(finished.results.rows)
     finally:
-        sweep_run.run_cell = run_cell
+        CellItem.run = run_cell  # type: ignore[method-assign]
         sweep_run.LANE_SITE_TICKS = lane_site_ticks
     # The first part after the interruption begins with reading the journal.
     steps_s = [after - at for at, after in itertools.pairwise(times_s)]

@@ -4,7 +4,6 @@ from pathlib import Path
 from typing import Any
 
 from trilat_people.experiment.experiment_run import Experiment, Note
-from trilat_people.experiment.questionnaires import find_form
 
 TEXT = """
 name = "short"
@@ -73,6 +72,6 @@ def answer_form(
 ) -> None:
     """Adds the answers of a participant to a questionnaire; None is a question without an answer."""
     items = [item for item in experiment.plan.protocol.questionnaires if item.name == form]
-    answers = find_form(items[0]).read(values)
+    answers = items[0].find_form().read(values)
     with experiment.open_notes() as notes:
         notes.add(Note(cell, "questionnaire", who, number, 0.0, form, answers))

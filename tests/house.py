@@ -23,6 +23,7 @@ BELOW_ALL = {
 
 INTERFACES = (
     "trilat_net.log.ros2",
+    "trilat_net.net.ros2",
     *("trilat_net.core", "trilat_net.laws", "trilat_net.own_code", "trilat_net.scenario"),
     *("trilat_net.net", "trilat_net.log", "trilat_net.execution", "trilat_net.analysis"),
     *("trilat_net.presentation", "trilat_net.work", "trilat_net.app", "sites", "recorder"),

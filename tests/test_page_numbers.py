@@ -18,10 +18,10 @@ import pytest
 from scipy.optimize import brentq
 from scipy.stats import uniform
 from trilat_studies.sweep.sweep_cell import CellClass, classify_cell
-from trilat_studies.tuning.candidate import CandidateScore, measure_candidate
+from trilat_studies.tuning.candidate import CandidateScore
 from trilat_studies.tuning.search_space import (
     SEARCH_SPACES,
-    build_model_information,
+    ModelInformation,
     select_search_spaces,
 )
 
@@ -609,7 +609,7 @@ def score_candidate(duration_s: float, changes: Changes) -> CandidateScore:
     scenario = load_scenario(
         "free", {"limits.tau_limit_nm": 60, "duration_s": duration_s, **changes}
     )
-    return measure_candidate(scenario.text, None)
+    return CandidateScore.measure(scenario.text, None)
 
 
 def test_the_table_of_tuned_gains_has_every_range() -> None:
@@ -637,7 +637,7 @@ def test_gains_repeat_the_ends_of_fronts(row: int) -> None:
     values = {
         name: float(number) for name, number in (gain.split() for gain in gains.split(", "))
     }
-    controls = space.controls(load_scenario("free"), build_model_information(100.0), values)
+    controls = space.controls(load_scenario("free"), ModelInformation.of_gravity(100.0), values)
     scores = score_candidate(
         30.0 if row < 4 else 6.0,
         {f"sites.{name}.control": table for name, table in controls.items()},

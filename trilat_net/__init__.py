@@ -123,11 +123,11 @@ _NAMES = {
         "load_scenario new_hand new_law new_plant read_template"
     ),
 }
-"""The public names that each module or interface has, separated by spaces."""
+"""Public names of each module or package interface, separated by spaces."""
 _MODULES = {name: module for module, names in _NAMES.items() for name in names.split()}
-"""For each public name the module or interface that has it."""
+"""The module or package interface that defines each public name."""
 _PACKAGE_NAMES = " ".join(_PACKAGE_FUNCTIONS.values()).split()
-"""The public names of packages of their own, such as trilat-studies."""
+"""Public names that optional packages such as trilat-studies define."""
 __all__ = sorted(["__version__", *_MODULES, *_PACKAGE_NAMES])
 
 
@@ -151,13 +151,14 @@ def __getattr__(name: str) -> _Any:
 
 
 def _is_added(name: str) -> bool:
-    """Returns True if another installed package adds a name.
+    """Returns True if another installed package adds a name to `trilat_net`.
 
-    Before Python imports a module of this package, it asks for an attribute of that name. Such
-    names are recognised by their files, because reading the entry points takes milliseconds.
+    Before Python imports a submodule, it looks up an attribute of the same name. The names of
+    submodules are recognised by their files, because reading the entry points takes
+    milliseconds.
 
     Args:
-        name: The name.
+        name: Name of the attribute.
     """
     folders_and_modules = [
         f"{folder}/{name}{ending}" for folder in __path__ for ending in ("", ".py")
@@ -172,11 +173,11 @@ def _is_added(name: str) -> bool:
 
 
 def _import_name(name: str) -> _Any:
-    """Imports the public function or class of a name, for example `trilat_net.simulate`.
+    """Imports a public function or class by its name, for example `trilat_net.simulate`.
 
-    If a package that it needs is missing, the result is a function that raises UsageError when
-    it is called. Raising the error here would be wrong, because programs look up names without
-    using them (`hasattr`, `dir`, completion in an editor).
+    If a package that the function needs is missing, the result is a stand-in that raises
+    UsageError when it is called. Raising the error here would be wrong, because programs look
+    up names without using them (`hasattr`, `dir`, completion in an editor).
     """
     from .errors import UsageError
 
@@ -197,8 +198,8 @@ def _import_name(name: str) -> _Any:
 def _make_stand_in(name: str, problem: str) -> _Any:
     """Returns a function that raises UsageError when it is called.
 
-    It takes the place of a public function that cannot be imported, for example because a
-    package that it needs is not installed.
+    The stand-in replaces a public function that cannot be imported, for example because an
+    optional package is not installed.
 
     Args:
         name: Public name of the function or class that cannot be imported.

@@ -18,7 +18,7 @@ from contextlib import suppress
 
 
 def main() -> None:
-    """Runs the command that the command line names, as the program `trilat`.
+    """Runs the command given on the command line. This is the entry point of `trilat`.
 
     The command `trilat stop` is executed before the rest of the program is loaded, so that it
     stops arms without delay.
@@ -46,7 +46,7 @@ def main() -> None:
 
 
 def _run() -> None:
-    """Runs the command that the command line names.
+    """Runs the command given on the command line.
 
     Two commands are handled before the others are loaded: `stop`, so that arms stop without
     delay, and the hidden command `start-processes`, which starts the processes of a session by
@@ -88,7 +88,7 @@ def _exit_before_zenoh(code: int | None) -> None:
     Otherwise Python would shut down before the threads of Zenoh, which then abort the process.
 
     Args:
-        code: The exit code. None if an exception ends the process, which Python has to report.
+        code: The exit code. None if an exception ends the process; Python then reports it.
     """
     if code is not None and "zenoh" in sys.modules:
         with suppress(OSError):  # Python reports this error itself

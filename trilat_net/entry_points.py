@@ -1,9 +1,10 @@
 """Finds the commands, functions and viewers that other installed packages add to this program.
 
-For example, a package can add `trilat log lag`. It lists the command in its pyproject.toml as
-an entry point, which is the name of an object (docs/develop/packages.md). This program reads
-the names without importing the package, and imports the object when somebody uses it. Optional
-packages of this program, such as trilat-studies, add their commands in the same way.
+For example, a package can add `trilat log lag`. The package lists the command in its
+pyproject.toml as an entry point, which is the name of an object (docs/develop/packages.md).
+This program reads the names without importing the package, and imports the object when somebody
+uses it. Optional packages of this program, such as trilat-studies, add their commands in the
+same way.
 
 Invariant:
     - A name that this program defines itself is never replaced.
@@ -20,13 +21,13 @@ from .errors import UsageError
 from .package_names import PACKAGE_COMMANDS, PACKAGE_FUNCTIONS, PACKAGE_HOOKS
 
 COMMANDS = "trilat_net.commands"
-"""Group of the commands. A name is that of the command, with a hyphen for each space."""
+"""Group of the commands. Each name is a command with a hyphen in place of each space."""
 FUNCTIONS = "trilat_net.api"
 """Group of the functions and classes of the Python interface."""
 VIEWS = "trilat_net.views"
-"""Group of the viewers that `trilat log view --in` opens a log in, by their names."""
+"""Group of the viewers in which `trilat log view --in` can open a log."""
 HOOKS = "trilat_net.hooks"
-"""Group of what methods of this program call in packages of this program, see `hooks`."""
+"""Group of the functions that `hooks` looks up in the optional packages of this program."""
 
 _PACKAGE_OF = {
     COMMANDS: {name: package for package, names in PACKAGE_COMMANDS.items() for name in names},
@@ -44,8 +45,8 @@ _PACKAGE_OF = {
 def find_entries(group: str) -> dict[str, EntryPoint]:
     """Returns the commands, functions or viewers that installed packages add, by their names.
 
-    The packages are not imported. An entry with the name of something in a package of this
-    program, such as trilat-studies, counts only if it is from that package.
+    The packages are not imported. A name that belongs to an optional package of this program,
+    such as trilat-studies, is accepted only from that package.
 
     Args:
         group: `COMMANDS`, `FUNCTIONS`, `VIEWS` or `HOOKS`.
@@ -61,9 +62,10 @@ def find_entries(group: str) -> dict[str, EntryPoint]:
 
 
 def find_package(group: str, name: str) -> str:
-    """Returns which optional package of this program, such as trilat-studies, contains a name.
+    """Returns the optional package, such as trilat-studies, that defines a name.
 
-    The result is "" if none does. With it, an error can tell the user what to install.
+    An error can then tell the user which package to install. The result is "" if no optional
+    package defines the name.
 
     Args:
         group: `COMMANDS`, `FUNCTIONS`, `VIEWS` or `HOOKS`.
@@ -80,20 +82,20 @@ def load_entry(group: str, name: str, use: str) -> Any:
     Args:
         group: `COMMANDS`, `FUNCTIONS`, `VIEWS` or `HOOKS`.
         name: Name of the entry point.
-        use: What the object is to a user, as in "trilat sweep", for the error.
+        use: How a user calls the object, as in "trilat sweep", for the error message.
 
     Returns:
         The object, or None if there is no such name.
 
     Raises:
-        UsageError: The package of this program that has the name is not installed, or the
-            package of another author cannot be imported.
+        UsageError: The optional package that defines the name is not installed, or another
+            author's package cannot be imported.
     """
     entry = find_entries(group).get(name)
     package = find_package(group, name)
     if entry is None:
         if package:
-            raise UsageError(f"{use} is in a package of its own: pip install {package}")
+            raise UsageError(f"{use} is in a separate package: pip install {package}")
         return None
     if package:
         return entry.load()  # an error in a package of this program is a bug: do not hide it
@@ -107,9 +109,9 @@ def load_entry(group: str, name: str, use: str) -> Any:
 
 
 def find_viewer(name: str) -> Callable[[Sequence[Path]], None]:
-    """Returns the function by which another package shows logs, from the group `VIEWS`.
+    """Returns the function with which another package displays logs (group `VIEWS`).
 
-    The function gets the paths of the log or of its parts, and returns when the log is shown.
+    The function takes the paths of the files of a log, and returns once the log is displayed.
 
     Args:
         name: Name of the viewer.

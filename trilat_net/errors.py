@@ -85,7 +85,7 @@ class TrilatError(Exception):
 class UnknownName(TrilatError, KeyError):  # noqa: N818 - it names an outcome
     """A name that a result does not contain, for example of an arm that is not in a log.
 
-    The error is also a KeyError, as for a dictionary.
+    The error is also a KeyError, so a result behaves like a dictionary in this respect.
     """
 
     exit_code = 2
@@ -117,7 +117,7 @@ class CodeWithheld(ScenarioError):  # noqa: N818 - it names an outcome
     """A user's code that a log names, but that is not allowed to run on this machine.
 
     The code is a control law, an operator (a program that moves an arm), or a plant (a
-    simulation of an arm). The user of this machine has to allow it first, because a log of
+    simulation of an arm). The user of this machine has to allow it first, because a log from
     somebody else may name harmful code.
     """
 
@@ -136,11 +136,12 @@ class UsageError(TrilatError):
 class WireError(TrilatError):
     """Network message from another machine that is not a valid message of this program.
 
-    The receiver drops and counts it; the sender may be a stranger or another version.
+    The receiver drops the message and counts it. The sender may be another program, or another
+    version of this one.
 
     Args:
-        reason: Category of the problem, by which refused payloads are counted.
-        detail: What is wrong with this payload, for the message of the error.
+        reason: Category of the problem, under which rejected payloads are counted.
+        detail: What is wrong with this payload, for the error message.
     """
 
     def __init__(self, reason: str, detail: str) -> None:
@@ -170,7 +171,7 @@ class LogError(TrilatError):
 class LogRefused(LogError):  # noqa: N818 - it names an outcome
     """An output that the disk refused to store, for example because the disk is full.
 
-    Data of the log that was written before is kept and can be read.
+    Log data that was written before the failure is kept and can be read.
     """
 
     exit_code = 5
@@ -179,7 +180,7 @@ class LogRefused(LogError):  # noqa: N818 - it names an outcome
 class NotRepeatable(LogError):  # noqa: N818 - it names an outcome
     """A run that cannot be computed again from its log.
 
-    The message gives the reason, for example that the log lacks what an arm received.
+    The message gives the reason, for example that the log lacks the data that an arm received.
     """
 
 
@@ -190,10 +191,10 @@ class NothingSaved(LogError):  # noqa: N818 - it names an outcome
 
 
 class RunFailed(TrilatError):  # noqa: N818 - it names an outcome, as the exit summary does
-    """A run or a comparison of runs that was executed, but with a bad outcome.
+    """A run, or a comparison of runs, that was completed but had a bad outcome.
 
-    For example, an arm became unstable, a process died, or two runs differ that should be
-    equal.
+    For example, an arm became unstable, a process died, or two runs that should be equal
+    differ.
     """
 
 
@@ -213,7 +214,7 @@ class CodeFailed(RunFailed):
         site: Name of the site that ran the code.
         code: The class, as in "package.module:Law".
         tick: Tick (period of the control loop) in which the code failed. None if the code
-            failed before a tick, when its state was restored.
+            failed while its state was restored, before any tick.
     """
 
     kind: ClassVar[str] = "code"
@@ -229,14 +230,14 @@ class CodeFailed(RunFailed):
     def __reduce__(self) -> tuple[object, ...]:
         """Returns what pickle needs to rebuild the error with all its facts.
 
-        Worker processes report errors to the process that started them by pickle.
+        Worker processes use pickle to report errors to the process that started them.
         """
         rebuild = partial(type(self), site=self.site, code=self.code, tick=self.tick)
         return rebuild, (self.problem,)
 
 
 class LawFailed(CodeFailed):
-    """A user's control law that raised an exception, was too slow, or had unusable results.
+    """A user's control law that raised an exception, was too slow, or returned bad results.
 
     A control law is the class that computes the torques of an arm.
     """
@@ -245,7 +246,7 @@ class LawFailed(CodeFailed):
 
 
 class PlantFailed(CodeFailed):
-    """A user's arm model that raised an exception, was too slow, or had unusable results.
+    """A user's arm model that raised an exception, was too slow, or returned bad results.
 
     The model is called a plant: a class that computes the motion of an arm from its torques.
     """
@@ -254,9 +255,9 @@ class PlantFailed(CodeFailed):
 
 
 class RuntimeFault(TrilatError):  # noqa: N818 - programs catch it by this name
-    """A state that the program must never reach, which shows a bug of the program itself.
+    """A state that the program must never reach. It means that the program has a bug.
 
-    Users cannot correct it, and should report it.
+    Users cannot correct the bug, and should report it.
     """
 
 
@@ -281,7 +282,7 @@ def count_nouns(count: object, singular: str, plural: str = "") -> str:
 def format_wall_time(seconds: float) -> str:
     """Returns a duration as a string with a readable unit, as in "2.5 h".
 
-    A larger unit is used from one and a half units on, and days from two days on.
+    Durations of at least 1.5 min, 1.5 h or 2 days are given in minutes, hours or days.
 
     Args:
         seconds: The duration, in s.
@@ -300,7 +301,7 @@ def pluralise(singular: str) -> str:
         singular: The noun, possibly with words before it, as in "late sample".
 
     Returns:
-        The same words, with the last one in the plural.
+        The same words, with the last word in the plural.
     """
     *before, noun = singular.split(" ")
     if noun in _IRREGULAR:
@@ -315,16 +316,16 @@ def pluralise(singular: str) -> str:
 
 
 MOST_LETTERS = 80
-"""Length of the longest word for which `suggest_nearest` compares."""
+"""Length of the longest word that `suggest_nearest` compares with valid words."""
 MOST_COMPARED = 500
 """Largest number of words that `suggest_nearest` compares.
 
-The time of the comparison grows faster than the product of their number and their length.
+The computing time grows faster than the product of the number of words and their length.
 """
 
 
 _UNIT_ENDINGS = ("deg", "hz", "kg", "m", "ms", "n", "nm", "ns", "rad", "s", "us")
-"""Units at the end of keys, in small letters."""
+"""Units that may end a key, in lower case."""
 
 
 def suggest_nearest(word: str, valid: Sequence[str], elsewhere: Sequence[str] = ()) -> str:
@@ -350,11 +351,11 @@ def suggest_nearest(word: str, valid: Sequence[str], elsewhere: Sequence[str] = 
 
 
 def find_nearest(word: str, valid: Sequence[str], elsewhere: Sequence[str] = ()) -> str:
-    """Returns the valid word that is most similar to an unknown word, which a user misspelt.
+    """Returns the valid word that a user probably meant by an unknown word.
 
     The arguments are those of `suggest_nearest`. Upper and lower case count as equal. A word
-    that is equal but for its case has priority, first among the valid words and then elsewhere.
-    The result is empty if no word is similar.
+    that differs only in case has priority: first among the words `valid`, then among
+    `elsewhere`. The result is empty if no word is similar.
     """
     if len(word) > MOST_LETTERS:
         return ""
@@ -373,7 +374,7 @@ def find_nearest(word: str, valid: Sequence[str], elsewhere: Sequence[str] = ())
         if sought in choice:
             return choice[sought]
 
-    # Elsewhere there are many words, so that a faint similarity among them means nothing.
+    # `elsewhere` has many words, so a weak similarity to one of them means nothing.
     least_similarities = (0.5, 0.7)
     for choice, least_similarity in zip(choices, least_similarities, strict=True):
         matches = get_close_matches(sought, list(choice), n=1, cutoff=least_similarity)
@@ -383,13 +384,13 @@ def find_nearest(word: str, valid: Sequence[str], elsewhere: Sequence[str] = ())
 
 
 def _prepare_choices(suggestions: Mapping[str, str]) -> dict[str, str]:
-    """Returns suggestions for misspelt words, by what a user may have meant to type.
+    """Returns the words to compare with a misspelt word, each with the text to suggest.
 
     Upper and lower case count as equal. Users also forget the unit at the end of a key: "delay"
     and "dely" mean "delay_ms". Therefore each key is listed with and without its unit.
 
     Args:
-        suggestions: For each valid word the text to suggest.
+        suggestions: The text to suggest for each valid word.
     """
     choices: dict[str, str] = {}
     for word, suggestion in suggestions.items():
@@ -403,7 +404,10 @@ def _prepare_choices(suggestions: Mapping[str, str]) -> dict[str, str]:
 
 
 def join_words(words: Iterable[str]) -> str:
-    """Joins words for a sentence: "m1, m2 and s", "m1 and s", "s", and nothing for no words."""
+    """Joins words into a list for a sentence, such as "m1, m2 and s" or "m1 and s".
+
+    The result is empty if there are no words.
+    """
     texts = list(words)
     if len(texts) < 2:
         return "".join(texts)
@@ -431,7 +435,7 @@ def join_arguments(arguments: Iterable[str]) -> str:
 
 
 def describe_exception(error: BaseException) -> str:
-    """Returns an exception of a user's code in one line, with the place where it was raised.
+    """Describes an exception in a user's code in one line, with the place where it was raised.
 
     The place is the innermost line that belongs neither to this program nor to a library. For
     example: "NameError: name 'nw' is not defined (mylaw.py, line 14)".
@@ -442,7 +446,7 @@ def describe_exception(error: BaseException) -> str:
     kind = type(error).__name__
     lines = str(error).strip().splitlines()
     text = f"{kind}: {lines[0]}" if lines else kind
-    # The message of a syntax error names the place itself.
+    # The message of a syntax error already names the place.
     if isinstance(error, SyntaxError):
         return text
     # Imported here, because `trilat stop` imports this module and describes no exception.
@@ -458,12 +462,12 @@ def describe_exception(error: BaseException) -> str:
 
 
 def _is_users_file(name: str) -> bool:
-    """Returns True if a source file is a user's, and not of this program or a library.
+    """Returns True if a source file belongs to a user, not to this program or a library.
 
     The place of an error is reported in the user's file, where it can be corrected.
 
     Args:
-        name: Name of the file in a traceback. That of code without a file is "<string>".
+        name: Name of the file in a traceback. Code without a file has the name "<string>".
     """
     file = Path(name)
     if name.startswith("<") or "site-packages" in file.parts:

@@ -1,4 +1,4 @@
-"""Lets other packages add commands to `trilat`: the names that they may import.
+"""Defines the names that other packages import to add commands to `trilat`.
 
 A package declares the function of its command with `command`, and registers the command as an
 entry point (docs/develop/packages.md). The names of this module and of `trilat_net` stay the

@@ -3,7 +3,7 @@
 A scenario is a TOML file that describes an experiment with several robot arms. Each of its
 tables becomes an object of a subclass of `Frozen`. Annotations say what a value may be:
 `Positive` limits the range of a number, and `Joints` requires one number per joint of the arm.
-`scenario.key_checks` checks what these types do not state.
+`scenario.key_checks` checks the rules that these types cannot state.
 
 Invariant:
     - An error names the path of the key as the author of the scenario wrote it.
@@ -39,8 +39,8 @@ def find_kinds(package: str, base: type[K]) -> Iterator[type[K]]:
     """Yields the classes that a scenario can select by name, as in `kind = "wall"`.
 
     To add a kind, add a file to the package; there is no other list. Classes without a tag
-    (name) of their own are only bases of others, and are left out. The order is that of the
-    files, and of the positions in each file.
+    (name) of their own serve only as base classes, and are left out. The classes are in the
+    order of their files, and of their positions in each file.
 
     Args:
         package: Dotted name of the package whose files are searched.
@@ -51,7 +51,7 @@ def find_kinds(package: str, base: type[K]) -> Iterator[type[K]]:
         name = f"{package}.{file.name}"
         for value in vars(import_module(name)).values():
             is_subclass = isinstance(value, type) and issubclass(value, base)
-            # A class that the file only imports is found in its own file.
+            # A class that this file imports is listed with the file that defines it.
             if not is_subclass or value.__module__ != name:
                 continue
             tag = value.__struct_config__.tag
@@ -89,7 +89,7 @@ TomlTable = dict[str, Any]
 
 
 class KeyProblem(NamedTuple):
-    """What is wrong with one key of a scenario's table, before it becomes an error message.
+    """Problem with one key in a table of a scenario, from which an error message is made.
 
     Attributes:
         key: Path of the key below the checked table. Empty for the table itself.
@@ -123,7 +123,7 @@ _TYPE_NAMES = {
     "array": "a list",
     "object": "a table",
 }
-"""Names of the types of TOML, by the name that msgspec gives them."""
+"""The TOML name of each type, by the name that msgspec uses."""
 WITHOUT_QUOTES = ": write it without quotes and unit, which the key's name states"
 
 
@@ -153,7 +153,7 @@ def _reword_types(quoted: re.Match[str]) -> str:
     Example: "`float | null`" becomes "a number". Null is left out, because TOML has no null.
 
     Args:
-        quoted: Match of the quoted types, without their backquotes as group 1.
+        quoted: Match of the quoted types. Group 1 is the text between the backquotes.
     """
     types = quoted[1].split(" | ")
     return " or ".join(_TYPE_NAMES.get(name, name) for name in types if name != "null")
@@ -177,7 +177,7 @@ UNITS = {
     "nm_rad": "N m/rad",
     "nm_s_rad": "N m s/rad",
 }
-"""Units by the ending of names, as in delay_ms."""
+"""The unit for each ending of a name, such as "ms" for delay_ms."""
 
 
 def split_unit(name: str) -> tuple[str, str]:

@@ -7,7 +7,7 @@ Invariant:
     - An existing output is replaced only if the caller allows it with `force`.
     - A file or folder gets its final name only when it is complete. A program that dies while
       it writes therefore leaves no output that looks complete.
-    - An output is never written through a symbolic link, also within an output folder.
+    - An output is never written through a symbolic link, not even inside an output folder.
       Otherwise, the author of the link could choose which file is overwritten.
     - An optional package is imported where it is used. If it is missing, the error names the
       command that installs it.
@@ -34,7 +34,7 @@ from .errors import LogError, LogRefused, TrilatError, UsageError
 from .package_names import PACKAGE_COMMANDS
 
 DISK_ERRNOS = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO})
-"""System errors with which a disk refuses data, for example because it is full."""
+"""Numbers of the system errors of a disk that accepts no more data, for example a full disk."""
 STUDY_LIBRARIES = ("loky", "matplotlib", "scipy")
 """Libraries that `trilat-net` installs and `trilat-net-core` does not (pyproject.toml)."""
 
@@ -53,7 +53,7 @@ EXTRAS = {
 
 
 def require_libraries(*names: str) -> None:
-    """Checks before a long command starts that all libraries that it needs are installed.
+    """Checks, before a long command starts, that all libraries it needs are installed.
 
     Otherwise the command would fail only at its end, for example when it draws a figure.
 
@@ -91,13 +91,13 @@ def describe_missing_library(function: str, error: ModuleNotFoundError) -> str:
         raise error
     distribution = package.replace("_", "-")
     if distribution in PACKAGE_COMMANDS:
-        remedy = f"a package of its own: pip install {distribution}"
+        remedy = f"a separate package: pip install {distribution}"
     elif package in STUDY_LIBRARIES:
         remedy = "which trilat-net-core does not include: pip install trilat-net"
     elif package in EXTRAS:
         remedy = f"which is not installed: {format_extra_install(EXTRAS[package])}"
     else:
-        # A library that every installation has, or that another library needs.
+        # A library that every installation of this program has, or that another library needs.
         remedy = f"which is not installed: pip install {package}"
     return f"{function} needs {package}, {remedy}"
 
@@ -168,8 +168,8 @@ def find_version() -> str:
 def find_page(name: str) -> Path:
     """Returns the path of a documentation page on this machine.
 
-    In a clone of the repository it lies in the folder docs, otherwise where the installation
-    put it.
+    In a clone of the repository, the pages are in the folder docs. Otherwise, they are where
+    the installation put them.
 
     Args:
         name: File name of the page, as in "json.md". No two pages have the same name.
@@ -185,9 +185,9 @@ def find_page(name: str) -> Path:
 
 
 def open_regular(path: Path, **options: Any) -> Any:
-    """Opens a file for reading. Folders, pipes and devices are refused.
+    """Opens a file for reading, and rejects folders, pipes and devices.
 
-    Pipes and devices are refused because they may have no end. Reading would then never return.
+    Pipes and devices are rejected because reading them might never end.
 
     Args:
         path: The file.
@@ -225,7 +225,7 @@ def reading(path: Path, kind: type[TrilatError] = LogError) -> Iterator[BinaryIO
     """Opens a file for reading, as a context manager that converts errors.
 
     Errors of the operating system become errors that a user can act on. Pipes and devices are
-    refused, because they may have no end.
+    rejected, because reading them might never end.
 
     Args:
         path: The file.
@@ -241,14 +241,14 @@ def reading(path: Path, kind: type[TrilatError] = LogError) -> Iterator[BinaryIO
         with open_regular(path) as stream:
             yield stream
     except OSError as error:
-        raise kind(f"{path}: cannot be read: {error.strerror}") from None
+        raise kind(f"{path} cannot be read: {error.strerror}") from None
 
 
 def digest_file(path: Path) -> str:
-    """Returns the SHA-256 hash of a file's content in hexadecimal, to detect any change of it.
+    """Returns the SHA-256 hash of a file's content in hexadecimal, to detect changes.
 
     Args:
-        path: The file, which is read in parts. The file may therefore be large.
+        path: The file. It may be large, because it is read in parts.
     """
     with path.open("rb") as stream:
         return hashlib.file_digest(stream, "sha256").hexdigest()
@@ -257,9 +257,8 @@ def digest_file(path: Path) -> str:
 def read_foreign_permissions(path: Path) -> int:
     """Returns the permission bits that a file grants to its group and to all other users.
 
-    The result is 0 on Windows, which has access control lists instead.
-
-    A file with a secret should grant no such permissions.
+    A file with a secret should grant no such permissions. The result is 0 on Windows, which has
+    access control lists instead.
 
     Args:
         path: The file.
@@ -281,7 +280,7 @@ def make_folder(folder: Path) -> Path:
     except OSError as error:
         if error.errno in DISK_ERRNOS:
             raise describe_write_error(folder, error) from None
-        raise UsageError(f"{folder}: cannot be created: {error.strerror}") from None
+        raise UsageError(f"{folder} cannot be created: {error.strerror}") from None
     return folder
 
 
@@ -302,9 +301,9 @@ def refuse_link(path: Path) -> None:
     """
     is_of_system = path.parent.as_posix() in SYSTEM_FOLDERS
     if path.is_symlink() and not is_of_system:
-        problem = "is a symbolic link, through which no output is written"
+        problem = "is a symbolic link, and no output is written through a link"
         advice = "remove the link, or choose another name"
-        raise UsageError(f"{path}: {problem}; {advice}")
+        raise UsageError(f"{path} {problem}; {advice}")
 
 
 def make_subfolder(folder: Path) -> Path:
@@ -326,10 +325,11 @@ def make_results_folder(folder: Path | None, name: str, *, force: bool | None) -
     An existing folder must be empty, unless the user permits other files in it.
 
     Args:
-        folder: The folder. None uses the next free folder `runs/NAME-N`.
+        folder: The folder. If None, the next free folder `runs/NAME-N` is used.
         name: The text for NAME in this path.
-        force: True permits files in the folder. False refuses them, and the error advises the
-            option --force. None also refuses them, for a command that has no option --force.
+        force: True if the folder may contain files. If False, files are an error, which
+            suggests the option --force. If None, files are also an error; use it for a command
+            without this option.
 
     Returns:
         The folder.
@@ -343,10 +343,10 @@ def make_results_folder(folder: Path | None, name: str, *, force: bool | None) -
     try:
         is_refused = must_be_empty and folder.exists() and any(folder.iterdir())
     except OSError as error:
-        raise UsageError(f"{folder}: cannot be created or read: {error.strerror}") from None
+        raise UsageError(f"{folder} cannot be created or read: {error.strerror}") from None
     if is_refused:
         advice = "" if force is None else ", or use --force"
-        raise UsageError(f"{folder}: is not empty; choose another folder{advice}")
+        raise UsageError(f"{folder} is not empty; choose another folder{advice}")
     return make_folder(folder)
 
 
@@ -372,8 +372,8 @@ def refuse_existing(
 ) -> None:
     """Checks that an output path is free, so that no earlier output is overwritten.
 
-    An empty folder is accepted as the place of an output folder. With `force`, an earlier
-    output of the same kind is accepted too, but never another kind of file or folder.
+    An empty folder is accepted as the path of an output folder. With `force`, an earlier output
+    of the same kind is accepted too, but never another kind of file or folder.
 
     Args:
         path: Path of the output, which is a file or a folder.
@@ -394,23 +394,23 @@ def refuse_existing(
         if not is_same_kind:
             kind = "an exported folder" if manifest else "a file"
             problem = f"already exists and is not {kind}"
-            raise UsageError(f"{path}: {problem}; choose another name")
+            raise UsageError(f"{path} {problem}; choose another name")
         if not force:
             advice = "choose another name, or replace it with --force"
-            raise UsageError(f"{path}: already exists; {advice}")
+            raise UsageError(f"{path} already exists; {advice}")
 
     if unfinished is not None and unfinished.exists() and not force:
         raise UsageError(
-            f"{unfinished}: already exists: this file is still being written, or was never "
+            f"{unfinished} already exists: this file is still being written, or was never "
             f"finished. Recover it with: trilat log recover {unfinished}; choose another name; "
             "or replace it with --force"
         )
 
 
 def publish_file(unfinished: Path, path: Path, *, force: bool) -> None:
-    """Gives a file that has been written completely its final name.
+    """Renames a completely written file to its final name.
 
-    Readers therefore never see a part of the file under that name.
+    Readers therefore never see an incomplete file under that name.
 
     Args:
         unfinished: Path of the complete file, in the same folder.
@@ -429,7 +429,7 @@ def publish_file(unfinished: Path, path: Path, *, force: bool) -> None:
         unfinished.unlink()
     except FileExistsError:
         raise UsageError(
-            f"{path}: was created by another program in the meantime; the finished file is "
+            f"{path} was created by another program in the meantime; the finished file is "
             f"{unfinished}: rename that file"
         ) from None
     except OSError:  # the file system does not support links
@@ -445,11 +445,11 @@ def write_whole(
     remedy: str = "",
     mode: int = 0o666,
 ) -> None:
-    """Writes a file in one step, so that readers never see a part of it.
+    """Writes a file in one step, so that readers never see an incomplete file.
 
-    The data is written to a temporary file beside it, which then replaces it. A device or a
-    pipe is written directly. A symbolic link is refused. A link that appears later is replaced,
-    and its target is not changed.
+    The data is written to a temporary file in the same folder, which then replaces the file. A
+    device or a pipe is written directly. A symbolic link is refused. A link that appears later
+    is replaced, and its target is not changed.
 
     Args:
         path: The file.
@@ -500,8 +500,8 @@ def _write_parts(stream: BinaryIO, parts: Iterable[bytes | str]) -> None:
 def stage_output(path: Path, *, force: bool, manifest: str | None = None) -> Iterator[Path]:
     """Lets the caller write an output at a temporary path, as a context manager.
 
-    If the block succeeds, the output gets its final name. If the block raises an exception,
-    nothing is left of the output, and an earlier output stays.
+    If the block succeeds, the output gets its final name. If the block raises an exception, the
+    unfinished output is deleted, and an earlier output stays.
 
     Args:
         path: The output, which is a file or a folder.
@@ -519,7 +519,8 @@ def stage_output(path: Path, *, force: bool, manifest: str | None = None) -> Ite
     refuse_existing(path, force=force, manifest=manifest)
     remedy = "nothing is left of it. Make room, or take another disk"
     try:
-        # In the same folder, because a rename works within a file system only.
+        # The temporary folder is in the same folder, because a rename works only within a file
+        # system.
         scratch = Path(tempfile.mkdtemp(prefix=f".{path.name}.", dir=path.parent))
     except OSError as error:
         raise describe_write_error(path, error, remedy) from None
@@ -531,7 +532,8 @@ def stage_output(path: Path, *, force: bool, manifest: str | None = None) -> Ite
         yield staged
 
         if manifest and path.is_dir():
-            # A folder cannot replace a folder: the earlier one is deleted with the scratch.
+            # A folder cannot replace a folder: the earlier output is moved into the temporary
+            # folder, and deleted with it.
             path.rename(scratch / "before")
         staged.replace(path)
     except OSError as error:
@@ -543,10 +545,10 @@ def stage_output(path: Path, *, force: bool, manifest: str | None = None) -> Ite
 def describe_write_error(
     path: Path, error: OSError, remedy: str = ""
 ) -> LogRefused | UsageError:
-    """Converts an error of the system in writing a file into one that tells users what to do.
+    """Converts a system error from writing a file into an error that tells users what to do.
 
-    A full disk needs another remedy than a wrong path. Therefore the two cases have different
-    errors. The caller raises the result.
+    A full disk needs a different remedy from a wrong path. Therefore the two cases have
+    different errors. The caller raises the result.
 
     Args:
         path: The file.
@@ -557,7 +559,7 @@ def describe_write_error(
         LogRefused if the disk refused the data, for example because it is full. Otherwise
         UsageError.
     """
-    text = f"{path}: cannot be written: {error.strerror or error}"
+    text = f"{path} cannot be written: {error.strerror or error}"
     if error.errno == errno.ENOENT and not path.parent.is_dir():
         text += f"; the folder {path.parent} does not exist"
     if error.errno in DISK_ERRNOS:

@@ -21,7 +21,7 @@ from importlib import import_module
 from typing import Any
 
 _loaders: dict[str, Callable[[], Any]] = {}
-"""For each hook a function that imports the registered function and returns it."""
+"""For each hook, a function that imports the registered function and returns it."""
 
 
 def register_hooks(package: str, functions: Mapping[str, str]) -> None:
@@ -33,8 +33,8 @@ def register_hooks(package: str, functions: Mapping[str, str]) -> None:
 
     Args:
         package: Name of the package, `__name__` in its `__init__.py`.
-        functions: Functions as "module:function", by the name of their hook. The modules are
-            those of the package.
+        functions: For each hook, the function as "module:function". The modules belong to
+            `package`.
     """
     for hook, function in functions.items():
         module, _, name = function.partition(":")
@@ -44,14 +44,14 @@ def register_hooks(package: str, functions: Mapping[str, str]) -> None:
 def find_hook(hook: str) -> Any:
     """Returns the function that an upper package has registered under a name.
 
-    With it, a lower package calls a function that it must not import.
+    A lower package can thus call a function that it must not import.
 
     Args:
         hook: Name of the hook, as in "plot a log".
 
     Raises:
         ModuleNotFoundError: A library that the function needs is not installed.
-        KeyError: No package has registered such a function.
+        KeyError: No package has registered a function under this name.
     """
     return _loaders[hook]()
 
@@ -64,14 +64,14 @@ def list_hooks() -> list[str]:
 def import_on_use(package: str, modules: Mapping[str, str]) -> Callable[[str], Any]:
     """Returns the `__getattr__` of a package, which imports a module when it is first needed.
 
-    Importing one name of a package therefore imports one of its modules. If the package
-    imported all of its modules, programs that need few of them would start late, and two
-    packages that need each other's modules could not be imported.
+    Importing a name from the package therefore imports only the module that defines the name.
+    If the package imported all of its modules, programs that need few of them would start late,
+    and two packages that need each other's modules could not be imported.
 
     Args:
         package: Name of the package, `__name__` in its `__init__.py`.
-        modules: The names of the interface, separated by spaces, by the module that defines
-            them. A name equal to that of its module is the module itself.
+        modules: For each module, the names of the interface that it defines, separated by
+            spaces. If a name equals the name of the module, it stands for the module itself.
     """
     module_of_name = {}
     for module_name, names in modules.items():
@@ -92,6 +92,6 @@ def import_on_use(package: str, modules: Mapping[str, str]) -> Callable[[str], A
 def _import_function(module: str, name: str) -> Any:
     """Imports a function that an upper package has registered as a hook.
 
-    It is called when a lower package uses the hook for the first time.
+    The import happens when a lower package uses the hook for the first time.
     """
     return getattr(import_module(module), name)

@@ -2,7 +2,7 @@
 
 A control loop must not wait for other programs or for Python's garbage collector.
 `request_real_time_scheduling` and `raise_priority` address the first, `disable_gc` and
-`freeze_gc` the second. `pause_gc` makes code faster that creates many objects.
+`freeze_gc` the second. `pause_gc` speeds up code that creates many objects.
 
 Invariant:
     - `pause_gc` is used only around code that creates many objects without reference cycles,
@@ -39,20 +39,20 @@ def pause_gc() -> Iterator[None]:
 
 
 def freeze_gc() -> None:
-    """Makes later collections of garbage faster, by exempting all objects that exist now.
+    """Speeds up later garbage collections by exempting all objects that exist now.
 
-    Garbage is collected once before. Without this function, each full collection traverses all
-    objects of the imported modules, which takes a quarter of a second.
+    One collection runs first. Without this function, each full collection traverses all objects
+    of the imported modules, which takes a quarter of a second.
     """
     gc.collect()
     gc.freeze()
 
 
 def disable_gc() -> None:
-    """Stops the garbage collector for the rest of a process whose loop must not pause.
+    """Turns off the garbage collector for the rest of a process whose loop must not pause.
 
-    Garbage is collected once before. Afterwards, only objects in reference cycles stay in
-    memory.
+    One collection runs first. Afterwards, unused objects stay in memory only if they are in
+    reference cycles.
     """
     freeze_gc()
     gc.disable()
@@ -75,7 +75,7 @@ def request_real_time_scheduling() -> str:
     Returns:
         Description of the scheduling that was obtained, for example "SCHED_FIFO 50".
     """
-    calling_thread = 0  # stands for the calling thread in calls of the system
+    calling_thread = 0  # in system calls, 0 stands for the calling thread
     try:
         lower_priority = os.sched_param(FIFO_PRIORITY - 1)
         _change_threads(
@@ -99,7 +99,7 @@ def _change_threads(change: Callable[[int], None]) -> None:
     The calling thread comes first.
 
     Args:
-        change: Function that changes the thread of a given number. 0 is the calling thread.
+        change: Function that changes the thread with a given number. 0 is the calling thread.
     """
     change(0)
     threads_folder = Path("/proc/self/task")  # Linux lists the threads of a process here
@@ -144,12 +144,13 @@ def raise_priority(nice: int) -> bool:
 
 
 def _raise_session_priority(nice: int) -> None:
-    """Raises the priority of this process among other sessions, if it leads one (`setsid`).
+    """Raises the priority of the operating system's session that this process leads, if any.
 
-    Linux may share the processors among sessions first, and only then among the threads of a
-    session (`man 7 sched`, "The autogroup feature"). The nice value of a thread then has no
-    effect outside its session. If another process leads the session, for example a shell,
-    nothing changes, because its other processes would be raised too.
+    A session is a group of processes (`setsid`). Linux may share the processors among sessions
+    first, and only then among the threads of a session (`man 7 sched`, "The autogroup
+    feature"). The nice value of a thread then has no effect outside its session. If another
+    process leads the session, for example a shell, nothing changes, because its other processes
+    would be raised too.
     """
     if os.getsid(0) == os.getpid():
         with suppress(OSError):  # not permitted, or the system has no such groups

@@ -21,11 +21,11 @@ PARAMETERS = 5
 MAX_JOINTS = 12
 """Largest number of joints of an arm."""
 MAX_LAW_MEMORY = 1024
-"""Largest count of numbers in a law's memory, which each record contains."""
+"""Largest number of values in a law's memory, which each record contains."""
 
 
 class Mode(IntEnum):
-    """What a site, the process that runs one arm, does in a period of its control loop.
+    """Mode of a site, the process that runs one arm, in a period of its control loop.
 
     RUN: the arm follows the other arms. If no samples (states) come from one of them, the mode
     becomes HOLD (the arm keeps its last reference) or BRAKE (the arm keeps its pose). When
@@ -33,8 +33,9 @@ class Mode(IntEnum):
     RUN. DIVERGED: a joint was too fast, or a number was not finite. This mode is final.
 
     Under the rule `glide`, explained in `core.life.session_life`, there are further modes, and
-    the arm is at rest in all of them. WAITING: not all other arms are heard yet. FAULT: a limit
-    was exceeded; it replaces DIVERGED. STOPPED: the arm was stopped by order.
+    the arm is at rest in all of them. WAITING: samples have not arrived from all other arms
+    yet. FAULT: a limit was exceeded; this mode replaces DIVERGED. STOPPED: the arm was stopped
+    by a command.
     """
 
     RUN = 1
@@ -61,8 +62,7 @@ class Arrival(NamedTuple):
         latency_us: Measured latency of the network, us. It is only recorded, and has no effect.
         tau_x: External torque of the peer, N m, for control laws that reflect force. The torque
             ON its arm is the negative.
-        ch: Further numbers that the control law of the peer sent, see
-            `core.plug.law_channel`.
+        ch: Further values that the control law of the peer sent, see `core.plug.law_channel`.
     """
 
     peer: int
@@ -75,41 +75,43 @@ class Arrival(NamedTuple):
 
 
 class TickRecord(NamedTuple):
-    """Results of one control period (tick): the state at its start, and what follows from it.
+    """State at the start of a control period (tick), and the results computed from it.
 
     The state at the end of the period is not included: it belongs to the next record.
 
     Attributes:
-        tick: k.
+        tick: Number k of the tick.
         t_ns: Nominal time, ns since the epoch.
         mode: The site's mode.
         q: Joint angles, rad.
         qd: Joint velocities, rad/s.
         q_des: Reference q_id, Eq. (6), rad.
-        qd_des: Its derivative, rad/s.
+        qd_des: Derivative of q_des, rad/s.
         tau: Control torque, Eq. (13), N m.
         tau_x: Exogenous torque in the sign of Eq. (8), N m; the torque ON the arm is its
             negative.
         theta_hat: Estimate of the parameters.
         used: Tick of the sample in use, per peer in scenario order; -1 before the first.
-        rx_crc: CRC-32 of the arrivals of this tick as the step received them, so that a changed
-            input shows at its own tick. Each arrival is little-endian (peer i64, tick i64, q
-            f64s, qd f64s), followed by its tau_x if the law reflects force.
+        rx_crc: CRC-32 of the arrivals of this tick, as the step received them. If an input was
+            changed, this checksum differs at the tick of the input. Each arrival is
+            little-endian (peer i64, tick i64, q f64s, qd f64s), followed by its tau_x if the
+            law reflects force.
         cmd: Texts of the changes that this tick applied.
-        mem: The memory of the site that no other field holds. In RUN and DIVERGED it is empty;
-            otherwise it is the held pose, rad, and the time at which the return began, ns since
-            the epoch (0 before). A site with a user's law always has these numbers, followed
-            by the memory of the law. Under the rule `glide` a site always has the memory of
-            `core.life.session_life` instead, see `Layout.count_life_memory`.
-        x: in task space the shared pose of the end effector: position, m, and orientation;
-            otherwise empty.
+        mem: State of the site that no other field contains. It is empty in RUN and DIVERGED. In
+            other modes, it is the held pose, rad, and the time at which the return began, ns
+            since the epoch, or 0 before the return. For a site with a user's law, it contains
+            these values in every mode, followed by the memory of the law. Under the rule
+            `glide`, it is the state of `core.life.session_life` in every mode, see
+            `Layout.count_life_memory`.
+        x: Pose of the end effector that the sites share in task space: position, m, and
+            orientation. Empty in joint space.
         xd: Derivative of x, m/s and rad/s.
         wrench: tau_x expressed at the end effector, N and N m.
-        ch: The numbers that the site's law sends, see `core.plug.law_channel`.
-        hand: The action of a live hand in this tick, see `core.life.live_hand`; empty without
-            a hand.
-        bodies: Poses of the bodies of the plant, seven numbers each: x, y, z in the arm's base
-            frame, m, and the unit quaternion w, x, y, z; empty without bodies.
+        ch: The values that the site's law sends, see `core.plug.law_channel`.
+        hand: The action in this tick of a live hand, a person or program that moves the arm
+            during the run, see `core.life.live_hand`. Empty without a live hand.
+        bodies: Poses of the other bodies in the scene, seven values each: x, y, z in the arm's
+            base frame, m, and the unit quaternion w, x, y, z. Empty without such bodies.
     """
 
     tick: int
@@ -140,7 +142,8 @@ class TickRecord(NamedTuple):
         effector, otherwise that of the joints.
 
         Returns:
-            The position, the velocity and the exogenous torque, a number per coordinate each.
+            The position, the velocity and the exogenous torque, each with one number per
+            coordinate.
         """
         if self.x:
             return self.x, self.xd, self.wrench
@@ -223,30 +226,32 @@ class Layout(NamedTuple):
         return columns
 
     def count_life_memory(self, peers: int, *, degrades: bool = False) -> int:
-        """Counts the values with which an arm at rest can continue a recorded run.
+        """Counts the recorded values from which an arm at rest can continue a run.
 
-        By the rule `glide`, an arm comes to rest while another arm is silent, see
-        `core.life.session_life`. The state of this rule stands first in the field `mem` of the
-        log:
+        Under the rule `glide`, an arm comes to rest while another arm is silent, see
+        `core.life.session_life`. The state of this rule is at the start of the field `mem` of
+        the log:
 
         - the values that every such arm stores, for example when each other arm was heard last,
         - in task space, the reference that brings the joints to rest (`rest_columns`),
-        - if the arm goes on without a lost arm, a value for each other arm: whether it is lost.
+        - if the arm may continue without a lost arm, one value per other arm: whether it is
+          lost.
 
         Args:
             peers: Number of the other sites from which this site receives data.
             degrades: True if the site continues without a lost site.
         """
         end_of_reference: int = self.rest_columns(peers).stop
-        lost_peer_values = peers * degrades  # none if it does not
+        lost_peer_values = peers * degrades  # zero if `degrades` is False
         return end_of_reference + lost_peer_values
 
     def rest_columns(self, peers: int) -> slice:
-        """Finds the reference that brings the joints to rest, in the field `mem` of a record.
+        """Returns the part of `mem` with the reference that brings the joints to rest.
 
-        `mem` contains numbers from which a run can be continued. For a site (the process that
-        runs one arm) with n joints, m coordinates that the sites share, and P peers (the other
-        sites), it starts with the numbers that `Site` stores under the rule `glide`:
+        The field `mem` of a record contains values from which a run can be continued. For a
+        site (the process that runs one arm) with n joints, m coordinates that the sites share,
+        and P peers (the other sites), it starts with the values that `Site` stores under the
+        rule `glide`:
 
             q_held (m), return_from_ns (1), qd_held (m), reason (1), used_ns (P), tau_held (n),
             q_rest (n), qd_rest (n)                                       only in task space
@@ -267,7 +272,7 @@ class Layout(NamedTuple):
         return slice(first, first + length)
 
     def list_lost_peers(self, mem: Sequence[float], peers: Sequence[str]) -> list[str]:
-        """Returns the names of the arms that fell silent and without which this arm goes on.
+        """Returns the names of the silent arms without which this arm continues.
 
         The names are derived from a record of this arm's log.
 
@@ -278,12 +283,12 @@ class Layout(NamedTuple):
         end = self.count_life_memory(len(peers), degrades=True)
         # One number per peer: 0 if the peer is present.
         states = mem[end - len(peers) : end]
-        # A record of another rule has a shorter memory, and then no lost peers.
+        # Under another rule, the memory is shorter, and no peer counts as lost.
         return [peer for peer, state in zip(peers, states, strict=False) if state]
 
     @property
     def floats(self) -> int:
-        """Count of the floats that an arm's process computes in one period of the control loop.
+        """Number of floats that an arm's process computes in one period of the control loop.
 
         They form a record of the log. Floats that are inputs of the period are not counted.
         """

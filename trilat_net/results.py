@@ -50,7 +50,7 @@ class Result:
     def summary(self) -> str:
         """Returns the text about the result that the command prints in the terminal.
 
-        Commands with the option --all print the whole text only with this option.
+        A command that has the option --all prints the whole text only with this option.
         """
         return str(find_hook("summarize a result")(self))
 
@@ -68,7 +68,7 @@ class Result:
     def headline(self) -> str:
         """Returns the result in one line: the first line of its summary that is not blank.
 
-        Texts that show a result among others use it. A result without any line is "nothing".
+        Lists of several results show this line. A result with an empty summary gives "nothing".
         """
         for line in self.summary().splitlines():
             if line.strip():

@@ -70,7 +70,7 @@ class Interrupt:
     ) -> None:
         for number, handler in self._before.items():
             signal.signal(number, handler)
-        # An enclosing `Interrupt` learns of the signal that ends this block.
+        # The signal that ends this block is also recorded in an enclosing `Interrupt`.
         outer = getattr(self._before.get(signal.SIGINT), "__self__", None)
         if kind is KeyboardInterrupt and isinstance(outer, Interrupt):
             outer.number = outer.number or self.number
@@ -89,7 +89,8 @@ class Interrupt:
             KeyboardInterrupt: The signal has arrived in a `with` block of `raising`.
         """
         self.number = self.number or number
-        # A terminal that closes and its shell send one SIGHUP each: these are not repetitions.
+        # When a terminal closes, the terminal and its shell each send SIGHUP. The second one
+        # does not count as a repetition.
         if number != _HANG_UP:
             now_s = os.times().elapsed
             if self._requested_s is None:
@@ -182,9 +183,9 @@ def _exit_by_signal(number: int, _frame: FrameType | None) -> None:
 def _watch_signals() -> Callable[[], None]:
     """Starts a thread that ends the process as soon as an ending signal arrives.
 
-    The part of Python that runs outside of its instructions writes the number of each signal
-    into a pipe (`signal.set_wakeup_fd`). The thread reads the pipe, and therefore works even
-    while the main thread is inside the compiler.
+    Python's signal handler in C writes the number of each signal into a pipe
+    (`signal.set_wakeup_fd`). The thread reads the pipe, and therefore works even while the main
+    thread is inside the compiler.
 
     Returns:
         A function that stops the thread.
@@ -209,7 +210,7 @@ def _watch_signals() -> Callable[[], None]:
                     os._exit(128 + number)
 
     def unwatch() -> None:
-        """Ends the thread that waits for signals. Closing the pipe ends its read."""
+        """Ends the thread that waits for signals, by closing the pipe that it reads."""
         signal.set_wakeup_fd(previous_descriptor)
         os.close(writer)
 
@@ -232,9 +233,9 @@ def _may_interrupt(owner: object) -> bool:
 def hold_sigint() -> Iterator[None]:
     """Delays Ctrl-C inside the `with` block, and hides it from processes started there.
 
-    The signal mask is inherited by the started processes, which is its purpose. It does not
-    delay Ctrl-C in this process if another thread receives the signal, because Python runs the
-    handler in the main thread anyway. Therefore the handler is replaced as well.
+    Blocking the signal hides it from the started processes, which inherit the signal mask. The
+    mask alone does not delay Ctrl-C in this process: another thread may receive the signal, and
+    Python then runs the handler in the main thread. Therefore the handler is replaced as well.
     """
     is_main_thread = threading.current_thread() is threading.main_thread()
     # Windows has no signal masks, and only the main thread may change handlers.

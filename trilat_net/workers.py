@@ -48,9 +48,10 @@ def worker_pool(count: int) -> Iterator[Executor]:
     """
     from loky import ProcessPoolExecutor
 
-    # loky misses pgrep, but the workers have no children to kill.
+    # loky warns if the program pgrep is missing, but the workers have no children to kill.
     warnings.filterwarnings("ignore", "Failed to kill subprocesses")
-    # A worker whose memory grows is restarted, since it keeps the laws that it compiled.
+    # loky restarts a worker whose memory grows. This is expected: a worker keeps the laws that
+    # it compiled.
     warnings.filterwarnings("ignore", "A worker was restarted")
     arguments = (os.getpid(), TrilatError.in_command)
     pool = ProcessPoolExecutor(count, initializer=_prepare_worker, initargs=arguments)
@@ -90,8 +91,8 @@ def _exit_after(parent: int) -> None:
     """
     from multiprocessing import connection, parent_process
 
-    # On Windows the number of the parent does not change when the parent has ended. The
-    # sentinel, a handle of the parent, then becomes ready.
+    # On Windows, the recorded number of the parent stays the same after the parent has ended,
+    # but the sentinel, a handle of the parent, becomes ready.
     sentinel = getattr(parent_process(), "sentinel", None)
     if os.name == "nt" and sentinel is not None:
         connection.wait([sentinel])

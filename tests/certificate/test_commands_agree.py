@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import msgspec
 import pytest
 from trilat_studies.bench import plan_bench
-from trilat_studies.bench.bench_run import BenchRunItem, judge_bench_run, run_bench_task
+from trilat_studies.bench.bench_run import BenchRunItem, JudgedRun
 from trilat_studies.sweep.sweep_cell import classify_cell
 
 import trilat_net as tn
@@ -101,7 +101,7 @@ def list_statements(scenario: Scenario) -> list[Statement]:
     )
     cell = classify_cell(scenario.text, scenario.duration_s)
     swept = Statement("sweep", cell.stability, _without_theorem(cell.rests_on))
-    suite_run = judge_bench_run(scenario, scenario.duration_s)
+    suite_run = JudgedRun.simulate(scenario, scenario.duration_s)
     benched = Statement(
         command="bench",
         word=suite_run.stability.value,
@@ -303,7 +303,7 @@ def test_a_suite_run_agrees_with_its_certificate() -> None:
         laws=["p_d"], study="round-trips", tasks=["free"], links=["rtt8"], seeds=1
     )
     cell = plan.cells[0]
-    suite_run = run_bench_task(BenchRunItem(cell, 1))
+    suite_run = BenchRunItem(cell, 1).run()
     scenario = msgspec.structs.replace(cell.build(1).scenario, duration_s=suite_run.length_s)
     decision = certify_run(tn.simulate(scenario)).decision
     assert suite_run.stability is decision.stability

@@ -40,7 +40,7 @@ def test_the_default_is_pdf_and_png(folder: Path) -> None:
     assert paths == [f"run-figures/control_torques.{kind}" for kind in ("pdf", "png")]
     assert b"MediaBox [ 0 0 504 " in (folder / paths[0]).read_bytes()
     trilat("figure", "run.mcap", "control_torques", cwd=folder).refuses(
-        "torques.pdf: already exists", "--force"
+        "torques.pdf already exists", "--force"
     )
 
 

@@ -123,7 +123,7 @@ def test_keys_are_complete_or_absent(
         with pytest.raises(caught) as raised:
             create_keys(tmp_path / "k", ["m1", "m2"])
         if isinstance(raised.value, TrilatError):
-            assert f"{tmp_path / 'k'}: cannot be written: No space left on device" in str(
+            assert f"{tmp_path / 'k'} cannot be written: No space left on device" in str(
                 raised.value
             )
         assert list(tmp_path.iterdir()) == []

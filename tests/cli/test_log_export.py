@@ -41,11 +41,11 @@ def test_a_log_is_exported_beside_itself(form: str, folder: Path) -> None:
 def test_exports_replace_only_their_own_kind(folder: Path) -> None:
     command = ("log", "export", "run.mcap", "--to", "csv", "-o", "tables")
     trilat(*command, cwd=folder).succeeds()
-    trilat(*command, cwd=folder).refuses("tables: already exists", "--force")
+    trilat(*command, cwd=folder).refuses("tables already exists", "--force")
     trilat(*command, "--force", cwd=folder).succeeds()
     assert pl.read_csv(folder / "tables" / "s_state.csv").height == 120
     done = trilat("log", "export", "run.mcap", "--to", "npz", "-o", "run.mcap", cwd=folder)
-    done.refuses("run.mcap: already exists")
+    done.refuses("run.mcap already exists")
     assert (folder / "run.mcap").read_bytes() == make_log_bytes("paper")
 
 
@@ -77,7 +77,7 @@ def test_a_folder_of_logs_becomes_episodes(folder: Path) -> None:
         text == "logs-lerobot: 8 frames in 2 episodes; 0 frames lie in gaps and are left out; "
         "no program moved an arm, so there is no column intervention\n"
     )
-    trilat(*command, cwd=folder).refuses("logs-lerobot: already exists", "--force")
+    trilat(*command, cwd=folder).refuses("logs-lerobot already exists", "--force")
     assert (
         "12 frames in 2"
         in trilat(*command, "--set", "fps=50", "--force", cwd=folder).succeeds()

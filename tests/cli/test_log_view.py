@@ -28,5 +28,5 @@ def test_views_can_be_kept(log_file: Path, tmp_path: Path) -> None:
     assert "run.rrd: open it with: rerun run.rrd" in text
     assert (tmp_path / "run.rrd").read_bytes().startswith(b"RRF2")
     trilat("log", "view", log_file, "--save", "run.rrd", cwd=tmp_path).refuses(
-        "run.rrd: already exists", "--force"
+        "run.rrd already exists", "--force"
     )

@@ -8,13 +8,13 @@ from numpy.typing import NDArray
 
 from tests.execution.varying_links import LINKS
 from trilat_net.core import first_tick_at, tick_ns
-from trilat_net.execution.fused import FusedRun
-from trilat_net.execution.lanes.lane_deliveries import (
+from trilat_net.core.lanes.lane_deliveries import (
     BLOCK_TICKS,
     copy_link_states,
     find_draw_addresses,
     use_samples_of_rates,
 )
+from trilat_net.execution.fused import FusedRun
 from trilat_net.scenario import load_scenario
 
 SITES = ("m1", "m2", "s")

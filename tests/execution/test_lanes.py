@@ -11,12 +11,14 @@ import numpy as np
 import pytest
 
 from tests.execution.varying_links import LINKS
+from trilat_net.core.lanes.lane_rows import LANES
+from trilat_net.core.lanes.lane_run import LaneRun, read_assembly
+from trilat_net.core.lanes.lane_structure import find_obstacle
+from trilat_net.core.lanes.run_groups import LEAST_RUNS, group_runs
 from trilat_net.core.step.row_fields import FIELDS
 from trilat_net.errors import LawFailed
 from trilat_net.execution import virtual
 from trilat_net.execution.fused import FusedRun
-from trilat_net.execution.lanes import LANES, LEAST_RUNS, find_obstacle, group_runs
-from trilat_net.execution.lanes.lane_run import LaneRun, read_assembly
 from trilat_net.scenario import Scenario, load_scenario
 
 ARM6 = (files("trilat_net") / "scenarios" / "arm6.urdf").read_text("utf-8")

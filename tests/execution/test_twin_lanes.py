@@ -8,8 +8,8 @@ import pytest
 
 import trilat_net as tn
 from tests.execution.circling_hand import CirclingHand
+from trilat_net.core.lanes import twin_lanes
 from trilat_net.execution import twins as twins_module
-from trilat_net.execution.lanes import twin_lanes
 from trilat_net.execution.twins import (
     Push,
     Twins,

@@ -195,7 +195,7 @@ FAILURES = {
     "raises": "ValueError: out of",
     "short": "torque has 1 number, not 2",
     "none": "TypeError",
-    "remembers": "memory has 1025 numbers, at most 1024 are kept",
+    "remembers": "memory has 1025 numbers, but at most 1024 are allowed",
     "leaves": "SystemExit: 0",
 }
 

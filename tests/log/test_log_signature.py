@@ -129,7 +129,7 @@ def test_keys_are_private_and_full_disks_leave_none(tmp_path: Path) -> None:
     full = OSError(errno.ENOSPC, "No space left on device")
     with (
         mock.patch("os.fsync", side_effect=full),
-        pytest.raises(LogRefused, match=r"lab\.key: cannot be written"),
+        pytest.raises(LogRefused, match=r"lab\.key cannot be written"),
     ):
         create_signing_keys(tmp_path / "lab")
     assert not list(tmp_path.iterdir())

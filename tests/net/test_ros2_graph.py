@@ -18,7 +18,7 @@ from tests.net.waiting import until
 from trilat_net.errors import UsageError
 from trilat_net.net.clock import SystemClock
 from trilat_net.net.connection import find_free_endpoints
-from trilat_net.net.ros2_graph import (
+from trilat_net.net.ros2.ros2_graph import (
     TYPE_HASHES,
     Attachment,
     EndpointKind,
@@ -32,7 +32,7 @@ from trilat_net.net.ros2_graph import (
     parse_attachment,
     topic_key,
 )
-from trilat_net.net.ros2_names import check_ros_name
+from trilat_net.net.ros2.ros2_names import check_ros_name
 from trilat_net.net.zenoh_bus import RouterSilent
 from trilat_net.net.zenoh_config import ZenohMode, make_zenoh_config
 

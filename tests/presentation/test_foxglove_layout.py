@@ -206,7 +206,7 @@ def test_the_command_says_how_to_use_it(paper: tuple[Path, Path], tmp_path: Path
         "run.foxglove.json: open run.mcap in Foxglove or Lichtblick, and import this file as "
         "a layout\n"
     )
-    trilat(*view, cwd=tmp_path).refuses("run.foxglove.json: already exists", "--force")
+    trilat(*view, cwd=tmp_path).refuses("run.foxglove.json already exists", "--force")
     trilat(*view, "--force", cwd=tmp_path).succeeds()
     advice = trilat("log", "view", "run.mcap", "--rviz", cwd=tmp_path).succeeds()
     assert advice.splitlines() == [

@@ -14,7 +14,7 @@ from tests.net.local_bus import LocalNetwork
 from tests.net.manual_clock import ManualClock
 from tests.net.waiting import sleep_for_ns
 from tests.sites.sessions import reach_session
-from trilat_net.app.monitor import SiteRow, describe_row, frame_alarms
+from trilat_net.app.monitor import SessionDisplay, StatusRow
 from trilat_net.core.step.ticks import LifeAlarm, LifeReason
 from trilat_net.errors import SessionError
 from trilat_net.execution.verification import verify
@@ -33,7 +33,7 @@ def test_stop_ends_all_sites_at_one_time(tmp_path: Path) -> None:
         load_scenario("paper", {"duration_s": 30.0, **LIVE}), tmp_path, ends={}
     )
     said: list[str] = []
-    shown: list[list[SiteRow]] = []
+    shown: list[list[StatusRow]] = []
     titles: list[str] = []
 
     def stop(bus: Bus, clock: RelayClock) -> None:
@@ -61,7 +61,7 @@ def test_stop_ends_all_sites_at_one_time(tmp_path: Path) -> None:
     assert [row["site"] for row in last] == ["m1", "m2", "s"]
     assert last[0]["angles"] == " ".join(f"{q:+.3f}" for q in log["m1"].q[-1]) + " rad"
     assert [row["held"] for row in last] == ["free", "", ""]
-    assert describe_row(shown[-1][0]).startswith(f"m1 {(ticks - 1) / 1000:.1f} s ")
+    assert shown[-1][0].describe().startswith(f"m1 {(ticks - 1) / 1000:.1f} s ")
     assert titles[0].endswith("waits for its members")
     assert " V = " in titles[-1]
 
@@ -115,14 +115,15 @@ def stopped_arm(tmp_path_factory: pytest.TempPathFactory) -> StoppedArm:
     def look(bus: Bus, clock: RelayClock) -> None:
         watch = SessionWatch(bus, clock, SESSION)
         pages = SessionFrames(watch.view)
-        console = Console(file=screen, width=100)
-        while not watch.view.ended:
-            watch.update()
-            frames.extend([frame] if (frame := pages.make_frame()) else [])
-            if watch.alarms and watch.alarms != alarms[-1:]:
-                alarms.extend(watch.alarms)
-                console.print(*frame_alarms(watch.alarms))
-            sleep_for_ns(clock, 50_000_000)
+        console = Console(file=screen, width=100, force_terminal=True, color_system=None)
+        with SessionDisplay(console, clock) as display:
+            while not watch.view.ended:
+                watch.update()
+                frames.extend([frame] if (frame := pages.make_frame()) else [])
+                if watch.alarms and watch.alarms != alarms[-1:]:
+                    alarms.extend(watch.alarms)
+                    display.show("", [], watch.alarms)
+                sleep_for_ns(clock, 50_000_000)
         events = [render_event(event) for event in watch.view.events.since(0, 400)]
         changes.extend(
             re.sub(r"[\d.]+ s$", "", event["text"])

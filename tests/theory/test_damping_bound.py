@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 import sympy as sp
-from trilat_studies.sweep.stability_map import evaluate_criterion
+from trilat_studies.sweep.stability_map import StabilityCriterion
 
 from tests.theory.networks import Network, Wire
 from tests.theory.position_networks import compute_rod_inertia, count_growing, position_network
@@ -84,7 +84,7 @@ def test_irreversible_shares_have_no_bound(
     """d is above abs(lambda_min) K T for the first; the second has lambda = exp(2 pi j / 3)."""
     scenario = position_network(alpha, d=d, delay_ms=delay_ms, masses=masses)
     assert d > 10.0 * delay_ms / 1e3 * abs(np.linalg.eigvals(alpha).real.min()) * (1.0 + 1e-9)
-    assert evaluate_criterion(scenario) is None
+    assert StabilityCriterion.evaluate(scenario) is None
     rightmost = analyse_linear_loop(scenario, pose=POSE).decisive.rightmost
     assert rightmost is not None
     assert rightmost.s.real == pytest.approx(growth_per_s, abs=1e-3)
@@ -99,7 +99,8 @@ def test_irreversible_shares_have_no_bound(
 def test_seven_equal_shares_exceed_their_eigenvalue() -> None:
     """K T = 2, d = 0.36: 1/6 of it is 0.333, 0.2172 of it 0.434."""
     lacking, enough = (
-        evaluate_criterion(position_network(make_equal_shares(7), d=d)) for d in (0.36, 0.44)
+        StabilityCriterion.evaluate(position_network(make_equal_shares(7), d=d))
+        for d in (0.36, 0.44)
     )
     assert lacking is not None
     assert enough is not None
@@ -117,7 +118,9 @@ def check_sharpness(alpha: Any, K: float, ticks: int) -> None:
 
     Heavy arms where abs(lambda_min) is 0.2172 and more, m = 1.2172 K T^2 / 20.19 below.
     """
-    criterion = evaluate_criterion(position_network(alpha, K=K, d=0.0, delay_ms=float(ticks)))
+    criterion = StabilityCriterion.evaluate(
+        position_network(alpha, K=K, d=0.0, delay_ms=float(ticks))
+    )
     assert criterion is not None
     # of two sites 2 sqrt(d1 d2) - ...
     line = -criterion.excess / (2.0 if len(alpha) == 2 else 1.0)
@@ -144,7 +147,7 @@ def test_the_bound_is_the_worst_masss_edge(count: int, seed: int) -> None:
 @pytest.mark.parametrize("ticks", [1, 2, 3])
 def test_few_ticks_give_the_computed_edge(ticks: int) -> None:
     """Errata 13: 0.667 K h for one tick, and any masses above d h."""
-    criterion = evaluate_criterion(
+    criterion = StabilityCriterion.evaluate(
         position_network(make_equal_shares(3), d=0.0, delay_ms=float(ticks))
     )
     assert criterion is not None
@@ -210,7 +213,9 @@ def check_network(rng: np.random.Generator, *, sharp: bool) -> bool | None:
         K_all = K * rng.uniform(0.5, 2.0, 2)
         d = d * rng.uniform(0.5, 2.0, 2)
     masses = 10.0 ** rng.uniform(-0.5, 0.5, count)
-    criterion = evaluate_criterion(position_network(alpha, K_all, d, float(ticks), masses))
+    criterion = StabilityCriterion.evaluate(
+        position_network(alpha, K_all, d, float(ticks), masses)
+    )
     if criterion is None:
         return None
     if sharp and ticks >= MANY_TICKS:

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 from scipy.linalg import eigvals
-from trilat_studies.sweep.stability_map import evaluate_criterion
+from trilat_studies.sweep.stability_map import StabilityCriterion
 
 from tests.core.chain_references import ARMS
 from tests.scenario.builders import two_arm_text
@@ -325,7 +325,7 @@ def test_the_p_d_bound_holds_for_chains() -> None:
     def damped(d: float, **overrides: Any) -> Linear:
         return make_six_joint_loop("p_d", **{"control.K": 20.0, "control.d": d, **overrides})
 
-    criterion = evaluate_criterion(damped(1.05).scenario)
+    criterion = StabilityCriterion.evaluate(damped(1.05).scenario)
     assert criterion is not None
     assert criterion.excess == pytest.approx(0.1)
     assert compute_delay_spectrum(damped(1.05).loop(), 1).verdict == "stable"
@@ -337,7 +337,10 @@ def test_the_p_d_bound_holds_for_chains() -> None:
     )
     assert edge is not None
     assert 0.8 < edge.value < 1.0
-    assert evaluate_criterion(damped(1.05, **{"arm.armature_kg_m2": 0.001}).scenario) is None
+    assert (
+        StabilityCriterion.evaluate(damped(1.05, **{"arm.armature_kg_m2": 0.001}).scenario)
+        is None
+    )
 
 
 @pytest.mark.long

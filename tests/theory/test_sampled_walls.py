@@ -5,7 +5,7 @@ from functools import cache
 import numpy as np
 import pytest
 from scipy.linalg import expm
-from trilat_studies.measure_run import run_whole
+from trilat_studies.measure_run import WholeRun
 from trilat_studies.sweep.sweep_cell import CellClass, classify_cell
 
 from tests.core.chain_references import Array, ChainState, chain_references
@@ -74,7 +74,7 @@ def classify_stiffness(K: float) -> CellClass:
 
 def end_alone(K: float) -> Stability:
     """Returns the class by the motion of the run alone."""
-    return run_whole(make_windup_scenario(K)).end.stability
+    return WholeRun.simulate(make_windup_scenario(K)).end.stability
 
 
 @pytest.mark.long

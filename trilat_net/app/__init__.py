@@ -21,15 +21,12 @@ __all__ = [
     "AnyScenario",
     "Overrides",
     # Sessions
-    "HEADS",
     "RunningSession",
     "SessionDisplay",
     "SessionResult",
     "ShareHistory",
-    "SiteRow",
+    "StatusRow",
     "compile_core",
-    "describe_angles",
-    "describe_site",
     "open_hand",
     "ping_session",
     "run_demo",
@@ -47,7 +44,7 @@ if TYPE_CHECKING:
     from .cli.sessions import run_and_report
     from .demo_session import SessionResult, compile_core, run_demo
     from .input_device import Device, DeviceState, Vector
-    from .monitor import HEADS, SessionDisplay, SiteRow, describe_angles, describe_site
+    from .monitor import SessionDisplay, StatusRow
     from .running_session import RunningSession, ShareHistory, open_hand
     from .session_ping import ping_session
 else:
@@ -60,7 +57,7 @@ else:
             "cli.sessions": "run_and_report",
             "demo_session": "SessionResult compile_core run_demo",
             "input_device": "Device DeviceState Vector",
-            "monitor": "HEADS SessionDisplay SiteRow describe_angles describe_site",
+            "monitor": "SessionDisplay StatusRow",
             "running_session": "RunningSession ShareHistory open_hand",
             "session_ping": "ping_session",
         },

@@ -342,11 +342,11 @@ def view(
             such viewer.
         LogError: The log cannot be read.
     """
+    from ..log.ros2 import write_rviz_config
     from ..presentation import (
         ViewerOptions,
         open_rerun,
         write_foxglove_layout,
-        write_rviz_config,
     )
 
     paths = [Path(file) for file in files]

@@ -7,7 +7,7 @@ table that is refreshed four times a second. If the output is a file or a pipe, 
 are printed as lines every two seconds.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 from rich.box import HEAVY
@@ -28,7 +28,18 @@ from ..records import NS_PER_S
 
 AGES = "age of each peer's sample"
 """Heading of the column with the ages of the peers' samples."""
-HEADS = ("site", "time", "mode", "angles", "|e|", "torque", AGES, "held", "late", "overruns")
+_HEADINGS = (
+    "site",
+    "time",
+    "mode",
+    "angles",
+    "|e|",
+    "torque",
+    AGES,
+    "held",
+    "late",
+    "overruns",
+)
 """Headings of the columns of the table."""
 NUMBERS = frozenset(("time", "|e|", "torque", "late", "overruns"))
 """Headings of the columns that are aligned to the right."""
@@ -41,60 +52,97 @@ LOUD_EVENTS = frozenset(
 )
 """Kinds of events whose sentences are printed."""
 
-SiteRow = Mapping[str, str]
-"""Texts of the row of a site, by the headings in `HEADS`."""
 
+class StatusRow(dict[str, str]):
+    """The row of a site in the table: texts by the headings of the columns.
 
-def describe_site(
-    scenario: Scenario,
-    name: str,
-    record: State | None,
-    stats: LinkStats | None,
-    *,
-    ended: bool = False,
-    silent_s: float = 0.0,
-) -> SiteRow:
-    """Composes the table row of one arm: mode, joint angles, torque and so on, as texts.
-
-    The texts follow from the newest record and statistics of the arm's process, its site.
-
-    Args:
-        scenario: Scenario of the session.
-        name: Name of the site.
-        record: Result of the site's newest tick. None if none has arrived.
-        stats: Newest statistics of the site. None if none have arrived.
-        ended: True if the site has published its end.
-        silent_s: Time since a message of the site arrived, in s. 0 if one has just arrived.
-
-    Returns:
-        The texts by the headings of the columns. Unknown ones are empty.
+    Unknown texts are empty.
     """
-    row = dict.fromkeys(HEADS, "") | {"site": name, "mode": "braked"}
-    if stats is not None:
-        age_texts = []
-        for peer, age_us in stats.age_us.items():
-            has_arrived = age_us >= 0
-            age_text = f"{age_us / 1000:.0f} ms" if has_arrived else "none"
-            age_texts.append(f"{peer} {age_text}")
-        row |= {
-            "time": f"{stats.t_ns / NS_PER_S:.1f} s",
-            "mode": stats.mode,
-            AGES: ", ".join(age_texts),
-            "late": f"{stats.late_max_us} us",
-            "overruns": f"{stats.overruns}",
+
+    @classmethod
+    def of_site(
+        cls,
+        scenario: Scenario,
+        name: str,
+        record: State | None,
+        stats: LinkStats | None,
+        *,
+        ended: bool = False,
+        silent_s: float = 0.0,
+    ) -> "StatusRow":
+        """Composes the row of one arm: mode, joint angles, torque and so on.
+
+        The texts follow from the newest record and statistics of the arm's process, its site.
+
+        Args:
+            scenario: Scenario of the session.
+            name: Name of the site.
+            record: Result of the site's newest tick. None if none has arrived.
+            stats: Newest statistics of the site. None if none have arrived.
+            ended: True if the site has published its end.
+            silent_s: Time since a message of the site arrived, in s. 0 if one has just arrived.
+        """
+        row = cls(dict.fromkeys(_HEADINGS, ""), site=name, mode="braked")
+        if stats is not None:
+            age_texts = []
+            for peer, age_us in stats.age_us.items():
+                has_arrived = age_us >= 0
+                age_text = f"{age_us / 1000:.0f} ms" if has_arrived else "none"
+                age_texts.append(f"{peer} {age_text}")
+            row.update(
+                {
+                    "time": f"{stats.t_ns / NS_PER_S:.1f} s",
+                    "mode": stats.mode,
+                    AGES: ", ".join(age_texts),
+                    "late": f"{stats.late_max_us} us",
+                    "overruns": f"{stats.overruns}",
+                }
+            )
+
+        if record is not None:
+            row.update(_describe_record(scenario, name, record))
+
+        if ended:
+            row["mode"] = "ended"
+        elif silent_s > 0.0:
+            row["mode"] = f"silent {silent_s:.0f} s"
+        return row
+
+    @classmethod
+    def of_pose(cls, name: str, t_s: float, q: Sequence[float]) -> "StatusRow":
+        """Composes the row of an arm of which only the pose at one time is known.
+
+        Args:
+            name: Name of the site.
+            t_s: Time of the pose, in s.
+            q: Joint angles in rad. Empty if the pose is not known either.
+        """
+        row = cls(dict.fromkeys(_HEADINGS, ""), site=name)
+        if q:
+            row["time"] = f"{t_s:.3f} s"
+            row["angles"] = _describe_angles(q)
+        return row
+
+    def describe(self) -> str:
+        """Returns the state of the arm as a line, for an output that cannot show a table.
+
+        The line contains only the most important columns.
+        """
+        headings_by_label = {
+            "|e|": "|e|",
+            "torque": "torque",
+            "age": AGES,
+            "hand": "held",
+            "late": "late",
         }
-
-    if record is not None:
-        row |= _describe_record(scenario, name, record)
-
-    if ended:
-        row["mode"] = "ended"
-    elif silent_s > 0.0:
-        row["mode"] = f"silent {silent_s:.0f} s"
-    return row
+        texts = [f"{self['site']} {self['time']} {self['mode']}".strip(), self["angles"]]
+        for label, heading in headings_by_label.items():
+            if self[heading]:
+                texts.append(f"{label} {self[heading]}")
+        return "; ".join(texts)
 
 
-def _describe_record(scenario: Scenario, name: str, record: State) -> SiteRow:
+def _describe_record(scenario: Scenario, name: str, record: State) -> dict[str, str]:
     """Returns the texts of an arm's table row that follow from its newest record.
 
     The display of `trilat demo` and `trilat watch` has one row per arm.
@@ -121,7 +169,7 @@ def _describe_record(scenario: Scenario, name: str, record: State) -> SiteRow:
     return {
         "time": f"{record.t_ns / NS_PER_S:.1f} s",
         "mode": record.mode,
-        "angles": describe_angles(record.q),
+        "angles": _describe_angles(record.q),
         "|e|": f"{np.linalg.norm(error):.4f} {unit}",
         "torque": f"{max(map(abs, record.tau)):.2f} N m",
         "held": _describe_hold(hand),
@@ -150,42 +198,12 @@ def _describe_hold(hand: HandInForce | None) -> str:
     return "fades" if is_fading else "free"
 
 
-def describe_angles(q: Sequence[float]) -> str:
-    """Formats the joint angles of an arm so briefly that they fit into a table column.
-
-    Args:
-        q: Joint angles in rad.
-
-    Returns:
-        The angles as one short text.
-    """
+def _describe_angles(q: Sequence[float]) -> str:
+    """Formats the joint angles of an arm, in rad, briefly enough for a column of the table."""
     return " ".join(f"{angle:+.3f}" for angle in q) + " rad"
 
 
-def describe_row(row: SiteRow) -> str:
-    """Returns the state of one arm in a session as a line of text.
-
-    Outputs that cannot show a table, such as a file, use it. The line contains only the most
-    important columns.
-
-    Args:
-        row: The texts of the row, by the headings of the columns.
-    """
-    headings_by_label = {
-        "|e|": "|e|",
-        "torque": "torque",
-        "age": AGES,
-        "hand": "held",
-        "late": "late",
-    }
-    texts = [f"{row['site']} {row['time']} {row['mode']}".strip(), row["angles"]]
-    for label, heading in headings_by_label.items():
-        if row[heading]:
-            texts.append(f"{label} {row[heading]}")
-    return "; ".join(texts)
-
-
-def frame_alarms(alarms: Sequence[tuple[str, LifeAlarm]]) -> list[Panel]:
+def _frame_alarms(alarms: Sequence[tuple[str, LifeAlarm]]) -> list[Panel]:
     """Composes a coloured panel for the terminal for each arm that needs attention.
 
     A panel is red if the arm stays stopped until a user acts. It is yellow if the arm continues
@@ -254,7 +272,10 @@ class SessionDisplay:
         self._console.print(text, highlight=False, markup=False, soft_wrap=True)
 
     def show(
-        self, title: str, rows: Sequence[SiteRow], alarms: Sequence[tuple[str, LifeAlarm]] = ()
+        self,
+        title: str,
+        rows: Sequence[StatusRow],
+        alarms: Sequence[tuple[str, LifeAlarm]] = (),
     ) -> None:
         """Refreshes the table of the arms in the terminal, and the alarms above the table.
 
@@ -270,20 +291,20 @@ class SessionDisplay:
             alarm_lines = [f"*** {name} {alarm}" for name, alarm in alarms]
             title_lines = [title] if title != self._title else []
             self._title = title
-            row_lines = [describe_row(row) for row in rows if row["time"]]
+            row_lines = [row.describe() for row in rows if row["time"]]
             for line in [*title_lines, *alarm_lines, *row_lines]:
                 self.say(line)
             return
 
         table = Table(title=escape(title), title_justify="left")
-        for heading in HEADS:
+        for heading in _HEADINGS:
             table.add_column(heading, justify="right" if heading in NUMBERS else "left")
         for row in rows:
             table.add_row(*map(escape, row.values()))
         # The table is started only now. If it was started before the `with` block, a signal
         # before the first update would leave the terminal in a wrong state.
         self._live.start()
-        self._live.update(Group(*frame_alarms(alarms), table), refresh=True)
+        self._live.update(Group(*_frame_alarms(alarms), table), refresh=True)
 
 
 class SessionMonitor:
@@ -339,7 +360,7 @@ class SessionMonitor:
 
         if self._display.due:
             rows = [
-                describe_site(scenario, name, self.records.get(name), self.latest.get(name))
+                StatusRow.of_site(scenario, name, self.records.get(name), self.latest.get(name))
                 for name in scenario.names
             ]
             self._display.show(f"{scenario.name}, {scenario.duration_s:g} s", rows)

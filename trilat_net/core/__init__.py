@@ -43,7 +43,6 @@ __all__ = [
     "ChainSetup",
     "Gains",
     "Law",
-    "LinkRow",
     "LinkSetup",
     "MotionLimits",
     "RecordedRows",
@@ -56,7 +55,6 @@ __all__ = [
     "StaleRule",
     "TaskSetup",
     "TickRepeater",
-    "apply_change",
     "links_bytes",
     "make_layout",
     "needed_pages",
@@ -68,53 +66,16 @@ __all__ = [
     "Row",
     "RowArray",
     "Vector",
-    "choose",
-    "five",
-    "holds_anywhere",
-    "pair",
-    "put_pair",
     "relative_rotation",
     "rotation_matrix",
-    "round_down",
     "sincos",
     "tanh",
-    "whole",
     # Compiled functions
     "compiling_notice",
     "compute_fingerprint",
-    "find_lane_address",
     "is_core_cached",
-    "is_lane_code_stored",
-    "lane_leaf",
     "leaf",
     "loop_leaf",
-    "read_lane_assembly",
-    "set_lane_form",
-    # The stages of a tick, for runs side by side
-    "NEVER_NS",
-    "PROGRESS_DTYPE",
-    "LawArrays",
-    "RecentRecords",
-    "ReplayedInputs",
-    "adapts",
-    "channel_of",
-    "emit_stage",
-    "error_stages",
-    "finish_advance",
-    "finish_site",
-    "first_sent_column",
-    "guard_reference",
-    "guard_torque",
-    "hold_motor_torque",
-    "max_over_joints",
-    "run_until",
-    "sense_site",
-    "sum_trapezoid",
-    "sums_dtype",
-    "torque_stage",
-    "update_peaks",
-    "update_sums",
-    "updates_estimate",
     # Arms
     "COULOMB_SPEED",
     "LINK_PARAMETERS",
@@ -139,57 +100,33 @@ __all__ = [
     "propagate_motion",
     "regressor",
     "rotate",
-    "task_space",
     "theta_from_links",
     "three",
     "two_link_stages",
     # Torques of operators and environments
     "LIVE_KINDS",
-    "NO_TORQUE",
     "OWN_KINDS",
     "SCRIPTED_KINDS",
-    "SourceTorque",
     "TorqueKind",
     "TorqueSource",
-    "TorqueTable",
-    "add_source_torque",
-    "torque_on_arm",
     # Links and dominance
     "AHEAD_LIMIT_NS",
-    "DELAY",
     "LINK_MODEL_DTYPE",
-    "LOSS",
     "LOST",
     "MAX_DELAY_US",
     "ROW_SUM_TOLERANCE",
-    "ChannelArrays",
     "DelayKind",
-    "DrawKey",
-    "LinkArrays",
     "LinkModel",
     "TraceEnd",
-    "accept_sample",
-    "advance_losses",
-    "clamp_delay_us",
-    "delay_sample",
     "dominance",
-    "draw_delay_us",
     "draw_pair",
     "find_balancing_weights",
-    "find_delay_us",
-    "find_due_ns",
     "find_reach",
     "is_irreducible",
     "link_dtype",
     "link_key",
-    "loses_samples",
-    "max_delay_us",
     "perron_vector",
-    "release_sample",
     "schedule_deliveries",
-    "select_model",
-    "uniforms",
-    "update_reference",
     # Live hands and hands of users
     "GRIP_NS",
     "SILENCE_NS",
@@ -209,40 +146,42 @@ __all__ = [
     "BLEND_S",
     "HELD_OVERRUN_TICKS",
     "REST_RATE_1_S",
-    "SeveralHands",
     # Control laws of users
-    "CHECKED",
     "MAX_RECORD_SENT",
     "MAX_SENT",
-    "CompiledLaw",
     "LawChannel",
     "LawContext",
     "LawEnergies",
-    "LawForm",
     "LawInput",
     "LawRecords",
     "PeerRecords",
     "PeerView",
-    "PlainLaw",
     "SentVector",
     "UserLaw",
     "UserLawFactory",
-    "call_address",
-    "collect_law_input",
     "compile_to_address",
     "compiled",
-    "digest_sibling_sources",
-    "finish_law",
     "list_numbers",
     "list_remembered",
     "plug_law",
     "read_memory",
     "sum_work",
-    "update_law_view",
+    # Runs of several sites, alone and side by side
+    "CompiledRun",
+    "LaneEndedError",
+    "LaneEpisodes",
+    "LaneTwin",
+    "RunGroup",
+    "RunInputs",
+    "TwinLanes",
+    "describe_structure",
+    "group_runs",
+    "prepare_lanes",
+    "suits_twins",
 ]
 
 if TYPE_CHECKING:
-    from .arms import chain_stages, task_space, two_link_stages
+    from .arms import chain_stages, two_link_stages
     from .arms.chain import (
         COULOMB_SPEED,
         LINK_PARAMETERS,
@@ -264,21 +203,14 @@ if TYPE_CHECKING:
         three,
     )
     from .arms.elementary import sincos, tanh
-    from .arms.exogenous import (
-        LIVE_KINDS,
-        NO_TORQUE,
-        OWN_KINDS,
-        SCRIPTED_KINDS,
-        SourceTorque,
-        TorqueKind,
-        TorqueSource,
-        TorqueTable,
-        add_source_torque,
-        torque_on_arm,
-    )
+    from .arms.exogenous import LIVE_KINDS, OWN_KINDS, SCRIPTED_KINDS, TorqueKind, TorqueSource
     from .arms.rotation import relative_rotation, rotation_matrix
     from .arms.task_space import POSE, POSITION
     from .arms.two_link_arm import ArmLinks, forward_kinematics, regressor, theta_from_links
+    from .lanes.lane_episodes import LaneEpisodes
+    from .lanes.lane_structure import describe_structure
+    from .lanes.run_groups import RunGroup, group_runs, prepare_lanes
+    from .lanes.twin_lanes import LaneEndedError, LaneTwin, TwinLanes, suits_twins
     from .life.live_hand import (
         GRIP_NS,
         SILENCE_NS,
@@ -295,30 +227,15 @@ if TYPE_CHECKING:
     from .life.resting import REST_RATE_1_S
     from .life.safeguards import BLEND_S
     from .life.session_life import HELD_OVERRUN_TICKS
-    from .life.several_hands import SeveralHands
     from .links import dominance
-    from .links.channel import (
-        LOST,
-        advance_losses,
-        delay_sample,
-        find_delay_us,
-        find_due_ns,
-        loses_samples,
-        schedule_deliveries,
-        select_model,
-    )
+    from .links.channel import LOST, schedule_deliveries
     from .links.delay import (
-        DELAY,
         LINK_MODEL_DTYPE,
-        LOSS,
         MAX_DELAY_US,
         DelayKind,
         LinkModel,
         TraceEnd,
-        clamp_delay_us,
-        draw_delay_us,
         draw_pair,
-        max_delay_us,
     )
     from .links.dominance import (
         ROW_SUM_TOLERANCE,
@@ -326,35 +243,13 @@ if TYPE_CHECKING:
         find_reach,
         is_irreducible,
         perron_vector,
-        update_reference,
     )
-    from .links.link import (
-        AHEAD_LIMIT_NS,
-        ChannelArrays,
-        LinkArrays,
-        accept_sample,
-        link_dtype,
-        release_sample,
-    )
-    from .links.philox import DrawKey, link_key, uniforms
-    from .plug.compiled_law import (
-        CHECKED,
-        CompiledLaw,
-        LawForm,
-        collect_law_input,
-        compiled,
-        finish_law,
-        plug_law,
-    )
+    from .links.link import AHEAD_LIMIT_NS, link_dtype
+    from .links.philox import link_key
+    from .plug.compiled_law import compiled, plug_law
     from .plug.law_channel import MAX_RECORD_SENT, MAX_SENT, LawChannel, SentVector
     from .plug.law_energy import LawEnergies, LawRecords, PeerRecords, sum_work
-    from .plug.law_view import PlainLaw, update_law_view
-    from .plug.plugged import (
-        call_address,
-        compile_to_address,
-        digest_sibling_sources,
-        list_numbers,
-    )
+    from .plug.plugged import compile_to_address, list_numbers
     from .plug.user_law import (
         LawContext,
         LawInput,
@@ -364,55 +259,17 @@ if TYPE_CHECKING:
         list_remembered,
         read_memory,
     )
+    from .step.compiled_run import CompiledRun
     from .step.control import ROBUST_RESIDUE
     from .step.fingerprint import compute_fingerprint
-    from .step.fused_run import (
-        NEVER_NS,
-        PROGRESS_DTYPE,
-        LawArrays,
-        RecentRecords,
-        ReplayedInputs,
-        finish_site,
-        first_sent_column,
-        max_over_joints,
-        run_until,
-        sense_site,
-        sums_dtype,
-        update_peaks,
-        update_sums,
-    )
-    from .step.jit import (
-        compiling_notice,
-        find_lane_address,
-        is_core_cached,
-        is_lane_code_stored,
-        lane_leaf,
-        leaf,
-        loop_leaf,
-        read_lane_assembly,
-        set_lane_form,
-    )
-    from .step.kernel import (
-        adapts,
-        channel_of,
-        emit_stage,
-        error_stages,
-        finish_advance,
-        guard_reference,
-        guard_torque,
-        hold_motor_torque,
-        sum_trapezoid,
-        torque_stage,
-        updates_estimate,
-    )
+    from .step.jit import compiling_notice, is_core_cached, leaf, loop_leaf
     from .step.recorded_ticks import RecordedRows, TickRepeater
-    from .step.row_fields import LinkRow
+    from .step.run_inputs import RunInputs
     from .step.site_arrays import (
         MAX_CHANGES,
         MAX_LINKS_BYTES,
         MAX_RAMPS,
         SiteArrays,
-        apply_change,
         links_bytes,
         needed_pages,
     )
@@ -448,22 +305,7 @@ if TYPE_CHECKING:
         first_tick_at,
         tick_ns,
     )
-    from .step.vectors import (
-        Array,
-        IntArray,
-        Pair,
-        Points,
-        Row,
-        RowArray,
-        Vector,
-        choose,
-        five,
-        holds_anywhere,
-        pair,
-        put_pair,
-        round_down,
-        whole,
-    )
+    from .step.vectors import Array, IntArray, Pair, Points, Row, RowArray, Vector
 else:
     __getattr__ = import_on_use(
         __name__,
@@ -476,14 +318,15 @@ else:
             ),
             "arms.chain_stages": "chain_stages",
             "arms.elementary": "sincos tanh",
-            "arms.exogenous": (
-                "LIVE_KINDS NO_TORQUE OWN_KINDS SCRIPTED_KINDS SourceTorque TorqueKind "
-                "TorqueSource TorqueTable add_source_torque torque_on_arm"
-            ),
+            "arms.exogenous": "LIVE_KINDS OWN_KINDS SCRIPTED_KINDS TorqueKind TorqueSource",
             "arms.rotation": "relative_rotation rotation_matrix",
-            "arms.task_space": "POSE POSITION task_space",
+            "arms.task_space": "POSE POSITION",
             "arms.two_link_arm": "ArmLinks forward_kinematics regressor theta_from_links",
             "arms.two_link_stages": "two_link_stages",
+            "lanes.lane_episodes": "LaneEpisodes",
+            "lanes.lane_structure": "describe_structure",
+            "lanes.run_groups": "RunGroup group_runs prepare_lanes",
+            "lanes.twin_lanes": "LaneEndedError LaneTwin TwinLanes suits_twins",
             "life.live_hand": (
                 "GRIP_NS HandCommand HandInForce HandMemory HandReach HandRules SILENCE_NS "
                 "TAKEN advance_hand empty_hand_vector"
@@ -492,57 +335,32 @@ else:
             "life.resting": "REST_RATE_1_S",
             "life.safeguards": "BLEND_S",
             "life.session_life": "HELD_OVERRUN_TICKS",
-            "life.several_hands": "SeveralHands",
-            "links.channel": (
-                "LOST advance_losses delay_sample find_delay_us find_due_ns loses_samples "
-                "schedule_deliveries select_model"
-            ),
+            "links.channel": "LOST schedule_deliveries",
             "links.delay": (
-                "DELAY DelayKind LINK_MODEL_DTYPE LOSS LinkModel MAX_DELAY_US TraceEnd "
-                "clamp_delay_us draw_delay_us draw_pair max_delay_us"
+                "DelayKind LINK_MODEL_DTYPE LinkModel MAX_DELAY_US TraceEnd draw_pair"
             ),
             "links.dominance": (
                 "ROW_SUM_TOLERANCE dominance find_balancing_weights find_reach "
-                "is_irreducible perron_vector update_reference"
+                "is_irreducible perron_vector"
             ),
-            "links.link": (
-                "AHEAD_LIMIT_NS ChannelArrays LinkArrays accept_sample link_dtype "
-                "release_sample"
-            ),
-            "links.philox": "DrawKey link_key uniforms",
-            "plug.compiled_law": (
-                "CHECKED CompiledLaw LawForm collect_law_input compiled finish_law plug_law"
-            ),
+            "links.link": "AHEAD_LIMIT_NS link_dtype",
+            "links.philox": "link_key",
+            "plug.compiled_law": "compiled plug_law",
             "plug.law_channel": "LawChannel MAX_RECORD_SENT MAX_SENT SentVector",
             "plug.law_energy": "LawEnergies LawRecords PeerRecords sum_work",
-            "plug.law_view": "PlainLaw update_law_view",
-            "plug.plugged": (
-                "call_address compile_to_address digest_sibling_sources list_numbers"
-            ),
+            "plug.plugged": "compile_to_address list_numbers",
             "plug.user_law": (
                 "LawContext LawInput PeerView UserLaw UserLawFactory list_remembered "
                 "read_memory"
             ),
+            "step.compiled_run": "CompiledRun",
             "step.control": "ROBUST_RESIDUE",
             "step.fingerprint": "compute_fingerprint",
-            "step.fused_run": (
-                "LawArrays NEVER_NS PROGRESS_DTYPE RecentRecords ReplayedInputs finish_site "
-                "first_sent_column max_over_joints run_until sense_site sums_dtype "
-                "update_peaks update_sums"
-            ),
-            "step.jit": (
-                "compiling_notice find_lane_address is_core_cached is_lane_code_stored "
-                "lane_leaf leaf loop_leaf read_lane_assembly set_lane_form"
-            ),
-            "step.kernel": (
-                "adapts channel_of emit_stage error_stages finish_advance guard_reference "
-                "guard_torque hold_motor_torque sum_trapezoid torque_stage updates_estimate"
-            ),
+            "step.jit": "compiling_notice is_core_cached leaf loop_leaf",
             "step.recorded_ticks": "RecordedRows TickRepeater",
-            "step.row_fields": "LinkRow",
+            "step.run_inputs": "RunInputs",
             "step.site_arrays": (
-                "MAX_CHANGES MAX_LINKS_BYTES MAX_RAMPS SiteArrays apply_change links_bytes "
-                "needed_pages"
+                "MAX_CHANGES MAX_LINKS_BYTES MAX_RAMPS SiteArrays links_bytes needed_pages"
             ),
             "step.site_setup": (
                 "ChainSetup Gains Law LinkSetup MotionLimits RestGains Scheme SiteSetup "
@@ -554,9 +372,6 @@ else:
                 "MAX_ARRIVALS PlantState RELEASE_REASONS TickInput describe_divergence "
                 "describe_mode find_life_reason first_tick_at tick_ns"
             ),
-            "step.vectors": (
-                "Array IntArray Pair Points Row RowArray Vector choose five holds_anywhere "
-                "pair put_pair round_down whole"
-            ),
+            "step.vectors": "Array IntArray Pair Points Row RowArray Vector",
         },
     )

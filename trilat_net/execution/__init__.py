@@ -2,7 +2,7 @@
 
 `virtual` simulates an experiment without real clocks and network. `verification` executes a log
 again, to check that it is correct. `what_if` does so with other settings, to show what would
-have happened. The package `lanes` computes many simulations at once with vector instructions.
+have happened. `fused` simulates runs for studies, without writing logs.
 """
 
 from typing import TYPE_CHECKING
@@ -22,12 +22,6 @@ __all__ = [
     "simulate_columns",
     "simulate_scenario",
     "simulate_without_operators",
-    # Runs side by side
-    "LaneEpisodes",
-    "RunGroup",
-    "describe_structure",
-    "group_runs",
-    "prepare_lanes",
     # Execution of a log
     "LogCheckReport",
     "Rerun",
@@ -46,9 +40,6 @@ __all__ = [
 
 if TYPE_CHECKING:
     from .fused import FusedRun, check_fusable, explain_not_repeatable
-    from .lanes.lane_episodes import LaneEpisodes
-    from .lanes.lane_structure import describe_structure
-    from .lanes.run_groups import RunGroup, group_runs, prepare_lanes
     from .log_checks import LogCheckReport, check_log_files
     from .twins import LEAST_PUSH, MOST_PUSH, PUSH_RAD, SMALLEST, Push, TwinPath, Twins
     from .unwritten_run import simulate_columns
@@ -67,9 +58,6 @@ else:
         __name__,
         {
             "fused": "FusedRun check_fusable explain_not_repeatable",
-            "lanes.lane_episodes": "LaneEpisodes",
-            "lanes.lane_structure": "describe_structure",
-            "lanes.run_groups": "RunGroup group_runs prepare_lanes",
             "log_checks": "LogCheckReport check_log_files",
             "twins": "LEAST_PUSH MOST_PUSH PUSH_RAD Push SMALLEST TwinPath Twins",
             "unwritten_run": "simulate_columns",

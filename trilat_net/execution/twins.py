@@ -25,12 +25,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ..core import BUCKETS_PER_S, Array, Law
+from ..core import BUCKETS_PER_S, Array, Law, RunInputs
 from ..errors import NotRepeatable, UsageError, count_nouns
 from ..log import Ints, Log
 from ..records import NS_PER_S
 from ..scenario import Scenario
-from .fused import FusedRun, RunInputs, explain_not_repeatable, read_run_inputs
+from .fused import FusedRun, explain_not_repeatable, read_run_inputs
 
 MAX_PUSHES = 32
 """Largest number of pushes that are chosen if the user states no number."""
@@ -395,7 +395,7 @@ def _run_twins(
         log: Log of the recorded run, with which the repeated run is compared.
     """
     # Imported late, so that programs that need no twins do not load this code.
-    from .lanes.twin_lanes import LaneEndedError, suits_twins
+    from ..core import LaneEndedError, suits_twins
 
     run = FusedRun(scenario, inputs=inputs)
     has_changes = inputs is not None and bool(inputs.changes)
@@ -748,7 +748,7 @@ class _LaneTwinRuns(_TwinRuns):
         record_count: int,
     ) -> list[Any]:
         """Creates the run and its twins (displaced copies), each in a lane of the vectors."""
-        from .lanes.twin_lanes import LaneTwin, TwinLanes
+        from ..core import LaneTwin, TwinLanes
 
         run = FusedRun(scenario, inputs=inputs)
         count = 1 + len(self._pushes)

@@ -8,7 +8,7 @@ of two master arms, typically a thousand times per second. The package contains:
 - the messages and their encoding: `messages`, `requests`, `wire`, `topics`;
 - the clocks of the machines and their comparison: `clock`, `pinging`, `offset`, `timing`;
 - the common start of all processes: `membership`, `session`, `discovery`;
-- connections of other programs to a session: `arm_client`, `known_sites`, `ros2_graph`.
+- connections of other programs to a session: `arm_client`, `known_sites`, `ros2`.
 """
 
 from typing import TYPE_CHECKING
@@ -25,6 +25,7 @@ __all__ = [
     "ROUTER",
     "Bus",
     "Connection",
+    "Endpoint",
     "Inbox",
     "Query",
     "QueryInbox",
@@ -40,6 +41,7 @@ __all__ = [
     "is_loopback",
     "make_site_known",
     "matches_key",
+    "open_zenoh",
     "read_zenoh_file",
     "reserve_session_endpoints",
     "run_router",
@@ -141,15 +143,6 @@ __all__ = [
     "Hand",
     "SiteClient",
     "SwitchClient",
-    # ROS 2
-    "DISTROS",
-    "ROUTER_ADVICE",
-    "Attachment",
-    "QualityOfService",
-    "Refusals",
-    "Ros2Graph",
-    "TopicPublisher",
-    "check_ros_name",
 ]
 
 if TYPE_CHECKING:
@@ -236,16 +229,6 @@ if TYPE_CHECKING:
         OrderName,
         PeerSeen,
     )
-    from .ros2_graph import (
-        DISTROS,
-        ROUTER_ADVICE,
-        Attachment,
-        QualityOfService,
-        Refusals,
-        Ros2Graph,
-        TopicPublisher,
-    )
-    from .ros2_names import check_ros_name
     from .session import SessionJoin
     from .site_stand_in import SiteStandIn
     from .timing import (
@@ -275,8 +258,8 @@ if TYPE_CHECKING:
         make_reader,
         split_states,
     )
-    from .zenoh_bus import RouterSilent, ZenohBus, read_zenoh_file, share_threads
-    from .zenoh_config import BRIDGE, OPERATOR, ROLES, ROUTER, describe_role
+    from .zenoh_bus import RouterSilent, ZenohBus, open_zenoh, read_zenoh_file, share_threads
+    from .zenoh_config import BRIDGE, OPERATOR, ROLES, ROUTER, Endpoint, describe_role
 else:
     __getattr__ = import_on_use(
         __name__,
@@ -312,11 +295,6 @@ else:
                 "BackfillRequest ChangeReply ChangeRequest HandMessage HandViewMessage "
                 "OrderName PeerSeen"
             ),
-            "ros2_graph": (
-                "Attachment DISTROS QualityOfService ROUTER_ADVICE Refusals Ros2Graph "
-                "TopicPublisher"
-            ),
-            "ros2_names": "check_ros_name",
             "session": "SessionJoin",
             "site_stand_in": "SiteStandIn",
             "timing": (
@@ -330,7 +308,7 @@ else:
                 "MAX_BYTES decode encode encode_sample encode_state join_states "
                 "make_decoder make_reader split_states"
             ),
-            "zenoh_bus": "RouterSilent ZenohBus read_zenoh_file share_threads",
-            "zenoh_config": "BRIDGE OPERATOR ROLES ROUTER describe_role",
+            "zenoh_bus": "RouterSilent ZenohBus open_zenoh read_zenoh_file share_threads",
+            "zenoh_config": "BRIDGE Endpoint OPERATOR ROLES ROUTER describe_role",
         },
     )

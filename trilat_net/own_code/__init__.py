@@ -1,17 +1,18 @@
 """Runs code that users wrote, if a person has permitted it.
 
 A scenario, the description of an experiment, may name classes of users: control laws, programs
-that move an arm, and plants (simulations of an arm). A scenario may come from a stranger, so
-its code must not run unasked.
+that move an arm, and plants (simulations of an arm). A scenario may come from an unknown
+author, so its code must not run without permission.
 
 - `imported_code` finds a class by its module and name, and imports it if it is permitted.
-- `code_consent` manages permissions, for scenarios and logs that strangers may have written.
+- `code_consent` manages permissions, for scenarios and logs from unknown authors.
 - `sent_channel` reads which vectors the source of a law sends, without running it.
 - `class_arguments` checks the arguments that a scenario gives to a class.
 
 Invariant:
     - Nothing outside this package imports a module that a scenario or a log names.
-    - Nothing here knows the types of a scenario: any object with sites that name code will do.
+    - This package does not import the types of a scenario: it accepts any object whose sites
+      name code.
 """
 
 from typing import TYPE_CHECKING

@@ -18,7 +18,7 @@ _TYPE_NAMES: dict[type, tuple[tuple[type, ...], str]] = {
     int: ((int, float), "a number"),
     str: ((str,), "a text"),
 }
-"""For each type that is checked: the types of accepted values, and its name in errors."""
+"""For each checked type, the accepted types of values, and the name of the type in errors."""
 
 
 def make_own_instance(
@@ -26,7 +26,7 @@ def make_own_instance(
 ) -> Any:
     """Creates an object of a user's class, after a check of its arguments.
 
-    An argument that is wrong is reported by its path in the scenario, like any other key, and
+    A wrong argument is reported with its path in the scenario, like any other wrong key, and
     not as an exception within the class.
 
     Args:
@@ -45,7 +45,7 @@ def make_own_instance(
 
 
 def check_arguments(kind: Any, code: str, settings: Mapping[str, Any], path: str) -> None:
-    """Refuses arguments in a scenario that a user's class does not accept.
+    """Rejects arguments in a scenario that a user's class does not accept.
 
     The check compares them with the constructor of the class, before an object is created, so
     that the error names the wrong key of the scenario.
@@ -63,8 +63,8 @@ def check_arguments(kind: Any, code: str, settings: Mapping[str, Any], path: str
     try:
         signature = inspect.signature(kind)
     except (TypeError, ValueError):
-        return  # a class of C code has no signature, and itself refuses wrong arguments
-    parameters = list(signature.parameters.values())[1:]  # without the facts
+        return  # a class written in C has no signature, and rejects wrong arguments itself
+    parameters = list(signature.parameters.values())[1:]  # without `context`
     named = {
         parameter.name: parameter
         for parameter in parameters
@@ -88,7 +88,7 @@ def check_arguments(kind: Any, code: str, settings: Mapping[str, Any], path: str
     for name, parameter in named.items():
         if parameter.default is parameter.empty and name not in settings:
             raise ScenarioError(
-                f"{subject} needs a value of its argument {name}, which has no default; its "
+                f"{subject} needs a value for its argument {name}, which has no default; its "
                 f"__init__ takes {accepted}",
                 path=path,
             )
@@ -101,11 +101,11 @@ def _describe_class(kind: Any, code: str) -> str:
 
 
 def _check_type(parameter: inspect.Parameter, value: Any, subject: str, path: str) -> None:
-    """Checks that a value has the type which a user's class expects for an argument.
+    """Checks that a value has the type that a user's class expects for an argument.
 
-    The type is that of the annotation. Without an annotation, it is the type of the default,
-    and only a text in place of a number, or the reverse, is refused: the class may accept lists
-    as well.
+    The type is that of the annotation. Without an annotation, it is the type of the default.
+    The class may then accept other types such as lists, so only a string in place of a number,
+    or a number in place of a string, is rejected.
 
     Args:
         parameter: The argument.

@@ -2,9 +2,9 @@
 
 A scenario describes an experiment and may name classes that users wrote: control laws, programs
 that move an arm, and plants (simulations of an arm). Code that users name in their own scenario
-may run. A log, or another member of a session, may come from a stranger. Code that these name
-may run only if a person names its file. The person may let the program remember the permission
-in the configuration folder.
+may run. A log, or another member of a session, may have an unknown author. Code that it names
+may run only if a person names the file of the code. The person may let the program remember the
+permission in the configuration folder.
 
 Invariant:
     - The file that a person names must have the hash that the log states, unless the person
@@ -42,7 +42,7 @@ from .imported_code import (
 
 AnyScenario = TypeVar("AnyScenario", bound=ScenarioWithCode)
 LawFiles = str | Path | Sequence[str | Path]
-"""File with code of a user, or several such files."""
+"""Path of a file with a user's code, or several such paths."""
 
 
 def list_imported_code(scenarios: Iterable[ScenarioWithCode]) -> list[tuple[str, str]]:
@@ -76,10 +76,10 @@ def _list_named_code(scenario: ScenarioWithCode) -> list[NamedCode]:
 
 @cache
 def _names_code(kind: object) -> bool:
-    """Returns True if entries of a class name a user's class.
+    """Returns True if scenario entries of the given class name a user's class.
 
-    The result is kept for each class, because `isinstance` with a protocol is slow: it took a
-    twelfth of the reset of a training environment.
+    The result is cached for each class, because `isinstance` with a protocol is slow: without
+    the cache, it took one twelfth of the time to reset a training environment.
 
     Args:
         kind: Class of an entry of a scenario.
@@ -94,8 +94,8 @@ def allow_own_code(
 ) -> AnyScenario:
     """Permits users' classes to run, because a user of this process has named them.
 
-    Code that nobody has named or permitted is refused, since the description of an experiment
-    that comes from elsewhere may name harmful code.
+    Code that nobody has named or permitted is rejected, because a scenario from elsewhere may
+    name harmful code.
 
     Args:
         scenario: Scenario that names the code.
@@ -158,10 +158,10 @@ def allow_logged_code(
     other_version: bool = False,
     remember: bool = False,
 ) -> None:
-    """Allows the code that a log names to run, as far as a person has permitted it.
+    """Allows code that a log names to run, if a person has permitted it.
 
-    A log may come from a stranger, so its code does not run without permission. A person
-    permits code by naming its file now, or has stored a permission before. See `open_log`.
+    A log may have an unknown author, so its code does not run without permission. A person
+    permits code by naming its file now, or by a permission stored earlier. See `open_log`.
 
     Args:
         scenario: Scenario of the log, which names the code.
@@ -179,7 +179,7 @@ def allow_logged_code(
         raise UsageError("--other-version and --remember need a file: give --law FILE, too")
     logged = {CodeKey.of(imported): imported for imported in _list_named_code(scenario)}
 
-    # Without code of users, the store is not read.
+    # If the log names no user's code, the store is not read.
     remembered = _read_store() if logged else {}
     _load_remembered_settings(remembered)
     for key in logged:
@@ -201,9 +201,9 @@ def allow_logged_code(
 
 
 def _load_remembered_settings(remembered: Mapping[str, _RememberedFile]) -> None:
-    """Loads with which arguments stored permissions were given.
+    """Loads the arguments for which stored permissions were given.
 
-    Messages about code that is refused then say which arguments differ.
+    A message about rejected code can then say which arguments differ.
 
     Args:
         remembered: Stored permissions, by the hash of the file.
@@ -222,7 +222,7 @@ def _class_of(key: CodeKey) -> str:
 
 
 def _find_store() -> Path:
-    """Returns the path of the file with the permissions of this user to run code of others."""
+    """Returns the path of the file that stores the user's permissions to run others' code."""
     folder = os.environ.get("XDG_CONFIG_HOME") or Path.home() / ".config"
     return Path(folder, "trilat-net", "laws.json")
 
@@ -256,7 +256,7 @@ def _write_store(remembered: Mapping[str, _RememberedFile]) -> None:
 def _allow_file(
     file: Path, logged: Mapping[CodeKey, NamedCode], *, other_version: bool
 ) -> tuple[str, list[CodeKey]]:
-    """Permits a file that the user names to run as code that a log names.
+    """Permits a file named by the user to run as the code that a log names.
 
     The file belongs to the code that has the hash of the file. If there is no such code, it
     belongs to the code whose module has the name of the file; it is then another version of
@@ -311,11 +311,11 @@ class _LoggedUserLaw(NamedTuple):
     Attributes:
         code: Class of the law, for example "package.module:Law".
         sites: Names of the sites (arm controllers) that the law controls.
-        settings: Arguments of the class, as a string for people.
+        settings: Arguments of the class, as readable text.
         allowed: True if the file may run with these arguments.
         file: The file that a person permitted, or else the file that Python's import finds for
             the module. None if there is no such file.
-        changed: Text about the hashes if the file differs from the one that ran. Otherwise
+        changed: Text about the hashes if the file differs from the file that ran. Otherwise
             empty.
         other_settings: Text about the difference if the code was permitted with other
             arguments. Otherwise empty.

@@ -1,14 +1,14 @@
 """Imports classes that users wrote, if a person has permitted it.
 
 A scenario names a class by its module and its name, for example `law = "package.module:Law"`.
-Importing a module runs its code, and a scenario may come from a stranger. Therefore a person
-must permit the code before. A permission applies to one class in one file, which is identified
+Importing a module runs its code, and a scenario may have an unknown author. Therefore a person
+must permit the code first. A permission applies to one class in one file, which is identified
 by its SHA-256 hash.
 
 Invariant:
     - A scenario contains the hash of the file that defines a class. If a run is repeated from
       its log, the hash shows whether the code is still the code that ran.
-    - Looking up a class by its name runs no code, not even that of the packages around it.
+    - Looking up a class by its name runs no code, not even that of the enclosing packages.
     - `CodeKey.import_class` is the only way to run code of users. It imports a class only if
       `allowed_code` contains a permission, and if the file still has the permitted hash and
       defines a class of that name.
@@ -116,7 +116,7 @@ class _SiteWithCode(Protocol):
 class ScenarioWithCode(Protocol):
     """Interface of a scenario, the description of an experiment, which may name users' classes.
 
-    Only the attributes are listed that the checks of permissions need.
+    Only the attributes that the checks of permissions need are listed.
     """
 
     @property
@@ -125,7 +125,7 @@ class ScenarioWithCode(Protocol):
 
 
 ANY_SETTINGS = "*"
-"""In place of settings: the permission applies to all arguments.
+"""Used in place of the arguments of a class if a permission applies to all arguments.
 
 Only the worker processes of a study receive such a permission, because a study varies the
 arguments itself.
@@ -204,7 +204,7 @@ class CodeKey(NamedTuple):
         return f"it was allowed with other settings, but here {', '.join(smallest_difference)}"
 
     def import_class(self, path: str, method: str = "torque") -> Any:
-        """Imports a user's class from the file that may run for it.
+        """Imports a user's class from its permitted file.
 
         The file must be the one that a person permitted. It is checked before any of its code
         runs.
@@ -216,8 +216,8 @@ class CodeKey(NamedTuple):
         Raises:
             CodeWithheld: There is no permission.
             ScenarioError: The file differs from the permitted one, or does not define such a
-                class. In these cases, none of its code has run. Or the code raises an error
-                while it is imported.
+                class; none of its code has run in these cases. Also raised if the code raises
+                an error while it is imported.
         """
         code = self.code
         module, _, name = code.partition(":")
@@ -249,7 +249,7 @@ class CodeKey(NamedTuple):
                     imported = _execute(module, source)
                 else:
                     imported = _import(module, source.sha256)
-            # The user's code may raise anything.
+            # The user's code may raise any exception.
             except (Exception, SystemExit) as error:
                 problem = f"{module} cannot be imported: {describe_exception(error)}"
                 raise ScenarioError(problem, path=path) from None
@@ -349,8 +349,8 @@ _executed: dict["_CodeSource", Any] = {}
 class ImportedLaw(LawSettings, frozen=True, tag_field="law", tag="own"):
     """Control law of a scenario whose torques a user's Python class computes.
 
-    The scenario names the class and the hash of its file. It does not import the class, so that
-    a scenario of a stranger can be read without running any code of it.
+    The scenario names the class and the hash of its file. It does not import the class, so a
+    scenario from an unknown author can be read without running its code.
 
     Attributes:
         code: Module and class, for example "package.module:Law".
@@ -422,7 +422,7 @@ def read_code(code: str, path: str, file: Path | None = None) -> _CodeSource:
     Args:
         code: Module and class, for example "package.module:Law".
         path: Path of the key in the scenario, for error messages.
-        file: The file. None for the file that Python's import finds for the module.
+        file: The file. If None, it is the file that Python's import finds for the module.
 
     Raises:
         ScenarioError: There is no such file, or it cannot be read.
@@ -456,7 +456,7 @@ def _find_file(code: str, path: str) -> Path:
     if spec is None or spec.origin is None or not Path(spec.origin).is_file():
         raise ScenarioError(
             f"the module {module}, which {code} names, was not found; install the module, or "
-            "run the command in its folder (folders on PYTHONPATH are searched, too)",
+            "run the command in its folder (folders on PYTHONPATH are searched too)",
             path=path,
         )
     return Path(spec.origin)
@@ -515,14 +515,14 @@ PAGES = {
     "act": ("hand", "policies.md"),
     "step": ("plant", "own-plant.md"),
 }
-"""For each required method: the name of such a class, and its page in the docs."""
+"""For each required method, the name of this kind of class, and its documentation page."""
 
 
 def check_class(source: _CodeSource, code: str, path: str, method: str = "torque") -> None:
     """Checks that a Python file defines a certain class with a certain method.
 
-    The check reads the syntax of the file and runs no code of it, because nobody may have
-    permitted the code yet.
+    The check parses the file and runs no code of it, because the code may not have been
+    permitted to run yet.
 
     Args:
         source: File, as it was read from disk.
@@ -590,7 +590,8 @@ def _execute(module: str, source: _CodeSource) -> Any:
     try:
         exec(compile(source.content, file, "exec"), executed.__dict__)
     finally:
-        # A log may give its module any name: it must not replace another module for good.
+        # A log may give its module any name, so the module must not permanently replace another
+        # one.
         sys.modules.pop(module, None)
         if previous_module is not None:
             sys.modules[module] = previous_module
@@ -613,7 +614,7 @@ def _name_law_class(kind: type) -> str:
     module = kind.__module__
     name = kind.__qualname__
     if module == "__main__":
-        # The script that runs is a module under the name of its file.
+        # Python calls the running script `__main__`; a scenario names its module by the file.
         module = Path(getattr(sys.modules[module], "__file__", None) or "").stem
     if not module or not name.isidentifier():
         raise ScenarioError(
@@ -648,14 +649,15 @@ def _searching(folder: Path | None) -> Iterator[None]:
     A user's class can thus import other files that lie beside its own file.
 
     Args:
-        folder: The folder. None for the working directory, unless Python searches it already.
+        folder: The folder. If None, it is the working directory, unless Python searches it
+            already.
     """
     search_path = str(folder or Path.cwd())
     if folder is None and search_path in sys.path:
         yield
         return
     sys.path.insert(0, search_path)
-    # A file may have been written a moment ago.
+    # A file may have been written a moment ago, after Python read the contents of the folder.
     importlib.invalidate_caches()
     try:
         yield

@@ -1,4 +1,4 @@
-"""Finds out which numbers a user's control law sends to other arms, without running the law.
+"""Determines which vectors a user's control law sends to other arms, without running the law.
 
 Each arm sends its motion to the other arms. A law may send further vectors, for example waves
 or energies, which its class declares in `sends` (`laws.sent_vectors`). This module reads the
@@ -22,7 +22,7 @@ from ..records import Layout
 
 
 def build_channel(sends: SentVectorSpecs, layout: Layout, peers: int) -> LawChannel:
-    """Returns the vectors that a law sends from a site, with their lengths, in their order.
+    """Returns the vectors that a law sends from a site, with their lengths, in message order.
 
     A law declares the vectors without knowing the arm. Their lengths follow from the counts of
     joints and coordinates.
@@ -112,8 +112,8 @@ def _find_name_problem(name: str) -> str:
 def parse_classes(source: bytes, file: Path, path: str) -> dict[str, ast.ClassDef]:
     """Returns the classes in a Python file by name, without running the file.
 
-    Only classes at the top level are included. The syntax tree is read, because nobody may have
-    permitted the code yet.
+    Only classes at the top level are included. The file is only parsed, because the code may
+    not have been permitted to run yet.
 
     Args:
         source: Content of the file.
@@ -137,7 +137,7 @@ def parse_classes(source: bytes, file: Path, path: str) -> dict[str, ast.ClassDe
 def read_sends(source: bytes, file: Path, code: str, path: str) -> SentVectorSpecs:
     """Returns the vectors that a law's class declares in a file, without running the file.
 
-    The scenario must know these vectors before anybody has permitted the code.
+    The scenario needs these vectors before the code has been permitted to run.
 
     Args:
         source: Content of the file.

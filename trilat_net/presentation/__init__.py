@@ -56,7 +56,6 @@ __all__ = [
     "list_export_formats",
     "open_rerun",
     "write_foxglove_layout",
-    "write_rviz_config",
 ]
 
 if TYPE_CHECKING:
@@ -79,7 +78,7 @@ if TYPE_CHECKING:
         compose_topic_delays,
     )
     from .terminal_output import err, print_error, print_json, print_line, print_table
-    from .viewer_files import write_foxglove_layout, write_rviz_config
+    from .viewer_files import write_foxglove_layout
 else:
     __getattr__ = import_on_use(
         __name__,
@@ -101,7 +100,7 @@ else:
             "terminal_output": (
                 "err print_error print_json print_line print_table terminal_output"
             ),
-            "viewer_files": "write_foxglove_layout write_rviz_config",
+            "viewer_files": "write_foxglove_layout",
         },
     )
 

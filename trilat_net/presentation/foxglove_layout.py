@@ -30,7 +30,7 @@ from ..log.ros2 import (
     SPACING_M,
     STRING,
     WORLD,
-    Ros2Channel,
+    Ros2Channels,
 )
 from .rerun_viewer import CurvePlot, PlotLayout, build_plot_layout
 
@@ -45,8 +45,6 @@ _MODES_PERCENT = 60.0
 _TITLE_KEYS = ("foxglovePanelTitle", "lichtblickPanelTitle")
 """Settings that contain the title of a panel, one for each viewer."""
 
-Ros2Channels = Mapping[str, Ros2Channel]
-"""Standard channels by topic."""
 JsonObject = dict[str, Any]
 Tree = str | JsonObject
 """Identifier of a panel, or a node that divides an area into two."""

@@ -21,7 +21,7 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Callable, Mapping, Sequence
-from itertools import cycle, product
+from itertools import cycle
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -38,7 +38,7 @@ from ..log.ros2 import (
     STRING,
     TRANSFORMS,
     WORLD,
-    Ros2Channel,
+    Ros2Channels,
     read_ros2_channels,
 )
 from .exports.ros2 import export_ros2
@@ -197,8 +197,6 @@ def _find_free_port() -> int:
         return port
 
 
-Ros2Channels = Mapping[str, Ros2Channel]
-"""Standard channels by topic."""
 _SESSION_CHANNELS = (EVENTS, LINES, FRAMES, DIAGNOSTICS)
 """Names, the last parts of topics, of the channels of a session instead of a site."""
 
@@ -377,10 +375,7 @@ def _build_row(channels: Ros2Channels, roots: Sequence[str], row: _PlotRow) -> l
         curves = []
         for name, field in row.sources:
             topic = f"{root}/{name}"
-            channel = channels.get(topic)
-            if channel is None:
-                continue
-            selected_curves = _select_curves(topic, field, channel)
+            selected_curves = _select_curves(channels, topic, field)
             if selected_curves is not None:
                 curves.append(selected_curves)
 
@@ -392,24 +387,25 @@ def _build_row(channels: Ros2Channels, roots: Sequence[str], row: _PlotRow) -> l
     return plots
 
 
-def _select_curves(topic: str, field: str, channel: Ros2Channel) -> _PlotCurves | None:
+def _select_curves(channels: Ros2Channels, topic: str, field: str) -> _PlotCurves | None:
     """Returns the curves of a channel that belong to a quantity.
 
     A channel is a series of messages with a list of numbers, such as the angles of all joints.
     A plot may need only some of them.
 
     Args:
+        channels: Standard channels by topic.
         topic: Topic of the channel.
         field: Field of the channel, see `_PlotRow`.
-        channel: The channel.
 
     Returns:
-        The curves. None if the channel has no such curves.
+        The curves. None if there is no such channel, or it has no such curves.
     """
-    if channel.kind == STRING:
+    channel = channels.get(topic)
+    if channel is None or channel.kind == STRING:
         return None
 
-    names = _name_curves(channel)
+    names = channel.name_numbers()
     channel_name = _get_channel_name(topic)
     if channel_name == "theta_hat":
         return _select_estimates(topic, field, names)
@@ -421,16 +417,6 @@ def _select_curves(topic: str, field: str, channel: Ros2Channel) -> _PlotCurves 
         names = [f"tau_x {name}" for name in names]
     all_visible = (True,) * len(names)
     return _PlotCurves(topic, tuple(names), all_visible)
-
-
-def _name_curves(channel: Ros2Channel) -> list[str]:
-    """Returns the names of a channel's numbers.
-
-    The metadata has a list of names for each axis of the numbers, such as "m1 m2; 1 2". The
-    name of a number combines one name of each axis.
-    """
-    axes = [axis.split(" ") for axis in channel.about.get("names", "").split("; ")]
-    return [" ".join(filter(None, parts)) for parts in product(*axes)]
 
 
 def _select_estimates(topic: str, kind: str, names: Sequence[str]) -> _PlotCurves | None:

@@ -5,7 +5,7 @@ from typing import Any
 
 import msgspec
 import pytest
-from trilat_people.experiment.protocol import Protocol, plan_experiment
+from trilat_people.experiment.protocol import ExperimentPlan, ExperimentProtocol
 
 import trilat_net as tn
 from tests.experiments import write_protocol
@@ -36,7 +36,9 @@ class ProtocolCase(Case, frozen=True, kw_only=True, forbid_unknown_fields=True):
     def plan(self, folder: Path) -> object:
         """Returns the plan of the protocol, unless the protocol is refused."""
         if self.keys:
-            return plan_experiment(msgspec.convert({**PROTOCOL, **self.keys}, Protocol))
+            return ExperimentPlan.of_protocol(
+                msgspec.convert({**PROTOCOL, **self.keys}, ExperimentProtocol)
+            )
         if not self.replace:
             file = folder / "protocol.toml"
             if self.text:

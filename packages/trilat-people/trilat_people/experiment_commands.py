@@ -87,13 +87,13 @@ def experiment_run_command(
     experimenter and one for each user; trials begin once all users are ready on their pages.
     The button on the experimenter's page or Ctrl-C pauses the experiment.
     """
-    from .experiment.experiment_run import begin_experiment, open_experiment
+    from .experiment.experiment_run import Experiment, open_experiment
     from .live_page.page_server import PageOptions
 
     page = PageOptions(*serving)
     if live:
         page.check()
-    experiment = open_experiment(file) if file.is_dir() else begin_experiment(file, out)
+    experiment = open_experiment(file) if file.is_dir() else Experiment.begin(file, out)
     exit_code = 0
     with terminal.lines_aside(as_json):
         trials = count_nouns(len(experiment.plan.trials), "trial")
@@ -169,10 +169,10 @@ def experiment_status_command(
     folder: FolderArgument, as_json: options.JsonOption = False
 ) -> None:
     """Prints the progress of an experiment, and checks that its logs were not changed."""
-    from .experiment.experiment_run import list_log_problems, open_experiment
+    from .experiment.experiment_run import open_experiment
 
     experiment = open_experiment(folder)
-    problems = list(list_log_problems(experiment))
+    problems = list(experiment.list_log_problems())
     terminal.print_result(experiment, as_json=as_json)
     for problem in problems:
         terminal.err.print(problem, markup=False, highlight=False)

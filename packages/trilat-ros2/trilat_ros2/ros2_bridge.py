@@ -40,31 +40,27 @@ from trilat_net.log.ros2 import (
     TopicTable,
     build_rviz_config,
     cdr,
-    list_full_topics,
+    list_topics,
     pack_event,
     pack_session_diagnostics,
 )
 from trilat_net.net import (
     BRIDGE,
-    ROUTER_ADVICE,
     ArmClient,
-    Attachment,
     Clock,
     Connection,
     Event,
     Hand,
     Info,
     LinkStats,
-    Refusals,
-    Ros2Graph,
     RouterSilent,
     SessionMembers,
     SystemClock,
-    TopicPublisher,
     read_messages,
     read_records,
     topics,
 )
+from trilat_net.net.ros2 import ROUTER_ADVICE, Attachment, Refusals, Ros2Graph, TopicPublisher
 from trilat_net.process import LOOP_NICE, raise_priority
 from trilat_net.records import NS_PER_S
 from trilat_net.scenario import Scenario, parse_embedded
@@ -1130,7 +1126,7 @@ def write_session_config(ends: BridgeEnds, scenario: Scenario, path: Path) -> No
     Raises:
         UsageError: The file cannot be written.
     """
-    topics = list_full_topics(scenario, ends.session, ends.table)
+    topics = list_topics(scenario, ends.session, ends.table)
     write_whole(path, build_rviz_config(topics))
 
 

@@ -53,7 +53,8 @@ def ros2_command(
     """
     from trilat_net.app import RunningSession
     from trilat_net.log.ros2 import TopicTable
-    from trilat_net.net import BRIDGE, DISTROS, Refusals, Ros2Graph, check_hosts, check_ros_name
+    from trilat_net.net import BRIDGE, check_hosts
+    from trilat_net.net.ros2 import DISTROS, Refusals, Ros2Graph, check_ros_name
 
     from .ros2_bridge import serve_ros2
 

@@ -15,15 +15,8 @@ from typing import NamedTuple
 
 from trilat_net.app import ShareHistory
 from trilat_net.log.ros2 import SiteMessages, TopicTable
-from trilat_net.net import (
-    Bus,
-    Clock,
-    LinkStats,
-    QualityOfService,
-    Ros2Graph,
-    State,
-    TopicPublisher,
-)
+from trilat_net.net import Bus, Clock, LinkStats, State
+from trilat_net.net.ros2 import QualityOfService, Ros2Graph, TopicPublisher
 from trilat_net.records import NS_PER_S
 from trilat_net.scenario import Scenario
 

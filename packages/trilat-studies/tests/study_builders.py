@@ -20,7 +20,7 @@ from trilat_studies.bench.bench_plan import BenchCell
 from trilat_studies.bench.bench_results import BenchRun
 from trilat_studies.measure_run import ExpectationResult, LinkAge, RunMetrics
 from trilat_studies.sweep import prepare_sweep_folder, run_sweep, sweep_cell
-from trilat_studies.sweep.stability_map import MapPlane, build_plane
+from trilat_studies.sweep.stability_map import MapPlane
 from trilat_studies.sweep.sweep_cell import CellClass, CellResult
 from trilat_studies.sweep.sweep_plan import SweepPlan, plan_sweep
 from trilat_studies.sweep.sweep_run import FinishedSweep
@@ -31,8 +31,8 @@ from trilat_studies.tuning.tuning_plan import ObjectivePoint
 
 from trilat_net.analysis.run_end import EndBehaviour, RunEnd, Stability
 from trilat_net.analysis.twins.envelope_trend import EnvelopeFit, EnvelopeTrend
-from trilat_net.execution.lanes import run_groups
-from trilat_net.execution.lanes.lane_run import LaneRun
+from trilat_net.core.lanes import run_groups
+from trilat_net.core.lanes.lane_run import LaneRun
 from trilat_net.own_code.code_consent import allow_own_code
 from trilat_net.scenario import Scenario, load_scenario, parse_scenario
 
@@ -268,19 +268,19 @@ def make_map_plane(
     """Returns the plane of a map with these rows."""
     map_rows = list(make_map_rows(verdict, seeds, **axes))
     further_keys = [name.replace("__", ".") for name in axes]
-    return build_plane(map_rows, [*MAP_KEYS, *further_keys], P_D)
+    return MapPlane.arrange_rows(map_rows, [*MAP_KEYS, *further_keys], P_D)
 
 
 def make_gapped_plane() -> MapPlane:
     """Returns the plane of a map in which one cell has not run."""
     map_rows = [row for row in make_map_rows() if row["cell"] != 12]
-    return build_plane(map_rows, MAP_KEYS, P_D)
+    return MapPlane.arrange_rows(map_rows, MAP_KEYS, P_D)
 
 
 def make_exponent_plane() -> MapPlane:
     """Returns the plane of a map whose exponents are the damping minus 1.2, in 1/s."""
     map_rows = [{**row, "exponent_per_s": row["control.d"] - 1.2} for row in make_map_rows()]
-    return build_plane(map_rows, MAP_KEYS, P_D)
+    return MapPlane.arrange_rows(map_rows, MAP_KEYS, P_D)
 
 
 _DECAY = EnvelopeFit(EnvelopeTrend.DECAYS, -0.2)

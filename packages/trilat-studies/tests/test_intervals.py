@@ -8,15 +8,10 @@ import msgspec
 import numpy as np
 import pytest
 from trilat_studies.sweep import plan_sweep, prepare_sweep_folder, run_sweep
-from trilat_studies.sweep.sweep_results import collect_grid_points, list_totals
+from trilat_studies.sweep.sweep_results import list_totals
 from trilat_studies.trials import run_trials, trials
 from trilat_studies.tuning import plan_tuning
-from trilat_studies.tuning.candidate import (
-    CandidateClass,
-    CandidateScore,
-    average_scores,
-    measure_candidate,
-)
+from trilat_studies.tuning.candidate import CandidateClass, CandidateScore
 
 from tests.cli.running import trilat
 from trilat_net.execution.fused import FusedRun
@@ -93,7 +88,7 @@ def test_trial_of_distribution_names_its_repeating_command(file: Path) -> None:
 def test_swept_cells_have_the_means_of_seeds(file: Path) -> None:
     plan = plan_sweep(file, over=["link.delay_ms=20,50"], seeds=list(SEEDS), longest_s=2.0)
     results = run_sweep(prepare_sweep_folder(plan, file.parent / "o"), 1).results
-    point = collect_grid_points(results)[1]
+    point = results.list_grid_points()[1]
 
     runs = [FusedRun(load_scenario(file, [f"seed={seed}"])) for seed in SEEDS]
     for run in runs:
@@ -117,8 +112,8 @@ def test_a_candidate_is_the_mean_of_its_seeds(file: Path) -> None:
         texts = [
             base.with_gains(law.space, plan.knowledge, gains).scenario.text for base in bases
         ]
-        alone = [measure_candidate(text, None) for text in texts]
-        assert score == average_scores(alone)
+        alone = [CandidateScore.measure(text, None) for text in texts]
+        assert score == CandidateScore.average(alone)
         assert score.error_rad == pytest.approx(np.mean([single.error_rad for single in alone]))
         assert score.error_half_rad > 0.0
 
@@ -128,7 +123,7 @@ def test_the_outcome_of_a_candidate_is_its_worst() -> None:
     diverged = msgspec.structs.replace(
         settled, outcome=CandidateClass.DIVERGED, error_rad=None, diverged_s=1.0
     )
-    score = average_scores([settled, diverged])
+    score = CandidateScore.average([settled, diverged])
     assert (score.outcome, score.error_rad, score.diverged_s) == (
         CandidateClass.DIVERGED,
         None,

@@ -7,8 +7,8 @@ import pytest
 from trilat_studies.sweep import plan_sweep
 from trilat_studies.sweep.fixed_gains import describe_fixed_gains
 from trilat_studies.tuning.search_space import (
-    build_model_information,
-    build_user_search_space,
+    ModelInformation,
+    SearchSpace,
     select_search_spaces,
 )
 from trilat_studies.tuning.tuning_plan import plan_tuning
@@ -82,7 +82,7 @@ def test_ranges_come_from_the_class() -> None:
         ("d", "N m s/rad", 1.0, 20.0, ""),
     ]
     controls = space.controls(
-        tn.load_scenario("free"), build_model_information(90.0), {"K": 7.0, "d": 2.0}
+        tn.load_scenario("free"), ModelInformation.of_gravity(90.0), {"K": 7.0, "d": 2.0}
     )
     assert controls["s"] == {"law": "tests.own_laws:PD", "K": 7.0, "d": 2.0, "gravity": 0.9}
 
@@ -91,7 +91,7 @@ def test_invalid_ranges_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     for entry in ((3.0, 1.0), (0.0, 1.0), "wide", (1.0, 2.0, 3.0), (1.0,)):
         monkeypatch.setattr(PD, "tune", {"K": entry})
         with pytest.raises(UsageError, match=r"tune\['K'\] must be"):
-            build_user_search_space("tests.own_laws:PD")
+            SearchSpace.of_user_law("tests.own_laws:PD")
 
 
 @pytest.mark.long

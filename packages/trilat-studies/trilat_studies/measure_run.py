@@ -141,18 +141,18 @@ class RecordBatch(NamedTuple):
         columns = [column[first:stop] for column in self]
         return RecordBatch._make(columns)
 
+    @classmethod
+    def join(cls, batches: "Sequence[RecordBatch]") -> "RecordBatch":
+        """Joins consecutive batches of records of one arm into a single batch.
 
-def join_batches(batches: Sequence[RecordBatch]) -> RecordBatch:
-    """Joins consecutive batches of records of one arm into a single batch.
-
-    Args:
-        batches: Batches in the order of time, at least one.
-    """
-    columns = []
-    for parts in zip(*batches, strict=True):
-        column = np.concatenate(parts)
-        columns.append(column)
-    return RecordBatch._make(columns)
+        Args:
+            batches: Batches in the order of time, at least one.
+        """
+        columns = []
+        for parts in zip(*batches, strict=True):
+            column = np.concatenate(parts)
+            columns.append(column)
+        return RecordBatch._make(columns)
 
 
 def _build_batch(axes: Sequence[float], t_ns: Ints, used: Ints, *vectors: Array) -> RecordBatch:
@@ -330,50 +330,55 @@ class WholeRun(NamedTuple):
     end: RunEnd
     run: FusedRun
 
+    @classmethod
+    def simulate(cls, scenario: Scenario) -> "WholeRun":
+        """Simulates a scenario by compiled code, and keeps all records in memory.
 
-def run_whole(scenario: Scenario) -> WholeRun:
-    """Simulates a scenario by compiled code, and keeps all records in memory.
+        Measures of the whole run, such as an impedance, need all records at once.
 
-    Measures of the whole run, such as an impedance, need all records at once.
+        Args:
+            scenario: Scenario to run: arms, control laws, links and duration.
+        """
+        batches: dict[str, list[RecordBatch]] = {name: [] for name in scenario.names}
+        receivers = {name: batches[name].append for name in batches}
+        run = run_compiled_in_batches(scenario, receivers)
+        return _join_run(scenario, run, batches)
 
-    Args:
-        scenario: Scenario to run: arms, control laws, links and duration.
-    """
-    batches: dict[str, list[RecordBatch]] = {name: [] for name in scenario.names}
-    receivers = {name: batches[name].append for name in batches}
-    run = run_compiled_in_batches(scenario, receivers)
-    return _join_run(scenario, run, batches)
+    @classmethod
+    def simulate_together(
+        cls,
+        scenarios: Sequence[Scenario],
+    ) -> "Iterator[tuple[int, WholeRun, str]]":
+        """Simulates several scenarios, as many as possible at once, and keeps their records.
+
+        Scenarios that differ in numbers only share the vector instructions of the processor.
+        Each run equals that of `simulate` bit for bit.
+
+        Args:
+            scenarios: The scenarios.
+
+        Yields:
+            The index of a scenario; its run, equal to that of `simulate`; and the property
+            because of which it was computed alone, or an empty text. The order is that of
+            groups of runs, of which one is in memory at a time.
+        """
+        batches: list[dict[str, list[RecordBatch]]] = []
+        compiled = []
+        for scenario in scenarios:
+            batches.append({name: [] for name in scenario.names})
+            receivers = {name: records.append for name, records in batches[-1].items()}
+            compiled.append(_CompiledRun(scenario, receivers))
+        for index, obstacle in _finish_together(compiled):
+            yield (
+                index,
+                _join_run(scenarios[index], compiled[index].run, batches[index]),
+                obstacle,
+            )
+            batches[index].clear()
 
 
 _RECORD_ROWS = 1 << BATCH_RECORDS.bit_length()
 """Number of records that runs side by side keep, a power of two above `BATCH_RECORDS`."""
-
-
-def run_whole_together(
-    scenarios: Sequence[Scenario],
-) -> Iterator[tuple[int, WholeRun, str]]:
-    """Simulates several scenarios, as many as possible at once, and keeps all of their records.
-
-    Scenarios that differ in numbers only share the vector instructions of the processor. Each
-    run equals that of `run_whole` bit for bit.
-
-    Args:
-        scenarios: The scenarios.
-
-    Yields:
-        The index of a scenario; its run, equal to that of `run_whole`; and the property because
-        of which it was computed alone, or an empty text. The order is that of groups of runs,
-        of which one is in memory at a time.
-    """
-    batches: list[dict[str, list[RecordBatch]]] = []
-    compiled = []
-    for scenario in scenarios:
-        batches.append({name: [] for name in scenario.names})
-        receivers = {name: records.append for name, records in batches[-1].items()}
-        compiled.append(_CompiledRun(scenario, receivers))
-    for index, obstacle in _finish_together(compiled):
-        yield index, _join_run(scenarios[index], compiled[index].run, batches[index]), obstacle
-        batches[index].clear()
 
 
 def _finish_together(compiled: Sequence[_CompiledRun]) -> Iterator[tuple[int, str]]:
@@ -387,7 +392,7 @@ def _finish_together(compiled: Sequence[_CompiledRun]) -> Iterator[tuple[int, st
         an empty text.
     """
     # A single run must not load the code of lanes.
-    from trilat_net.execution import group_runs
+    from trilat_net.core import group_runs
 
     for group in group_runs([member.run for member in compiled], _RECORD_ROWS):
         members = [compiled[index] for index in group.members]
@@ -414,7 +419,7 @@ def _join_run(
     buckets = []
     last_tau_x = []
     for name, site_batches in batches.items():
-        site_records = join_batches(site_batches)
+        site_records = RecordBatch.join(site_batches)
         records[name] = site_records
         buckets.append(site_records.reduce())
         last_tau_x.append(site_records.tau_x[-1])
@@ -743,7 +748,7 @@ class SiteStats:
             end_ns: Time of the run's last record, in ns. If the records of this arm end earlier
                 than others, fewer records are returned.
         """
-        rows = join_batches(self._tail)
+        rows = RecordBatch.join(self._tail)
         start_ns = end_ns - _END_NS
         return rows.since(start_ns)
 
@@ -1098,7 +1103,7 @@ class _EvenBatches:
         self._count += len(batch.t_ns)
         if self._count < BATCH_RECORDS:
             return
-        joined = join_batches(self._waiting)
+        joined = RecordBatch.join(self._waiting)
         whole = self._count - self._count % BATCH_RECORDS
         for first in range(0, whole, BATCH_RECORDS):
             self._receive(joined.slice(first, first + BATCH_RECORDS))
@@ -1109,7 +1114,7 @@ class _EvenBatches:
     def flush(self) -> None:
         """Passes on the last records, which are fewer than a batch."""
         if self._waiting:
-            self._receive(join_batches(self._waiting))
+            self._receive(RecordBatch.join(self._waiting))
             self._waiting.clear()
 
 

@@ -1,13 +1,14 @@
 """Decides which runs of a study are computed side by side, and reports those that were not.
 
 Runs that differ in numbers only share the vector instructions of the processor, see
-`trilat_net.execution.group_runs`. A study passes a scenario of each kind of run to
+`trilat_net.core.group_runs`. A study passes a scenario of each kind of run to
 `prepare_kinds`, which compiles the code where the number of runs is worth it. After the runs,
 `describe_runs_alone` names those that were computed one by one.
 """
 
 from collections import Counter
 from collections.abc import Hashable, Iterable, Mapping
+from functools import partial
 from typing import NamedTuple, TypeVar
 
 from trilat_net.errors import TrilatError, count_nouns
@@ -59,13 +60,14 @@ def prepare_kinds(kinds: Mapping[K, RunKind]) -> dict[K, str]:
     if not several:
         return {}
     # A study of single runs must not load the code of lanes.
-    from trilat_net.execution import FusedRun, describe_structure, prepare_lanes
+    from trilat_net.core import describe_structure, prepare_lanes
+    from trilat_net.execution import FusedRun
 
     prepared: dict[K, str] = {}
     obstacles: dict[K, str] = {}
     for key, kind in several.items():
         try:
-            if prepare_lanes(kind.scenario, kind.runs, LANE_SITE_TICKS):
+            if prepare_lanes(partial(FusedRun, kind.scenario), kind.runs, LANE_SITE_TICKS):
                 prepared[key] = ""
                 continue
             structure = describe_structure(FusedRun(kind.scenario))

@@ -165,16 +165,11 @@ def margin(
         UsageError: The range is not of the form KEY=LOW:HIGH.
     """
     from .sweep import plan_sweep
-    from .sweep.margin_search import (
-        SweepMargins,
-        format_range_axis,
-        parse_search_range,
-        search_margins,
-    )
+    from .sweep.margin_search import SweepMargins, parse_search_range, search_margins
     from .sweep.sweep_plan import list_axes
 
     search_range = parse_search_range(along, tolerance)
-    axes = [*list_axes(over), format_range_axis(search_range)]
+    axes = [*list_axes(over), search_range.format_axis()]
     overrides = _list_override_texts(set, duration_s)
     plan = plan_sweep(scenario, overrides, over=axes, seeds=seeds, laws=laws)
     edges = search_margins(plan, search_range, jobs, on=on)

@@ -86,12 +86,11 @@ def _draw_map(
     from .sweep.fixed_gains import FAIR_COMPARISON
     from .sweep.map_page import write_map
     from .sweep.stability_map import build_stability_map
-    from .sweep.sweep_plan import build_sweep_command
 
     size = FigureSize.for_print(COLUMN_IN if width is None else width)
     width_option = [] if width is None else ["--width", f"{width:g}"]
     beside_option = [] if beside is None else ["--beside", str(beside)]
-    command = build_sweep_command(results.plan, "--map", *width_option, *beside_option)
+    command = results.plan.build_command("--map", *width_option, *beside_option)
     simulated = None if beside is None else read_results(beside)
     terminal.print_text("map: the lines of theory ...")
     with show_progress(
@@ -207,7 +206,7 @@ def _run_sweep(
     was_complete = not (estimate.entries or finished.runs)
     if was_complete:
         terminal.out.print("nothing was left to run")
-    remarks = [sweep_run.describe_sweep_speed(finished)] if finished.simulated_s else []
+    remarks = [finished.describe_speed()] if finished.simulated_s else []
     run_count = len(finished.results.rows)
     remarks += filter(None, [describe_runs_alone(finished.alone, run_count)])
     remarks.append(f"results: {folder.path / sweep_results.RESULTS_FILE}")
@@ -266,14 +265,13 @@ def _print_cell_commands(path: Path, number: int, *, as_json: bool) -> None:
         as_json: True to print the rows of the cell as JSON instead.
     """
     from .sweep import read_results
-    from .sweep.sweep_results import build_reproduce_command
 
     results = read_results(path)
     if as_json:
         return terminal.print_json([dict(row) for row in results.of_cell(number)])
     folder = path if path.is_dir() else path.parent
     for row in results.of_cell(number):
-        command, note = build_reproduce_command(results, row, folder)
+        command, note = results.build_reproduce_command(row, folder)
         if note:
             terminal.print_note(note)
         terminal.print_line(command)
@@ -355,7 +353,7 @@ def sweep_command(
         confirm: Former option that ran cells live. Its error names the replacement.
     """
     from .sweep import plan_sweep
-    from .sweep.margin_search import format_range_axis, parse_search_range
+    from .sweep.margin_search import parse_search_range
 
     used_options = options.list_used_options(context)
     if confirm is not None:
@@ -396,7 +394,7 @@ def sweep_command(
         search_range = None
         if margin is not None:
             search_range = parse_search_range(margin, tolerance)
-            axes.append(format_range_axis(search_range))
+            axes.append(search_range.format_axis())
         plan = plan_sweep(
             scenario,
             options.list_overrides(overrides, duration),

@@ -27,9 +27,8 @@ import numpy as np
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from numpy.typing import NDArray
 
-from trilat_net.core import Array, HandView, PeerView, tick_ns
+from trilat_net.core import Array, HandView, LaneEpisodes, PeerView, tick_ns
 from trilat_net.errors import UsageError
-from trilat_net.execution import LaneEpisodes
 from trilat_net.scenario import LiveHand
 
 from .teleoperation_environment import (

@@ -271,7 +271,8 @@ def _write_viewer_files(file: Path, *, foxglove: bool, rviz: bool, force: bool) 
         rviz: True to write a configuration of RViz.
         force: True to replace existing files.
     """
-    from ...presentation import write_foxglove_layout, write_rviz_config
+    from ...log.ros2 import write_rviz_config
+    from ...presentation import write_foxglove_layout
 
     if foxglove:
         layout = write_foxglove_layout(file, force=force)

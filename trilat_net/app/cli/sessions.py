@@ -346,33 +346,11 @@ def _ping_topic(
         lasts_s: Duration of the measurement, in s.
         as_json: True to print the result as JSON.
     """
-    from trilat_net.app.session_ping import ping_topic
+    from trilat_net.app.ros2_ping import ping_topic
 
-    from ...net import ROUTER_ADVICE, Refusals, Ros2Graph, RouterSilent, check_ros_name
-
-    name = check_ros_name(topic, "topic")
-    clock = SystemClock()
-    try:
-        graph = Ros2Graph(
-            refusals=Refusals(terminal.print_note),
-            routers=routers or [options.ROS_ROUTER],
-            namespace="",
-            name="trilat_ping",
-            clock=clock,
-            domain=domain,
-        )
-    except RouterSilent as silent:
-        raise RouterSilent(f"{silent}; {ROUTER_ADVICE}") from None
-
-    with graph, Interrupt() as interrupt:
-        measurement = ping_topic(
-            graph=graph,
-            clock=clock,
-            topic=name,
-            lasts_s=lasts_s,
-            stopped=interrupt.is_requested,
-        )
-
+    measurement = ping_topic(
+        topic, routers or [options.ROS_ROUTER], domain, lasts_s, terminal.print_note
+    )
     terminal.print_result(measurement, as_json=as_json)
 
 

@@ -41,16 +41,17 @@ from ..step.vectors import Array, Vector
 SILENCE_NS = 200_000_000
 """A longer silence of the holder releases the arm."""
 GRIP_NS = 100_000_000
-"""Time in which a grip becomes firm, and time in which it fades."""
+"""Time in which a grip grows from 0 to 1, and in which it fades from 1 to 0."""
 GLIDE_NS = 50_000_000
 """Longest time of a glide to the goal, unless a limit of the target prolongs it."""
 
-ANOTHER_HOLDS = "hand: another one holds the arm"
+ANOTHER_HOLDS = "hand: another operator holds the arm"
 OUT_OF_ORDER = "hand: out of order"
 TAKEN = "takes hold"
 RELEASED = "lets go"
 SILENT = "is silent: let go"
-"""Outcomes of a message or a silence: refusals, and changes of the holder."""
+"""Outcomes of a message or a silence: reasons to ignore a message, and changes of the holder.
+"""
 
 
 class HandReach(NamedTuple):
@@ -136,7 +137,7 @@ class HandCommand(NamedTuple):
     """Message by which a person or program moves an arm during the run.
 
     For example, a web page sends such a message for each movement of the mouse: who sends it,
-    where the arm shall be pulled, and whether the arm is still held.
+    where the arm is to be pulled, and whether the arm is still held.
 
     Attributes:
         source: Identifies the sender, a random number above 0.
@@ -158,10 +159,12 @@ class HandCommand(NamedTuple):
 class HandMemory(NamedTuple):
     """State of the pull of a person or program on an arm, stored between two control periods.
 
-    It states who holds the arm, how firmly, and how the point moves to which the arm is pulled.
+    It states who holds the arm, how firmly, and how the target to which the arm is pulled
+    moves.
 
     Attributes:
-        source: Sender that holds the arm; 0: nobody, though a grip may still fade.
+        source: Sender that holds the arm. 0 if nobody holds it; an earlier grip may still be
+            fading.
         number: Number of the newest accepted message; -1 without a message.
         grip: Firmness of the grip, 0 to 1.
         target: Position of the target, which the arm follows, m or rad, or the force, N.
@@ -194,8 +197,8 @@ class HandInForce(NamedTuple):
 
     Attributes:
         grip: Firmness of the grip, 0 to 1.
-        number: Number of the newest message that the hand follows; -1: nobody holds the arm.
-        source: Sender that holds the arm; 0: nobody.
+        number: Number of the newest message that is obeyed. -1 if nobody holds the arm.
+        source: Sender that holds the arm. 0 if nobody holds it.
         target: Position that the arm follows, m or rad, or the force, N, in the tick.
         rate: Velocity of the target.
     """
@@ -246,7 +249,7 @@ class HandStep(NamedTuple):
 
 
 def count_hand_numbers(size: int) -> int:
-    """Returns how many numbers the log stores about a person or program who moves the arm.
+    """Returns how many values the log stores about a person or program that moves the arm.
 
     They are the fields of a `HandInForce` for one control period, written one after another
     into the field `hand` of a record. Vectors such as the goal have `size` numbers.
@@ -306,7 +309,7 @@ def advance_hand(
     silence_ns = t_ns - state.received_ns
     if state.source and silence_ns > SILENCE_NS:
         changes.append((state.source, SILENT))
-        # One less: the silent holder may repeat its number and so take hold again.
+        # One less, so that the silent holder can take hold again by repeating its number.
         state = _release(state, state.number - 1)
 
     if not state.target:
@@ -320,7 +323,7 @@ def advance_hand(
 
 
 def _move_target(rules: HandRules, memory: HandMemory) -> HandMemory:
-    """Returns the state one period later: the target has moved, the grip is firmer or weaker.
+    """Returns the state one period later, with the target moved and the grip firmer or weaker.
 
     The target moves with its velocity `rate`. The grip, a factor of the force from 0 to 1,
     grows while a sender holds the arm, and fades after that. It needs GRIP_NS for the whole
@@ -331,7 +334,7 @@ def _move_target(rules: HandRules, memory: HandMemory) -> HandMemory:
         memory: State after the previous tick (period of the loop), with a target.
     """
     h_s = 1.0 / rules.rate_hz
-    # The period, 1e9 / rate_hz in ns, as a part of GRIP_NS.
+    # The period, 1e9 / rate_hz in ns, as a fraction of GRIP_NS.
     grip_step = 1e9 / (GRIP_NS * rules.rate_hz)
     # A list instead of a generator: it is faster, and this runs in each tick.
     target = tuple([x + v * h_s for x, v in zip(memory.target, memory.rate, strict=True)])
@@ -351,11 +354,11 @@ def _move_target(rules: HandRules, memory: HandMemory) -> HandMemory:
 def find_stopping_speed(distance: float, acceleration: float, h_s: float) -> float:
     """Returns the largest speed from which a target can stop within a distance, Eq. (L1).
 
-    The target moves in steps of one period h, with an acceleration of at most a. With the unit
-    a h of speed and a h^2 of distance, the speed falls by 1 per period, and the distance to the
-    goal is D. The target can stop from the whole speed n in n more periods, which takes the
-    distance n (n + 1) / 2. Therefore n is the largest integer with n (n + 1) / 2 <= D. The
-    remaining distance is divided among the n + 1 periods:
+    The target moves in steps of one period h, with an acceleration of at most a. With a h as
+    the unit of speed and a h^2 as the unit of distance, the speed falls by 1 per period, and
+    the distance to the goal is D. From an integer speed n, the target can stop in n more
+    periods, which takes the distance n (n + 1) / 2. Therefore n is the largest integer with n
+    (n + 1) / 2 <= D. The remaining distance is divided among the n + 1 periods:
 
         speed = n + (D - n (n + 1) / 2) / (n + 1) = D / (n + 1) + n / 2
 
@@ -413,7 +416,7 @@ def glide(
     """Computes how a person or program pulls an arm in several ticks without a new message.
 
     A simulated spring pulls the arm to a target, which moves to the goal of the last message.
-    The grip, a factor of the force from 0 to 1, grows at first. The result equals that of
+    The grip, a factor of the force from 0 to 1, grows initially. The result equals that of
     `advance_hand`, bit for bit, but one compiled call computes all ticks (control periods).
 
     Args:
@@ -434,7 +437,7 @@ def glide(
         The firmness of the grip afterwards.
     """
     h_s = 1.0 / rate_hz
-    # The period, 1e9 / rate_hz in ns, as a part of GRIP_NS.
+    # The period, 1e9 / rate_hz in ns, as a fraction of GRIP_NS.
     grip_step = 1e9 / (GRIP_NS * rate_hz)
     size = target.shape[0]
     for n in range(rows.shape[0]):
@@ -654,10 +657,10 @@ def _release(memory: HandMemory, number: int) -> HandMemory:
 
 
 def _find_fading_rate(rules: HandRules, memory: HandMemory) -> tuple[float, ...]:
-    """Returns the velocity of the target to which an arm is pulled, after the person let go.
+    """Returns the velocity of the target after the person has let go of the arm.
 
-    The force fades meanwhile. The speed of the target falls with the largest deceleration that
-    `rules` allow, until the target stands still.
+    The force that pulls the arm to the target fades meanwhile. The speed of the target falls
+    with the largest deceleration that `rules` allow, until the target stands still.
 
     Args:
         rules: Limits of the target's motion, and the rate of the control loop.

@@ -53,7 +53,7 @@ class HandContext(NamedTuple):
         peers: Names of the peers, in scenario order.
         mode: "tip": the program moves the end effector; "joint": it turns the joints; "force":
             it pushes.
-        size: Count of the numbers of an action: one per axis, m or N, or one per joint, rad.
+        size: Number of components of an action: one per axis, m or N, or one per joint, rad.
         rate_hz: Rate of decisions, Hz.
         delay_s: Time from a view to the action that is based on it, s.
         speed_limit: Largest speed of the target, m/s or rad/s; inf for a program that pushes.
@@ -73,7 +73,7 @@ class HandContext(NamedTuple):
 
 
 class HandView(NamedTuple):
-    """What a user's program that moves an arm may know when it makes a decision.
+    """Information that a user's program gets when it decides how to move an arm.
 
     >>> def act(self, now: tn.HandView) -> list[float]:
     ...     return now.pose + 0.3 * (self.goal_m - now.pose)
@@ -91,8 +91,8 @@ class HandView(NamedTuple):
         target: The hand's current target, m or rad, or its force, N; zeros while it does not
             hold the arm.
         grip: Firmness of the hand's grip, 0 to 1.
-        peers: The peers in scenario order, by the samples that were in use at the previous
-            tick: q and qd have m numbers, and ages are those at this tick.
+        peers: The peers in scenario order, with the samples that were in use at the previous
+            tick. q and qd have shape (m,), and the ages are those at this tick.
     """
 
     k: int
@@ -123,8 +123,8 @@ class HandProgram(Protocol):
             now: State of the arm, of the target to which it is pulled, and of the other arms.
 
         Returns:
-            The target of the end effector, m, or of the joints, rad, or a force, N, as the
-            program's mode says. None releases the arm.
+            The target of the end effector, m, or of the joints, rad, or a force, N, depending
+            on the program's mode. `None` if the program releases the arm.
         """
 
 
@@ -160,7 +160,7 @@ class OwnHand:
         self._newest = -1
 
     def is_decision_tick(self, k: int) -> bool:
-        """Returns True if tick k asks the user's program for a decision.
+        """Returns True if the user's program makes a decision in tick k.
 
         This is every `period_ticks`-th tick: 0, 20, 40 and so on for a program that decides 50
         times a second in a loop of 1 kHz.
@@ -250,12 +250,13 @@ class OwnHand:
     def accept_decision(self, k: int, goal: Sequence[float] | None) -> None:
         """Checks a decision of the user's program, and schedules it after a reaction time.
 
-        A decision is ignored if it is based on an older view of the arm than an earlier one.
+        A decision is ignored if a decision based on a newer view of the arm was accepted
+        before.
 
         Args:
-            k: Control period whose view of the arm the decision is based on.
-            goal: Position to which the program pulls the arm, m or rad, or the force, N. None
-                to release the arm.
+            k: Control period of the view of the arm on which the decision is based.
+            goal: Position to which the program pulls the arm, m or rad, or the force, N. If
+                None, the program releases the arm.
 
         Raises:
             ValueError: The goal has the wrong number of coordinates, is not finite, or is too

@@ -23,8 +23,8 @@ terms are added:
 - B is the damping in N m s/rad, and k = 1 / (4 `RestGains.time_s`). Lambda is the convergence
   rate, in 1/s: the rate of the adaptive law in joint space, otherwise `REST_RATE_1_S`.
 - w carries a constant load, for example unknown gravity. It starts as the part of the last
-  torque that the law does not explain, times 1 - max B |qd| / tau_limit. While the arm brakes,
-  w loses B |qd| in each period in which it acts in the direction of motion.
+  torque that does not come from the law, times 1 - max B |qd| / tau_limit. While the arm
+  brakes, w loses B |qd| in each period in which it acts in the direction of motion.
 
 An arm is fast while B |qd| of some joint exceeds its torque limit `tau_limit`. The limit on the
 rate of the torque does not delay braking: against the motion, the torque may change by B |qd|
@@ -48,10 +48,10 @@ from ..step.ticks import NS_PER_S, LifeReason, Mode
 from ..step.vectors import Array
 
 REST_RATE_1_S = 3.0
-"""Lambda of an arm at rest whose law has no Lambda of joints, 1/s."""
+"""Lambda for an arm at rest, if its control law has no such rate for the joints, 1/s."""
 
 _ROUNDING_S = 1e-9
-"""Rounding error of the last step of a reference, s: below it the reference rests."""
+"""Tolerance for rounding errors in the time at which a reference comes to rest, s."""
 
 _WAITING = int(Mode.WAITING)
 _HOLD = int(Mode.HOLD)
@@ -205,7 +205,7 @@ def _find_remaining_s(elapsed_s: float, site: SiteRow) -> float:
 
 @leaf
 def advance_rest_reference(t_ns: int, ticks: int, site: SiteRow) -> None:
-    """Slows down the motion that brings the joints of an arm to rest, by some control periods.
+    """Advances the motion that brings the joints of an arm to rest, by one or more periods.
 
     The joints follow this motion, which is called the rest reference. Its rules are at the top
     of this module.
@@ -240,9 +240,9 @@ def advance_rest_reference(t_ns: int, ticks: int, site: SiteRow) -> None:
         step = 0.5 * step_s * (rate_before + rate)
         is_limited = abs(site.tau[i]) >= site.tau_limit[i]
         if is_fast or is_limited:
-            # Without the law, or at its limit, the torque does not pay for a growing distance
-            # from the reference. The spring would later return that distance as energy of its
-            # own, so the reference moves along with the joint.
+            # Without the law, or at the torque limit, no work is done against the spring while
+            # the distance from the reference grows. The spring would later turn this distance
+            # into additional energy, so the reference moves along with the joint.
             q_before = site.q_before[i]
             joint_step = site.q[i] - q_before
             distance = q_before - q_ref
@@ -289,7 +289,7 @@ def put_rest_reference(site: SiteRow, q: Array, qd: Array) -> None:
 
     Args:
         site: State of the site (the process that runs the arm). `task` is 1 in task space, and
-            0 in joint space. `felt` is cleared, the weighted forces on the other arms.
+            0 in joint space. `felt`, the weighted forces on the other arms, is cleared.
         q: Receives the reference, one number per coordinate, rad or m.
         qd: Receives the velocity of the reference, rad/s or m/s.
     """
@@ -347,9 +347,9 @@ def add_rest_torque(k: int, t_ns: int, site: SiteRow) -> None:
 
     The integral term w, in N m, carries a constant load, for example unknown gravity:
 
-    - At the start of the rest, it is the part of the previous torque that the control law does
-      not explain. The faster the arm moves, the smaller this part is made; it is zero in the
-      first tick of a run, which has no previous torque.
+    - At the start of the rest, it is the part of the previous torque that does not come from
+      the control law. This part is reduced if the arm moves, and the more the faster it moves.
+      It is zero in the first tick of a run, which has no previous torque.
     - While the arm brakes, w may act in the direction of motion and so delay the stop. Then its
       magnitude is reduced by B |qd| in each tick, at most to zero. qd is the joint velocity.
     - After this tick, `advance_rest` integrates it.
@@ -362,7 +362,8 @@ def add_rest_torque(k: int, t_ns: int, site: SiteRow) -> None:
     """
     starts_to_rest = t_ns == site.return_from_ns
     brakes = _brakes(t_ns, site)
-    # The factor of a torque that the law does not explain: smaller for a faster arm.
+    # Factor for the part of the torque that does not come from the law: smaller for a faster
+    # arm.
     unexplained_factor = 0.0
     if k > site.first:
         unexplained_factor = max(0.0, 1.0 - _find_brake_ratio(site))
@@ -409,7 +410,7 @@ def advance_rest(site: SiteRow) -> None:
         slip = _find_slip(site, i)
         step = -site.integral[i] * slip / site.rate_hz
         cut_off = site.u[i] - site.tau[i]
-        # A step is not finite if the motion is not; it must not get into w.
+        # If the motion is not finite, neither is the step, which must then not be added to w.
         if isfinite(step) and cut_off * step <= 0.0:
             site.tau_held[i] += step
 

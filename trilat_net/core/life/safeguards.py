@@ -89,11 +89,11 @@ def _limit_turn(site: SiteRow) -> None:
     if factor < 1.0:
         limited_turn = scale(factor, turn)
         velocity = scale(factor * site.rate_hz, turn)
-        # The orientation before, followed by the limited turn.
+        # The previous orientation, followed by the limited turn.
         put_three(site.q_des[3:], compose_rotations(limited_turn, vector_before))
         put_three(site.qd_des[3:], velocity)
-    # The velocity of a turn that was not shortened comes from the peers, and may be above the
-    # limit although the turn is not. That of a shortened turn only loses rounding errors here.
+    # The velocity of a turn that was not shortened comes from the peers, and may exceed the
+    # limit even if the turn does not. For a shortened turn, this only removes rounding errors.
     for i in range(3, 6):
         limit = site.qd_des_limit[i]
         rate = site.qd_des[i]

@@ -1,8 +1,9 @@
 """Decides when an arm waits, follows other arms, comes to rest, or stops after a fault.
 
 A site is a process that runs one arm, and its peers are the other sites, whose states it
-receives. The rules of this module are called `glide`. They let an arm start and stop smoothly
-when its peers appear or fall silent. A site has one of these modes:
+receives. A peer is heard while its states arrive, and silent otherwise. The rules of this
+module are called `glide`. They let an arm start and stop smoothly when its peers appear or fall
+silent. A site has one of these modes:
 
 - WAITING: The arm is at rest, until all peers that it follows are heard. Then the mode becomes
   RETURN.
@@ -59,9 +60,9 @@ MIN_ALIGN_NS = 250_000_000
 RETURN_NS = 100_000_000
 """Duration of the change from the torque at rest to that of the law, ns."""
 HELD_OVERRUN_TICKS = 20
-"""Largest number of missed ticks without HOLD, of a site with an external arm."""
+"""Largest number of ticks that a site with an external arm may miss without entering HOLD."""
 FAULT_OVERRUN_TICKS = 200
-"""Largest number of missed ticks without FAULT."""
+"""Largest number of ticks that a site may miss without entering FAULT."""
 
 _RUN = int(Mode.RUN)
 _DIVERGED = int(Mode.DIVERGED)
@@ -127,8 +128,8 @@ def _alignment_s(site: SiteRow) -> float:
 
     An alignment is the smooth return of an arm to the arms that it follows, its peers, in the
     mode RETURN. An offset is added to the reference, the position that the peers ask for, and
-    falls from its start value to zero within T. The largest slope of its polynomial is 1.5
-    times its mean slope, so with
+    falls from its start value to zero within the time T. The largest slope of its polynomial is
+    1.5 times its mean slope, so with
 
         T = 1.5 distance / align_speed
 
@@ -311,7 +312,7 @@ def _find_fault(site: SiteRow) -> int:
 
 @leaf
 def _apply_order(t_ns: int, site: SiteRow) -> None:
-    """Changes the mode of an arm for an order, or because its control loop missed ticks.
+    """Changes the mode of an arm after an order, or because its control loop missed ticks.
 
     An order comes from a person, such as stop, or from the site itself, such as the loss of a
     real arm. Missed ticks (control periods) stop an arm that moves. At most one branch applies.
@@ -340,8 +341,9 @@ def _apply_order(t_ns: int, site: SiteRow) -> None:
         (order == _ORDER_STOP and site.reason == _RELEASED)
         or (order == _ORDER_RELEASED and site.reason == _STOP)
     ):
-        # The brakes of a real arm hold it from the release on, and must not open again. An arm
-        # that was ordered to stop first was held by a torque, which nobody supervises any more.
+        # The brakes of a real arm close when the switch is released, and must not open again.
+        # An arm that was ordered to stop before that was held by a torque, which nobody
+        # supervises any more.
         site.reason = _STOP_RELEASED
     elif stops and mode != _FAULT and mode != _STOPPED:
         reason = _STOP if order == _ORDER_STOP else _RELEASED
@@ -363,7 +365,7 @@ def _apply_order(t_ns: int, site: SiteRow) -> None:
 
 @leaf
 def _update_mode(t_ns: int, site: SiteRow, links: RowArray) -> None:
-    """Changes the mode of an arm for a fault of its motion, or for silent or returning peers.
+    """Changes the mode of an arm after a fault, or because peers fall silent or return.
 
     A peer is another arm that this arm follows. The first of these changes that applies is made
     (the code calls the mode RETURN `_ALIGN`):

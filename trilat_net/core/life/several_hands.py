@@ -23,7 +23,8 @@ from .live_hand import GLIDE_NS, GRIP_NS, SILENCE_NS, HandRules, find_glide_ns, 
 AXES = 2
 """Number of coordinates of an action."""
 ACTION_NUMBERS = 1 + 2 * AXES
-"""Numbers of an action in a tick: the grip, the target, and the target one second later."""
+"""Values of an action in a tick: the grip, the target, and the target one second later.
+"""
 
 
 class HandArrays(NamedTuple):
@@ -43,8 +44,8 @@ class HandArrays(NamedTuple):
         speed_limit: Largest speed of the target, m/s or rad/s.
         acceleration: Largest acceleration of the target, m/s^2 or rad/s^2.
         centre: Centre of the reachable shell, m, shape (L, 2).
-        radii_m: Inner and outer radius of the shell, shape (L, 2). Infinite outer radius
-            and inner radius 0: no shell.
+        radii_m: Inner and outer radius of the shell, shape (L, 2). If there is no shell, the
+            inner radius is 0 and the outer radius is infinite.
         low: Smallest coordinates of a goal, rad or m, shape (L, 2).
         high: Largest coordinates of a goal, rad or m, shape (L, 2).
     """
@@ -128,11 +129,11 @@ def _advance_hands(
         period_ticks: Time from one decision to the next, ticks.
         is_idle: 1 for runs that are not advanced, shape (L,).
         acts: 1 for runs in which a decision begins to act at the first tick, shape (L,).
-        goals: These decisions: the position to which the arm is pulled, or the force, shape
-            (L, 2).
+        goals: The decisions that begin to act: the position to which the arm is pulled, m or
+            rad, or the force, N, shape (L, 2).
         poses: Pose of the arm at the first tick, m or rad, shape (L, 2).
         hands: State of the programs' pulls in all runs; changed.
-        rows: Room for the actions of a run, shape (ticks, 3 + 2 * 2).
+        rows: Buffer for the actions of one run, shape (ticks, 3 + 2 * 2).
         actions: Receives for each tick and lane the grip, the target, and the target one second
             later, shape (ticks, 5, L).
     """
@@ -257,9 +258,10 @@ class SeveralHands:
         return ""
 
     def begin(self, run: int, rules: HandRules) -> None:
-        """Resets the numbers of one simulation, whose program does not hold its arm yet.
+        """Resets the state of one simulation, whose program does not hold its arm yet.
 
-        It is called for each simulation before its first tick, a period of the control loop.
+        The method is called for each simulation before its first tick (period of the control
+        loop).
 
         Args:
             run: Index of the run.
@@ -296,12 +298,12 @@ class SeveralHands:
         Each simulation has one program and one arm, and one call advances all simulations.
 
         Args:
-            runs: Number of runs that are advanced, the first ones.
+            runs: Number of runs that are advanced. They are the first rows of the arrays.
             first: First tick of each run, shape (L,).
             count: Number of ticks.
             is_idle: 1 for runs that are not advanced, shape (L,).
             acts: 1 for runs in which a decision begins to act at the first tick, shape (L,).
-            goals: These decisions, shape (L, 2).
+            goals: The decisions that begin to act, shape (L, 2).
             poses: Pose of the arm at the first tick, m or rad, shape (L, 2).
         """
         _advance_hands(

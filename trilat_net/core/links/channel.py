@@ -1,4 +1,4 @@
-"""Computes when a simulated network delivers each message, or that it loses the message.
+"""Computes when a simulated network delivers each message, or whether it loses the message.
 
 In each control period, an arm sends its state, a sample, over a link to each other arm. The
 number of the period is called the stamp of the sample. The model of a link may delay, lose or
@@ -10,7 +10,7 @@ Invariant (law L4 of docs/develop/design.md):
 - What happens to sample m depends only on the key of the link (the seed of its random numbers),
   on m, and on the network model in force at the stamp of m.
 - Models with a memory (bursts of loss, correlated delays, order of samples) advance from sample
-  to sample by index, in whatever order samples arrive.
+  to sample by index, regardless of the order in which samples arrive.
 """
 
 from ..step.jit import leaf
@@ -33,7 +33,7 @@ from .delay import (
 from .philox import DrawKey, uniforms
 
 LOST = -1
-"""Stands for the due time of a lost sample."""
+"""Used in place of a due time for a sample that the network loses."""
 
 _AR1 = int(DelayKind.AR1)
 _SINE = int(DelayKind.SINE)
@@ -50,8 +50,8 @@ def _in_outage(stamp_ns: int, link: LinkRow, points: Points) -> bool:
 
     Args:
         stamp_ns: Stamp of the sample, ns since the epoch, the common start of the session.
-        link: State of the link. It states which rows of `points` are its outages.
-        points: Table of points; the row of an outage has its start and its end, ns.
+        link: State of the link, which gives the rows of its outages in `points`.
+        points: Table of points. The row of an outage contains its start and its end, ns.
     """
     for n in range(link.outage_first, link.outage_first + link.outage_count):
         if points[n, 0] <= stamp_ns < points[n, 1]:
@@ -63,19 +63,20 @@ def _in_outage(stamp_ns: int, link: LinkRow, points: Points) -> bool:
 def loses_samples(model: Row) -> bool:
     """Returns True if the model of a network link drops messages at random.
 
-    If it does not, no random number needs to be drawn for the losses.
+    Otherwise, no random number needs to be drawn for the losses.
     """
     return bool(model.loss_good != 0.0 or model.enter != 0.0)
 
 
 @leaf
 def advance_losses(u: float, v: float, fresh: bool, link: LinkRow, model: Row) -> bool:
-    """Decides by random numbers whether the next sample is lost, with losses in bursts.
+    """Decides at random whether the next sample is lost, on a link whose losses come in bursts.
 
     The link is in a good or a bad state, each with its own probability of loss (model of
-    Gilbert and Elliott). From sample to sample it enters the bad state with the probability
-    `enter`, and leaves it with the probability `leave`. A fresh chain starts in its stationary
-    distribution, where the bad state has the probability enter / (enter + leave).
+    Gilbert and Elliott). From sample to sample, the link enters the bad state with the
+    probability `enter`, and leaves the bad state with the probability `leave`. A fresh chain
+    starts in its stationary distribution, where the bad state has the probability enter /
+    (enter + leave).
 
     Args:
         u: Uniform random number, which decides on the state of the chain.
@@ -85,7 +86,7 @@ def advance_losses(u: float, v: float, fresh: bool, link: LinkRow, model: Row) -
         model: Model in force, which loses samples.
     """
     if fresh:
-        # A product and not a quotient: enter + leave may be zero.
+        # The test is a product, not a quotient, because enter + leave may be zero.
         link.bad = u * (model.enter + model.leave) < model.enter
     elif link.bad:
         link.bad = u >= model.leave
@@ -97,7 +98,7 @@ def advance_losses(u: float, v: float, fresh: bool, link: LinkRow, model: Row) -
 
 @leaf
 def _draw_loss(sample: int, fresh: bool, link: LinkRow, model: Row) -> bool:
-    """Decides by random numbers whether the simulated network loses a message.
+    """Decides at random whether the simulated network loses a message.
 
     Losses are independent or come in bursts, as the model says. The same seed, link and message
     number always give the same decision, so that a run can be repeated.
@@ -162,7 +163,8 @@ def delay_sample(stamp_ns: int, delay_us: int, link: LinkRow, model: Row) -> int
 
     Args:
         stamp_ns: Time at which the sample was sent, ns since the start of the session.
-        delay_us: Delay of the sample, or the smaller one of its delay and that of its copy, us.
+        delay_us: Delay of the sample, us. If the sample has a copy, the smaller of the two
+            delays.
         link: State of the link. `due_before`, the latest delivery so far, is updated.
         model: Model of delay and loss in force.
     """
@@ -193,7 +195,7 @@ def find_due_ns(
     Args:
         sample: Index of the sample.
         stamp_ns: Time at which the sample was sent, ns since the start of the session.
-        lost: True if the chain of losses lost the sample.
+        lost: True if the model of random losses drops the sample.
         delay_us: Delay of the sample, us, or LOST if a trace says that the sample is lost.
         link: State of the link, with the seed `key` of its random numbers; changed. `copies`
             counts the duplicated samples, and `due_before` is the latest due time so far, ns.
@@ -228,7 +230,7 @@ def find_due_ns(
 def _due_ns(
     sample: int, stamp_ns: int, fresh: bool, link: LinkRow, model: Row, points: Points
 ) -> int:
-    """Computes when a network link delivers a message, or that it loses the message.
+    """Computes when a network link delivers a message, or whether it loses the message.
 
     The function must be called once for each message (sample), in order, because bursts of loss
     and correlated delays depend on the previous message. For the same reason, loss and delay

@@ -25,7 +25,7 @@ from ..step.vectors import Points, Row, count_started
 from .philox import DrawKey, standard_gamma, standard_normal, uniforms
 
 MAX_DELAY_US = 10_000_000
-"""Largest delay; the tail of a distribution is cut off here."""
+"""Largest delay. Longer delays from a random distribution are cut off at this value."""
 
 
 class DelayKind(IntEnum):
@@ -37,9 +37,10 @@ class DelayKind(IntEnum):
     - UNIFORM: from location - scale to location + scale.
     - NORMAL: mean `location`, deviation `scale`; negative draws are repeated.
     - GAMMA: shape `extra`, scale `scale`.
-    - LOG_NORMAL: exp of a normal number of mean `location` and deviation `scale`.
-    - HYPER_EXPONENTIAL: `location` plus an exponential number, of mean `extra` with the
-      probability `weight`, otherwise of mean `scale`.
+    - LOG_NORMAL: exponential of a normal random number with mean `location` and deviation
+      `scale`.
+    - HYPER_EXPONENTIAL: `location` plus a random number with an exponential distribution. Its
+      mean is `extra` with the probability `weight`, and `scale` otherwise.
     - AR1: mean `location`, deviation `scale`, correlation `weight` from sample to sample; cut
       off at zero.
     - SINE: location + scale sin(2 pi t / extra + weight).
@@ -90,7 +91,7 @@ class LinkModel(NamedTuple):
         leave: Probability of a change from bad to good, per sample.
         duplicate: Probability that a sample has a copy, with another delay.
         in_order: 1: no sample is released before an older sample; 0: the newest sample counts.
-        playout_us: Least delay of each sample, us (play-out buffer).
+        playout_us: Minimum delay of each sample, us (play-out buffer).
         call: Address of the function of a CUSTOM model, see `plugged`.
         key: Input of that function: the key of the link.
         sample: Input: the index of the sample.
@@ -134,13 +135,15 @@ LINK_MODEL_DTYPE = np.dtype(
 
 _LARGEST_NORMAL = 8.6
 _LARGEST_EXPONENTIAL = 36.8
-"""Largest magnitudes of draws, at the least uniform number 2^-53 (see `unit_interval`):
-sqrt(-2 log 2^-53) by Box and Muller, and -log 2^-53.
+"""Largest magnitudes of random numbers.
+
+They occur at the smallest uniform number 2^-53 (see
+`unit_interval`): sqrt(-2 log 2^-53) by the method of Box and Muller, and -log 2^-53.
 """
 
 
 def _longest_us(model: LinkModel, trace: Points | None) -> float:
-    """Returns the longest delay that a delay model can produce, us, or a bound of it.
+    """Returns the longest delay that a delay model can produce, or an upper bound on it, us.
 
     The bound follows from the bounds of the model's random numbers: the largest normal number
     is `_LARGEST_NORMAL`, and the largest exponential number of mean 1 is
@@ -167,8 +170,8 @@ def _longest_us(model: LinkModel, trace: Points | None) -> float:
         return math.exp(min(location + _LARGEST_NORMAL * scale, largest_exponent))
 
     if model.kind == DelayKind.AR1:
-        # With the correlation c, draw n samples ago counts sqrt(1 - c^2) c^n. The sum over all
-        # past draws, each at its largest, is sqrt(1 - c^2) / (1 - c).
+        # With the correlation c, a draw made n samples ago has the weight sqrt(1 - c^2) c^n.
+        # The sum over all past draws, each at its largest, is sqrt(1 - c^2) / (1 - c).
         gain = math.sqrt((1.0 + weight) / (1.0 - weight)) if weight < 1.0 else math.inf
         return location + _LARGEST_NORMAL * scale * gain
 
@@ -187,7 +190,7 @@ def _longest_us(model: LinkModel, trace: Points | None) -> float:
 
 
 def max_delay_us(models: Sequence[LinkModel], traces: Sequence[Points | None]) -> int:
-    """Returns an upper bound of the delay of any message on a link, us.
+    """Returns an upper bound on the delay of any message on a link, us.
 
     The receiver reserves memory for as many waiting messages as this bound permits. The bound
     includes the play-out buffer, a minimum delay that the receiver adds to reduce jitter.
@@ -213,7 +216,9 @@ LOSS = 0
 DUPLICATE = 1
 DELAY = 2
 COPY = 5
-"""Purposes of draws. DELAY and COPY also reserve the two purposes that follow them, see
+"""Purposes of random draws.
+
+DELAY and COPY also reserve the two numbers that follow them, see
 `standard_gamma`.
 """
 
@@ -227,7 +232,7 @@ _LOOP = int(TraceEnd.LOOP)
 
 @leaf
 def draw_delay_us(key: DrawKey, sample: int, purpose: int, model: Row) -> float:
-    """Draws a random delay from a distribution that has no memory, us, not rounded.
+    """Draws a random delay from a distribution without memory, in us and not rounded.
 
     The random numbers are a function of the key, the sample and the purpose. Therefore the same
     arguments always give the same delay. `DelayKind` states what the parameters `location`,
@@ -294,7 +299,7 @@ def next_ar1_value(
 
 @leaf
 def sine_delay_us(stamp_ns: int, model: Row) -> float:
-    """Computes the delay of a sample (message) on a link with a delay that is a sine of time.
+    """Computes the delay of a sample (message) on a link whose delay is a sine of time.
 
         delay(t) = mean + amplitude sin(2 pi t / period + phase)
 
@@ -380,8 +385,8 @@ def custom_delay_us(
         stamp_ns: Time at which the sample was sent, ns since the start of the session.
         model: The delay model, a row of LINK_MODEL_DTYPE. The field `call` is the address of
             the function. The field `location` is the maximum delay, us.
-        points: Table with the parameters of all models, which are floats in an array of
-            integers. Each row holds two of them.
+        points: Table with the parameters of all models: floats stored in an array of integers,
+            two per row.
 
     Returns:
         The delay in us, not rounded.

@@ -71,10 +71,10 @@ def find_balancing_weights(alpha: Array) -> Array | None:
 
     With such weights the matrix is similar to a symmetric one, so that its eigenvalues are
     real. Some stability conditions hold only then. The equation is called detailed balance. It
-    has a solution if the products of the dominance factors around each circle of sites are
-    equal in both directions (Kolmogorov), as in alpha12 alpha23 alpha31 = alpha13 alpha32
-    alpha21 for three sites. Links out of a group of sites that reach each other belong to no
-    circle and are ignored.
+    has a solution if the products of the dominance factors around each cycle of sites are equal
+    in both directions (Kolmogorov), as in alpha12 alpha23 alpha31 = alpha13 alpha32 alpha21 for
+    three sites. Links that leave a group of sites that all reach each other are part of no
+    cycle, and are ignored.
 
     Args:
         alpha: Dominance matrix, shape (N, N): row i contains the weights with which site i
@@ -133,7 +133,7 @@ def perron_vector(alpha: Array) -> Array:
         a[:last, last] /= row.sum()
         column = a[:last, last]
         a[:last, :last] += np.outer(column, row)
-    # Substitute back, from the weight 1 of the first site.
+    # Substitute back, starting with the weight 1 for the first site.
     beta = np.zeros(size)
     beta[0] = 1.0
     for site in range(1, size):
@@ -143,10 +143,10 @@ def perron_vector(alpha: Array) -> Array:
 
 
 RAMP_COLUMNS = 2
-"""Columns of a ramp before its factors.
+"""Number of columns before the factors in a row of `ramps`.
 
-A ramp is a row: its start and its end, ns, and then the dominance factor of each peer at its
-end.
+Each row is a ramp: its start and
+end, ns, followed by the dominance factor of each peer at its end.
 """
 
 
@@ -177,8 +177,8 @@ def apply_ramps(t_ns: int, count: int, ramps: Array, links: RowArray) -> None:
     """Computes the weights with which an arm follows the others, and their rates, at time t.
 
     The weights are called dominance factors, one per network link. They change by ramps, which
-    are linear in time. A ramp starts at the factors that the previous ramp has at that time,
-    complete or not.
+    are linear in time. A ramp starts at the factors that the previous ramp has reached by then,
+    even if that ramp is not complete.
 
     Args:
         t_ns: The time, ns since the epoch, the common start of the session.
@@ -277,10 +277,10 @@ _ACT_BRAKE = int(StaleAction.BRAKE)
 
 @leaf
 def _any_peer_stale(t_ns: int, age_ns: int, links: RowArray) -> bool:
-    """Returns True if this arm has heard nothing recent of an arm that it follows.
+    """Returns True if this arm has no recent state from an arm that it follows.
 
-    That is, the message in use from the other arm was sent too long ago. If none has come yet,
-    the time counts from the common start of the session.
+    That is, the message in use from the other arm was sent too long ago. If no message has
+    arrived yet, the time counts from the common start of the session.
 
     Args:
         t_ns: Time, ns since the epoch.
@@ -302,11 +302,11 @@ def update_stale_mode(t_ns: int, site: SiteRow, links: RowArray) -> None:
     The reference is the position that the arm follows, and a peer an arm that it follows. A
     peer is silent if its last sample (sent state) is too old. In mode HOLD the reference stays
     where it was. In BRAKE it is the pose that the arm had when the peer fell silent. In RETURN
-    the reference moves smoothly back to the position q_des that the peers ask for:
+    the reference moves smoothly back to the position q_des computed from the peers:
 
         reference = q_held + s (q_des - q_held),    s = 3 x^2 - 2 x^3
 
-    Here q_held is the reference before the return, and x the elapsed part of the time
+    Here q_held is the reference before the return, and x the elapsed fraction of the time
     `return_ns`, from 0 to 1.
 
     Args:
@@ -360,8 +360,8 @@ def update_reference(t_ns: int, site: SiteRow, links: RowArray, ramps: Array) ->
 
     Here q_j, qd_j and tau_x_j are the position, velocity and exogenous torque in the sample of
     peer j, alpha_ij is the weight of this peer and alpha_ij' its derivative. The torque `felt`
-    is that of operators and environments on the peers' arms. The sums have the order of the
-    scenario, on which their bits depend.
+    is that of operators and environments on the peers' arms. The terms are added in scenario
+    order, because another order would change the last bits of the sums.
 
     Args:
         t_ns: Time, ns since the epoch, the common start of the session.
@@ -369,7 +369,7 @@ def update_reference(t_ns: int, site: SiteRow, links: RowArray, ramps: Array) ->
         links: State of each link from another site, one row per link.
         ramps: Changes of the dominance factors, see `apply_ramps`.
     """
-    # Row 0 of the ramps has the factors at the start, which hold if there is no other row.
+    # Row 0 of the ramps has the factors at the start, which apply if there is no other row.
     if site.ramps > 1 or site.degrades:
         apply_ramps(t_ns, site.ramps, ramps, links)
     if site.degrades:

@@ -58,18 +58,18 @@ def sample_dtype(shared: int) -> np.dtype[np.void]:
 
 
 class ChannelArrays(NamedTuple):
-    """Numbers that the control law of another arm sends, such as energies, as arrays.
+    """Arrays of the values that the control law of another arm sends, such as energies.
 
-    C is the count of the numbers, in the order in which the law of this arm reads them. If the
-    arrays are for several senders or receivers, they have additional first axes.
+    C is the number of values. They are in the order in which the law of this arm reads them.
+    Arrays for several senders or receivers have additional leading axes.
 
     Attributes:
-        waiting: Numbers that came with the samples whose simulated delay has not passed, one
+        waiting: Values that arrived with samples whose simulated delay has not passed yet, one
             row per entry of the ring buffer `LinkArrays.calendar`, shape (pages, C).
-        received: Numbers that came with the sample in use, shape (C,). Zeros before the first
+        received: Values that arrived with the sample in use, shape (C,). Zeros before the first
             sample.
-        columns: For each number its index among all numbers that arrive with a sample, shape
-            (C,). -1 if the other law does not send the number, which is then 0.
+        columns: Index of each value among all values that arrive with a sample, shape (C,). The
+            index is -1 for a value that the other law does not send; that value is 0.
     """
 
     waiting: Array
@@ -92,7 +92,7 @@ class LinkArrays(NamedTuple):
             becomes `_FILED` minus the time.
         calendar: Ring buffer of the samples whose delay has not passed, see `sample_dtype`.
         points: Traces and outages of all links of the receiver, shape (n, 2).
-        channel: Further numbers that the other control law sends. None if the law of the
+        channel: Further values that the other control law sends. None if the law of the
             receiver does not read them.
     """
 
@@ -106,7 +106,8 @@ class LinkArrays(NamedTuple):
 
 AHEAD_LIMIT_S = 10
 AHEAD_LIMIT_NS = AHEAD_LIMIT_S * NS_PER_S
-"""Largest lead of a stamp over the receiver; a sample further ahead is refused."""
+"""Largest time by which a stamp may be ahead; samples further ahead are rejected.
+"""
 
 _MEASURED = int(DelayKind.MEASURED)
 
@@ -120,8 +121,9 @@ this, and LOST is above it.
 def span_ticks(span_ns: int, rate_hz: int) -> int:
     """Returns how many control periods (ticks) a duration takes, rounded up.
 
-    For example, 2.5 ms take 3 ticks of a loop at 1000 Hz. Equal to `first_tick_at`, but in
-    plain Python, for callers that have not loaded the compiled code.
+    For example, 2.5 ms take 3 ticks of a loop at 1000 Hz. The result is that of
+    `first_tick_at`, but this function is plain Python, for callers that have not loaded the
+    compiled code.
 
     Args:
         span_ns: The time, ns.
@@ -133,10 +135,10 @@ def span_ticks(span_ns: int, rate_hz: int) -> int:
 def calendar_pages(
     rate_hz: int, delay_us: int = MAX_DELAY_US, ahead_ns: int = AHEAD_LIMIT_NS
 ) -> int:
-    """Returns how many entries the ring buffer needs in which delayed messages wait.
+    """Returns the number of entries in the ring buffer in which delayed messages wait.
 
     The buffer is called the calendar, and its entries pages. There is one page for each control
-    period of the receiver in which a message may be used first. The default arguments give the
+    period of the receiver in which a message may first be used. The default arguments give the
     largest number that any network link needs.
 
     Args:
@@ -156,7 +158,7 @@ def calendar_pages(
 
 @leaf
 def release_tick(tick: int, rate_hz: int, link: LinkArrays) -> int:
-    """Computes in which control period of the receiver a message is used first.
+    """Computes the control period of the receiver in which a message is first used.
 
     A message (sample) is the state that a sender publishes in one period of its own loop.
 
@@ -171,7 +173,8 @@ def release_tick(tick: int, rate_hz: int, link: LinkArrays) -> int:
     """
     row: LinkRow = link.state[0]
     dues = link.dues
-    # Computes the due times, the times of delivery, up to this sample if that is not done yet.
+    # Compute the due times (times of delivery) up to this sample, unless they are known
+    # already.
     schedule_deliveries(
         sample=tick, link=row, models=link.models, dues=dues, points=link.points
     )
@@ -195,7 +198,8 @@ def release_tick(tick: int, rate_hz: int, link: LinkArrays) -> int:
 def _is_far_ahead(k: int, rate_hz: int, tick: int, peer_rate_hz: int) -> bool:
     """Returns True if a message claims to come from more than AHEAD_LIMIT_S in the future.
 
-    It is refused, because it would have to wait too long. The sender's clock may be wrong.
+    Such a message is rejected, because it would have to wait too long. The sender's clock may
+    be wrong.
 
     Args:
         k: Present tick of the receiver.
@@ -211,15 +215,15 @@ def _is_far_ahead(k: int, rate_hz: int, tick: int, peer_rate_hz: int) -> bool:
 
 @leaf
 def _file_sent(channel: ChannelArrays | None, page: int, sent: Array) -> None:
-    """Stores the numbers that the control law of another arm has sent, until they may be used.
+    """Stores the values that the control law of another arm has sent, until they may be used.
 
-    The numbers, for example an energy, came in the same message as the state of the other arm,
-    and wait with it until its simulated delay has passed.
+    The values, for example an energy, arrived in the same message as the state of the other
+    arm. They wait with that state until the simulated delay of the message has passed.
 
     Args:
         channel: Arrays of these numbers; None if the receiver's law ignores them.
         page: Index of the entry of the ring buffer in which the sample waits.
-        sent: Numbers as they arrived, in the order of the sender.
+        sent: The values that arrived, in the order of the sender.
     """
     if channel is None:
         return
@@ -230,10 +234,10 @@ def _file_sent(channel: ChannelArrays | None, page: int, sent: Array) -> None:
 
 @leaf
 def _use_sent(channel: ChannelArrays | None, page: int) -> None:
-    """Gives the control law of this arm the numbers that the law of another arm has sent.
+    """Gives the control law of this arm the values that the law of another arm has sent.
 
-    The numbers, for example an energy, came in the same message as the state of the other arm.
-    The function is called when the simulated delay of this message has passed.
+    The values, for example an energy, arrived in the same message as the state of the other
+    arm. The function is called when the simulated delay of this message has passed.
 
     Args:
         channel: Arrays of these numbers; None if the receiver's law ignores them.
@@ -258,7 +262,7 @@ def accept_sample(
 
     A message (sample) is the state of the other arm. If it arrives after its delivery time, it
     is used in the present control period, unless a newer one is in use. Messages that cannot be
-    used are counted as refused, lost or duplicate.
+    used are counted as rejected, lost or duplicate.
 
     Args:
         k: Present tick, the number of the receiver's control period.
@@ -267,7 +271,7 @@ def accept_sample(
         q: Joint angles or pose of the peer, rad or m.
         qd: Derivative of q.
         tau_x: External torque of the peer, N m; the torque ON its arm is the negative.
-        sent: Further numbers from the control law of the peer. They are ignored if the law of
+        sent: Further values from the control law of the peer. They are ignored if the law of
             the receiver does not read them.
         link: Arrays of the link; written.
     """
@@ -296,7 +300,7 @@ def accept_sample(
         if model.kind != _MEASURED:  # on a measured link every sample is due before it arrives
             row.late += 1
         release = k
-    # The driver has made room for stamps in range, see `CalendarSizer`.
+    # The calendar has room for all stamps within this range, see `CalendarSizer`.
     if release - k >= calendar.shape[0]:
         row.refused += 1
         return
@@ -320,11 +324,12 @@ def accept_sample(
 
 @leaf
 def release_sample(k: int, rate_hz: int, link: LinkArrays) -> None:
-    """Puts into use the newest message of another arm whose simulated delay has passed.
+    """Starts to use the newest message from another arm whose simulated delay has passed.
 
-    If none is due in control period (tick) k, the last one stays in use. The function must be
-    called once in each period of the receiver, in order. Otherwise messages stay in the ring
-    buffer (calendar), which has a page per period. `accept_sample` has put them there.
+    If no message is due in control period (tick) k, the previous one stays in use. The function
+    must be called once in each period of the receiver, in order. Otherwise, messages that
+    `accept_sample` stored would stay in the ring buffer (calendar), which has one page per
+    period.
 
     The delivery times of all messages that were sent up to the time t_k of the period are
     computed here, so that the first message after a long silence costs no more than any other.

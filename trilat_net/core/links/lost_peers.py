@@ -27,7 +27,7 @@ from ..step.ticks import LifeReason
 from ..step.vectors import RowArray
 
 BACK_NS = 250_000_000
-"""Time for which a dropped peer must be heard before it gets its share again, ns."""
+"""Time for which samples of a dropped peer must arrive before it gets its share again, ns."""
 
 _DROPPED = int(LifeReason.DROPPED)
 _RESTORED = int(LifeReason.RESTORED)
@@ -38,13 +38,13 @@ def _can_drop(lost: int, t_ns: int, site: SiteRow, links: RowArray) -> bool:
     """Returns True if the site may go on without a peer that is lost.
 
     A site is the process that runs one arm. Its peers are the other sites, from which it
-    receives samples. The remaining sites are this site and the peers that it still hears, apart
-    from the lost one. This site must still follow at least one of them, and they must all reach
-    each other, where a site reaches the sites that it follows, directly or through others.
+    receives samples. The remaining sites are this site and the peers whose samples still
+    arrive. This site must still follow at least one of them, and they must all reach each
+    other. A site reaches the sites that it follows, directly or through others.
 
-    It suffices to compare two sets with the remaining sites: the sites that this site reaches,
-    and the sites that reach this site. The sets grow from this site until nothing can be added.
-    A set of sites is an integer with one bit per site.
+    The remaining sites all reach each other if two sets contain all of them: the sites that
+    this site reaches, and the sites that reach this site. The sets grow from this site until
+    nothing can be added. A set of sites is an integer with one bit per site.
 
     Args:
         lost: Index of the peer that is lost.
@@ -172,7 +172,8 @@ def _redistribute_shares(links: RowArray) -> bool:
         alpha_j / sum alpha,  with the derivative by the quotient rule; 0 for a lost peer
 
     Returns:
-        False, without a change, if all other peers have the factor 0.
+        True if the factors were redistributed. False if all other peers have the factor 0; the
+        factors are not changed then.
     """
     total = 0.0  # the sum of the factors of the present peers, and its derivative
     total_rate = 0.0
@@ -214,7 +215,7 @@ def regroup(t_ns: int, site: SiteRow, links: RowArray) -> None:
     The field `gone` of a link is the state of its peer:
 
     - 0: present. If the peer falls silent and can be spared, it becomes lost.
-    - -1: lost. When the peer is heard again, the field becomes the time of its return.
+    - -1: lost. When samples of the peer arrive again, the field becomes the time of its return.
     - Above 0: time of the return, ns. If the peer falls silent again, it is lost again. After
       BACK_NS it becomes present, if it is near enough for the reference not to move far.
 
@@ -249,7 +250,7 @@ def regroup(t_ns: int, site: SiteRow, links: RowArray) -> None:
             link.gone = 0.0
             site.regrouped = _RESTORED
 
-    # A change of the shares may leave all of them to lost peers: then no peer counts as lost.
+    # A change of the shares may give all of them to lost peers. Then no peer counts as lost.
     if not _redistribute_shares(links):
         for j in range(links.shape[0]):
             link = links[j]

@@ -61,7 +61,7 @@ def philox(
 ) -> PhiloxWords:
     """Returns four random 32-bit words for a counter and a key, by the Philox generator.
 
-    The same arguments always give the same words. Therefore no generator has a state. All words
+    The same arguments always give the same words, so the generator needs no state. All words
     are 32-bit numbers in uint64, so that products keep their upper halves.
 
     Args:
@@ -88,7 +88,7 @@ def philox(
 
 @leaf
 def unit_interval(high: np.uint64, low: np.uint64) -> float:
-    """Returns a number of the open interval (0, 1) that is made of two random 32-bit words.
+    """Returns a number in the open interval (0, 1) that is made from two random 32-bit words.
 
         (52 random bits + 1/2) / 2^52
 
@@ -113,7 +113,7 @@ def uniforms(key: DrawKey, sample: int, purpose: int, attempt: int) -> tuple[flo
     Args:
         key: Key of the link for whose samples the numbers are drawn.
         sample: Index of the sample.
-        purpose: What the numbers are for; it separates the draws of one sample.
+        purpose: Purpose of the numbers, which distinguishes several draws for one sample.
         attempt: Attempt of a method that rejects draws, from 0.
     """
     index = np.uint64(sample)
@@ -137,7 +137,7 @@ def standard_normal(key: DrawKey, sample: int, purpose: int, attempt: int) -> fl
     Args:
         key: Key of the link for whose samples the number is drawn.
         sample: Index of the sample.
-        purpose: What the number is for; it separates the draws of one sample.
+        purpose: Purpose of the number, which distinguishes several draws for one sample.
         attempt: Attempt of a method that rejects draws, from 0.
     """
     u, v = uniforms(key, sample, purpose, attempt)
@@ -169,7 +169,7 @@ def standard_gamma(key: DrawKey, sample: int, purpose: int, shape: float) -> flo
         k += 1.0
     d = k - 1.0 / 3.0
     c = 1.0 / math.sqrt(9.0 * d)
-    # At most one attempt in twenty is rejected: 64 in a row never happen.
+    # At most one attempt in twenty is rejected, so 64 rejections in a row never happen.
     for attempt in range(64):
         x = standard_normal(key, sample, purpose, attempt)
         root = 1.0 + c * x

@@ -63,11 +63,12 @@ def compiled(law: T) -> T:
     ...         for i in range(now.joints):
     ...             now.tau[i] = -now.qd[i]
 
-    A class with memory needs `remembers`. Code that Numba cannot compile is refused when a site
-    is built.
+    A class with memory needs `remembers`. Code that Numba cannot compile is rejected when a
+    site is built.
     """
     if not isinstance(law, type):
-        # called from a law in plain Python it stays a Python function, which takes any objects
+        # For a law in plain Python, the function stays a Python function, which accepts any
+        # objects.
         function: Any = law
         callable_from_python: T = register_jitable(**CHECKED)(function)
         return callable_from_python
@@ -86,7 +87,7 @@ def is_compiled(law: Any) -> bool:
 
 @leaf
 def _all_finite(values: Array) -> bool:
-    """Returns True if no number of an array is NaN or infinite."""
+    """Returns True if all numbers of an array are finite."""
     are_finite = True
     for i in range(values.shape[0]):
         are_finite = are_finite and np.isfinite(values[i])
@@ -100,8 +101,8 @@ def finish_law(s: Row, law: Array, sent: Array) -> None:
     Args:
         s: State of the site (the process that runs the arm), with the torque and the estimate;
             the torque is limited.
-        law: Numbers of the law. Those that it keeps from tick to tick (control period) come
-            first, and are checked too.
+        law: Memory and gains of the law. The memory, which the law keeps from tick to tick
+            (control period), comes first and is checked too.
         sent: Vectors that the law sends to other arms.
 
     Raises:
@@ -139,7 +140,7 @@ def law_stage(
         k: Number of the tick (control period).
         t_ns: Nominal time of the tick, ns since the epoch, the common start of the session.
         address: Address of the law's machine code.
-        law: Numbers of the law, those that it keeps from tick to tick first; changed.
+        law: Memory of the law, which it keeps from tick to tick, and its gains; changed.
         site: State of the site (the process that runs the arm), in which the torque is written.
         links: State of each link from another site, one row per link.
         chain: Data of the joints, one row per joint. None for the planar two-link arm.
@@ -167,9 +168,9 @@ class LawForm(NamedTuple):
         law: Names and shapes of the law's numbers: its gains and its memory.
         site: Data type of the state of the arm and its controller.
         link: Data type of the state of a link from a peer.
-        received: Vectors that a peer sends. None if there are none.
-        to_all: Vectors that go to all peers. None if there are none.
-        sent: Vectors that go to one peer alone. None if there are none.
+        received: Vectors that a peer sends. None if there are no such vectors.
+        to_all: Vectors that go to all peers. None if there are no such vectors.
+        sent: Vectors that go to one peer alone. None if there are no such vectors.
         peers: Number of peers.
     """
 
@@ -209,10 +210,10 @@ def _vectors_dtype(vectors: Sequence[SentVector], width: int = 0) -> np.dtype[np
     return np.dtype((np.record, layout))
 
 
-# Numba cannot return a record from a function, so the code becomes a part of each caller.
+# Numba cannot return a record from a function, so this function is inlined into its callers.
 @numba.njit(inline="always", **CHECKED)  # type: ignore[untyped-decorator]
 def collect_law_input(s: Row, links: Any, received: Any, sent: Any, to_all: Any) -> LawInput:
-    """Collects what a compiled control law may read and write in one control period.
+    """Collects the data that a compiled control law may read and write in one control period.
 
     The vectors are views of the arrays of the simulation, because copying would take time in
     every period.
@@ -320,23 +321,23 @@ def _compile_law(torque: Callable[..., Any], form: LawForm) -> Any:
 
 
 def _read_numbers(law: Any) -> dict[str, np.ndarray[Any, Any]]:
-    """Collects the numbers of a law, which the compiled law stores in a row of an array.
+    """Collects the gains and the memory of a law, which its compiled form keeps in an array.
 
     These are the attributes of the instance, and the attributes of its class whose names occur
     in the method `torque`. Each of them needs a fixed type:
 
     - Integers that do not change, such as counts and indices, remain integers. Booleans that
       do not change become integers.
-    - All other numbers become floats, also integers that may change: the numbers that the law
-      remembers from tick to tick, attributes that `torque` assigns, and lists, whose elements
-      it can assign. A tick is a period of the control loop.
+    - All other numbers become floats. They include integers that may change: numbers that the
+      law remembers from tick to tick, attributes that `torque` assigns, and elements of lists.
+      A tick is a period of the control loop.
 
     Args:
         law: An instance of the law's class.
 
     Returns:
-        Numbers by name, as arrays: first those that the law remembers, in their order, then the
-        others in alphabetical order. Attributes that are not numbers are left out.
+        Arrays by attribute name: first the numbers that the law remembers, in their order, then
+        the other numbers in alphabetical order. Attributes that are not numbers are left out.
     """
     # The byte code of `torque` names the attributes that it reads and assigns. It does not tell
     # whether they belong to the law, so names of attributes of other objects are included.
@@ -370,11 +371,11 @@ _INPUTS = {
     "LawInput": ("now", LawInput._fields),
     "Record(alpha": ("an entry of now.peers", PeerView._fields),
 }
-"""Names and fields of the inputs of a law, by the beginning of their types in Numba."""
+"""Names and fields of the inputs of a law, by the first words of their types in Numba."""
 
 
 def _explain(error: Exception, law: Any) -> str:
-    """Tells a user in one sentence why Numba cannot compile a control law.
+    """Explains to a user in one sentence why Numba cannot compile a control law.
 
     The messages of Numba are long and name types of Numba. Frequent causes are recognised and
     explained in the terms of a law; otherwise the first sentence of the message is returned.
@@ -456,7 +457,7 @@ def _explain_field(name: str, kind: str, location: str) -> str:
 
 
 def _explain_attribute(name: str, law: Any, location: str) -> str:
-    """Tells a user why a compiled control law cannot use an attribute of `self`.
+    """Explains to a user why a compiled control law cannot use an attribute of `self`.
 
     Only numbers and lists of numbers can be compiled. The attribute is of another type, does
     not exist, or is a method. For a method, the sentence says what to write instead.
@@ -490,11 +491,11 @@ class CompiledLaw:
     Args:
         law: An instance of the law's class.
         setup: Setup of the site.
-        arrays: Arrays of the site; their vectors may be longer than the site's.
-        sent: Vectors that the law sends, in the site's record, see `LawChannel`.
+        arrays: Arrays of the site. Their vectors may be longer than this site needs.
+        sent: Part of the site's record for the vectors that the law sends, see `LawChannel`.
 
     Attributes:
-        row: Numbers of the law, those that it keeps from tick to tick first.
+        row: Memory of the law, which it keeps from tick to tick, followed by its gains.
         address: Address of its machine code.
         form: Layouts of the arrays of the law.
         torque: Method of the law's class that computes the torque, not compiled.
@@ -592,7 +593,8 @@ class CompiledLaw:
         arrays = self._arrays
         assert arrays.channel is not None
         try:
-            # Positional, because compiled functions take no names of arguments.
+            # The arguments are positional, because compiled functions accept no keyword
+            # arguments.
             self._stage(
                 k,
                 t_ns,
@@ -604,7 +606,7 @@ class CompiledLaw:
                 arrays.channel,
                 self._sent,
             )
-        except Exception as error:  # the user's code may raise anything
+        except Exception as error:  # the user's code may raise any exception
             raise self.find_failure(error) or error from None
         return self.memory
 
@@ -671,13 +673,13 @@ def plug_law(
         law: An instance of the law's class.
         setup: Setup of the site.
         arrays: Arrays of the site, which the law reads and writes.
-        sent: Array for the numbers that the law sends to other sites, see `LawChannel`.
+        sent: Array for the values that the law sends to other sites, see `LawChannel`.
 
     Returns:
         The law, ready for use.
 
     Raises:
-        ScenarioError: The law is to be compiled, and Numba cannot compile it.
+        ScenarioError: The law is marked for compilation, but Numba cannot compile it.
     """
     arrays.site["needs_model"] = getattr(law, "needs_model", False)
     arrays.site["holds"] = getattr(law, "holds", False)

@@ -1,10 +1,10 @@
-"""Defines where the numbers that a control law sends to other arms are stored in a record.
+"""Defines where the values that a control law sends to other arms are stored in a record.
 
 Each arm sends its motion to the other arms, its peers. Some control laws send further vectors,
 for example wave variables or energies. A vector either goes to all peers, or each peer gets a
 vector of its own.
 
-In each control period, the site (the process that controls an arm) stores all these numbers in
+In each control period, the site (the process that controls an arm) stores all these values in
 the field `ch` of its record. A peer receives the part that is meant for it. Therefore the
 records of the sender show what each peer received.
 
@@ -20,9 +20,9 @@ from typing import NamedTuple
 from ...errors import count_nouns
 
 MAX_SENT = 16
-"""Largest count of numbers per joint that a law sends to a peer."""
+"""Largest number of values per joint that a law sends to a peer."""
 MAX_RECORD_SENT = 1024
-"""Largest count of numbers that a law sends to all its peers together; each record has them."""
+"""Largest number of values that a law sends to all its peers together, as in each record."""
 
 
 class SentVector(NamedTuple):
@@ -32,9 +32,9 @@ class SentVector(NamedTuple):
 
     Attributes:
         name: Name of the vector, as the law uses it.
-        unit: Unit of its numbers.
-        length: Count of its numbers.
-        per_peer: True: each peer gets its own vector; false: all peers get the same vector.
+        unit: Unit of its values.
+        length: Number of its values.
+        per_peer: True if each peer gets its own vector, False if all peers get the same vector.
     """
 
     name: str
@@ -48,7 +48,7 @@ class _SentEntry(NamedTuple):
 
     Attributes:
         vector: Vector of the number.
-        peer: Peer that alone gets the vector, or "" if all peers get it.
+        peer: The only peer that gets the vector, or "" if all peers get it.
         position: Position of the number in the vector, from 0.
     """
 
@@ -76,8 +76,8 @@ class LawChannel(NamedTuple):
     vectors are listed in the order in which the log stores them.
 
     Attributes:
-        vectors: The vectors. Vectors that all peers (the other arms) receive come before
-            vectors of which each peer gets its own.
+        vectors: The vectors. Those that are the same for all peers (the other arms) come before
+            those that are different for each peer.
         peers: Number of peers.
     """
 
@@ -85,43 +85,43 @@ class LawChannel(NamedTuple):
     peers: int = 0
 
     def select_vectors(self, *, per_peer: bool) -> tuple[SentVector, ...]:
-        """Returns the vectors that a control law sends to all other arms, or to each arm alone.
+        """Returns the vectors that are equal for all receivers, or different for each one.
 
-        A vector to each arm alone has a value of its own for each receiver, for example a wave.
-        The receivers are called peers.
+        The receivers are the other arms, called peers. A wave, for example, is different for
+        each receiver.
 
         Args:
-            per_peer: True: the vectors that go to each peer alone; false: those that go to all.
+            per_peer: True for vectors that are different for each peer, False for vectors that
+                are the same for all peers.
         """
         return tuple(vector for vector in self.vectors if vector.per_peer is per_peer)
 
     def count_numbers(self, *, per_peer: bool) -> int:
-        """Counts the numbers of all vectors that go to all peers, or to each peer alone.
+        """Counts the values of the vectors that go to all peers, or to each peer alone.
 
         A peer is another arm's process, which receives the vectors that the law sends.
 
         Args:
-            per_peer: True for the vectors of which each peer (the process of another arm) gets
-                its own. The result is then the count for a single peer. False for the vectors
-                that all peers receive.
+            per_peer: True for vectors that are different for each peer; the result is then the
+                count for a single peer. False for vectors that are the same for all peers.
         """
         return sum(vector.length for vector in self.select_vectors(per_peer=per_peer))
 
     @property
     def received_size(self) -> int:
-        """Count of the numbers that one other arm receives from the law with each message.
+        """Number of values that one other arm receives from the law with each message.
 
-        These are the vectors for all receivers, and one vector of each kind that has a value of
-        its own for each receiver.
+        They are the vectors that are the same for all receivers, and this receiver's own copy
+        of each vector that is different for each receiver.
         """
         return sum(vector.length for vector in self.vectors)
 
     @property
     def record_size(self) -> int:
-        """Count of the floats that the law sends to all receivers in a control period.
+        """Number of floats that the law sends to all receivers in a control period.
 
-        This is the length of the field `ch` in the log. A vector with a value of its own for
-        each receiver counts once per receiver.
+        This is the length of the field `ch` in the log. A vector that is different for each
+        receiver counts once per receiver.
         """
         if not self.vectors:
             return 0
@@ -130,7 +130,7 @@ class LawChannel(NamedTuple):
         return to_all + self.peers * to_each
 
     def find_columns(self, vectors: Sequence[SentVector]) -> list[int]:
-        """Finds the numbers that a receiving control law reads, in a message of this law.
+        """Locates the values that a receiving control law reads, in a message of this law.
 
         The receiver may read fewer vectors, and in another order.
 
@@ -138,8 +138,8 @@ class LawChannel(NamedTuple):
             vectors: The vectors that the other law reads.
 
         Returns:
-            For each number of these vectors its index among the numbers that this law sends to
-            a peer. The index is -1 for the numbers of a vector that this law does not send.
+            For each value of these vectors, its index among the values that this law sends to a
+            peer. The index is -1 for the values of a vector that this law does not send.
         """
         first_column = 0
         first_columns = {}
@@ -157,7 +157,7 @@ class LawChannel(NamedTuple):
         return columns
 
     def entries(self, peers: Sequence[str]) -> Iterator[_SentEntry]:
-        """Describes each number that the law sends in a control period, one after another.
+        """Describes each value that the law sends in a control period, one after another.
 
         The order is that of the field `ch` in the log.
 
@@ -177,12 +177,12 @@ class LawChannel(NamedTuple):
                     yield _SentEntry(vector, peer, n)
 
     def select_for_peer(self, sent: Sequence[float], peer_index: int) -> Sequence[float]:
-        """Returns those of a law's sent numbers that one receiver (peer) gets.
+        """Returns the values sent by a control law that one receiver (peer) gets.
 
-        They are the numbers for all receivers, and the numbers for this one alone.
+        They are the values for all receivers, and the values for this receiver alone.
 
         Args:
-            sent: All numbers that the law sent in a tick, as the record contains them.
+            sent: All values that the law sent in a tick, as in its record.
             peer_index: Index of the peer among the sender's peers.
         """
         to_all = self.count_numbers(per_peer=False)

@@ -2,8 +2,8 @@
 
 Such a law is called passive: a delay in the network cannot feed energy into the arms. Some laws
 count the energy that they sent to other arms, took from other arms, stored and dissipated. They
-have a method that computes this account from the records of a run, which contain the numbers of
-each control period. A check then compares the account with the motion of the arms.
+have a method that computes this account from the records of a run, one record per control
+period. A check then compares the account with the motion of the arms.
 
 Invariant:
     - The energy that arm i takes from arm j is never more than the energy that the law of arm j
@@ -21,7 +21,7 @@ from ..step.vectors import Array, IntArray
 
 
 class PeerRecords(NamedTuple):
-    """Numbers that an arm's control law received from another arm and sent to it, in K periods.
+    """Values that a control law received from another arm and sent to that arm, in K periods.
 
     In each period of the control loop, every arm's process sends a message (sample) with its
     state. The receiving law uses the newest message that has arrived.
@@ -69,9 +69,9 @@ class LawRecords(NamedTuple):
 class LawEnergies(NamedTuple):
     """Account of the energy that a control law gave, took, stored and dissipated.
 
-    It has K control periods. All energies are in J and have the shape (K,) or (K, parts). Flows
-    are sums since the beginning. Each part, for instance that of a joint, must not be below
-    zero by itself.
+    The account covers K control periods. All energies are in J and have the shape (K,) or (K,
+    parts). Flows are sums since the start of the run. Each part, for instance that of a joint,
+    must not be below zero by itself.
 
     Attributes:
         gave: Per peer, the energy that was sent to it.
@@ -82,11 +82,11 @@ class LawEnergies(NamedTuple):
         store: Energy that the law stores.
         taken: Energy that the law has dissipated, by its own formula. None if it is the
             remainder of the other energies.
-        observed: Per peer, the energy that the site knows to remain of the energy sent by the
-            peer; () if the law does not observe it.
+        observed: Per peer, the energy sent by the peer that this site knows not to have been
+            taken yet; () if the law does not observe this energy.
         weight: Weight of the arm's energy in the sum over all sites.
-        gravity: Factor of gravity that the law compensates; the work of this torque is no work
-            of the law.
+        gravity: Fraction of the gravity torque that the law compensates. The work of this part
+            of the torque is not counted as work of the law.
     """
 
     gave: Sequence[Array]

@@ -5,7 +5,7 @@ control law reads these rows directly. For a law in plain Python, this module co
 lists and writes the results of the law back.
 
 Invariant:
-    - The compiled and the plain form of a law see the same numbers.
+    - A law receives the same numbers whether it is compiled or runs in plain Python.
     - A vector that the law sends to other arms keeps its numbers until the law writes it again.
 """
 
@@ -30,7 +30,8 @@ from .user_law import LawInput, LawVector, PeerView, UserLaw, call_law, read_mem
 def _update_model(s: Row, chain: RowArray | None) -> None:
     """Computes the gravity torque, inertia matrix and bias torque of an arm for a user's law.
 
-    The bias torque is that of Coriolis forces, gravity and friction, without acceleration.
+    The bias torque is the torque of Coriolis forces, gravity and friction, which an arm needs
+    even without acceleration.
 
     Args:
         s: State of the site (the process that runs the arm).
@@ -89,7 +90,7 @@ def _name_vectors(vectors: Sequence[SentVector], numbers: list[float]) -> Simple
 
     Args:
         vectors: Names and lengths of the vectors.
-        numbers: Their numbers, one vector after another. Further numbers are ignored.
+        numbers: Values of the vectors, one vector after another. Further values are ignored.
     """
     named = SimpleNamespace()
     first = 0
@@ -109,8 +110,8 @@ class PlainLaw:
     Args:
         law: The law.
         setup: Setup of the site.
-        arrays: Arrays of the site; their vectors may be longer than the site's.
-        sent: Vectors that the law sends, in the site's record, see `LawChannel`.
+        arrays: Arrays of the site. Their vectors may be longer than this site needs.
+        sent: Part of the site's record for the vectors that the law sends, see `LawChannel`.
     """
 
     def __init__(self, law: UserLaw, setup: SiteSetup, arrays: SiteArrays, sent: Array) -> None:
@@ -212,8 +213,8 @@ class PlainLaw:
 
         The input also contains the vectors that the law sends to the laws of its peers (other
         arms), with the numbers of the previous tick. The law overwrites them, and
-        `_collect_sent` reads the new numbers. In the array they have the order of a record:
-        first the vectors that go to all peers, then for each peer those that go to it alone.
+        `_collect_sent` reads the new numbers. The array has the order of a record: first the
+        vectors that go to all peers, then for each peer the vectors that go to this peer alone.
 
         Args:
             k: Number of the tick (control period).

@@ -30,7 +30,7 @@ from ..step.vectors import Array
 _OPTIONS: Any = {"_nrt": False, "error_model": "numpy"}
 _config: Any = numba.config
 _PLAIN: dict[int, Callable[..., None]] = {}
-"""The functions by the numbers that replace their addresses if Numba is disabled."""
+"""Python functions, by the numbers that replace their addresses if Numba is disabled."""
 
 
 @intrinsic
@@ -119,7 +119,8 @@ def digest_sibling_sources(function: Callable[..., Any]) -> str:
         function: A function.
 
     Returns:
-        The hash. Empty if the function is not part of this package; its code is not stored.
+        The hash. Empty if the function is not part of this package, because its code is not
+        stored then.
     """
     folder = Path(function.__code__.co_filename).parent
     if not folder.is_relative_to(Path(__file__).parents[2]):
@@ -140,7 +141,7 @@ def find_address(compiled: Any) -> int:
 
 
 def _find_numbers(model: Any) -> dict[str, Array]:
-    """Returns the parameters of a user's model as arrays: those fields that are numbers.
+    """Returns the numerical fields of a user's model as arrays. They are its parameters.
 
     The compiled function of the model receives them as a row with these field names. Fields of
     other types, such as texts, are left out. Example: a field `stiffness_n_m = 200` becomes
@@ -216,7 +217,7 @@ def _compile(
     sources = digest_sibling_sources(function)
     is_part_of_this_package = bool(sources)
     if is_part_of_this_package:
-        # The machine code is stored on disk, under a name from all that it depends on.
+        # The machine code is stored on disk, under a hash of everything that it depends on.
         text = f"{sources} {function.__module__} {function.__qualname__} {form} {row}"
         digest = hashlib.sha256(text.encode()).hexdigest()
         return compile_named(call, f"own_{digest[:32]}", signature, **_OPTIONS)

@@ -40,7 +40,7 @@ class LawContext(NamedTuple):
             unknown, as for a real arm that was not identified.
         tau_limit_nm: Largest torque of a joint, N m; one number, or one per joint.
         joints: Number of joints of the arm.
-        coordinates: Count of numbers in q, qd and tau_x of a peer: one per joint, or one per
+        coordinates: Number of values in q, qd and tau_x of a peer: one per joint, or one per
             coordinate of the end effector.
         peers: Names of the peers, in scenario order.
     """
@@ -108,10 +108,10 @@ class LawVector(list[Any]):
 
 
 class PeerView(NamedTuple):
-    """What a control law knows about one of the other arms (a peer) in a control period.
+    """Information that a control law has about another arm (a peer) in a control period.
 
-    It is the newest state that the other arm has sent and whose network delay has passed (its
-    sample). Before the first one, it is the start pose of the other arm, at rest.
+    It is the newest state (sample) from the other arm whose network delay has passed. Before
+    the first sample, it is the start pose of the other arm, at rest.
 
     Attributes:
         alpha: Dominance factor of the peer now, the weight with which this site follows it.
@@ -134,15 +134,15 @@ class PeerView(NamedTuple):
 
 
 class LawInput(NamedTuple):
-    """Input of a control law in one control period (tick), and the places for its results.
+    """Input of a control law in one control period (tick), and fields for its results.
 
     A vector has one number per joint, or one per coordinate that the arms share.
 
     >>> def torque(self, now: tn.LawInput) -> list[float]:
     ...     return [-d * speed for d, speed in zip(self.d, now.qd)]
 
-    In plain Python the vectors are `LawVector`, which has arithmetic. A compiled law uses their
-    numbers one by one.
+    In plain Python, each vector is a `LawVector`, which supports arithmetic. A compiled law
+    uses the numbers of a vector one by one.
 
     Attributes:
         k: Number of the tick (control period).
@@ -155,13 +155,13 @@ class LawInput(NamedTuple):
         felt: Torque of hands and environments ON the peers' arms as received, weighted by
             dominance, N m: the sum of -alpha tau_x of the peers.
         joints: Number of joints.
-        coordinates: Count of numbers in the vectors of a peer.
+        coordinates: Number of values in each vector of a peer.
         tau: Torque of each joint, N m, written by the law and then limited.
         peers: The peers in scenario order.
-        received: Per peer the vectors that its law sent with the sample in use, by name; zeros
+        received: Per peer, the vectors by name that its law sent with the sample in use. Zeros
             before the first sample, and for a vector that the peer's law does not send.
-        sent: Per peer the vectors that go to this peer alone, written by the law; a vector that
-            is not written keeps its numbers.
+        sent: Per peer, the vectors that go to this peer alone, written by the law. A vector
+            that is not written keeps its values.
         to_all: Vectors that go to all peers, also written by the law.
         tau_x: Minus the torque of hand and environment ON this arm in this tick, N m, the sign
             of Eq. (8).
@@ -205,7 +205,7 @@ class UserLaw(Protocol):
     entries of the table `[control]` of the scenario as keyword arguments. The method `torque`
     is called in each period of the control loop.
 
-    Optional attributes and methods:
+    A law may have these attributes and methods:
 
     - If `torque` needs numbers from earlier periods, the law must declare them, so that a run
       can be repeated. Either the class lists the names of these attributes in `remembers`, or a
@@ -237,7 +237,8 @@ def call_law(
 ) -> "LawResults":
     """Calls a user's control law for one control period, and checks its results.
 
-    An exception or an unusable result is reported with the class, the arm and the period.
+    If the law raises an exception or returns an unusable result, the error names the class, the
+    arm and the period.
 
     Args:
         law: The law.
@@ -246,8 +247,8 @@ def call_law(
         collect_sent: Function that returns the numbers that the law sends to other arms.
 
     Raises:
-        LawFailed: The law raised an exception, or its results are not finite numbers of the
-            right count.
+        LawFailed: The law raised an exception, or its results are not finite or have the wrong
+            length.
     """
     try:
         returned = law.torque(now)
@@ -280,7 +281,7 @@ class LawResults(NamedTuple):
     """Checked results of a user's control law in one control period.
 
     They are the torque of each joint, the estimate of the arm's parameters, the numbers that
-    the law keeps for the next period, and those that it sends to other arms.
+    the law keeps for the next period, and the numbers that it sends to other arms.
     """
 
     torque: list[float]
@@ -290,7 +291,7 @@ class LawResults(NamedTuple):
 
 
 def check_results(law: UserLaw, site: str, tick: int, results: LawResults) -> None:
-    """Checks that the results of a user's control law are finite numbers, and not too many.
+    """Checks that the results of a user's control law are finite, and its memory not too large.
 
     A torque that is NaN would make the simulation useless, and a large memory would fill the
     log.
@@ -307,7 +308,7 @@ def check_results(law: UserLaw, site: str, tick: int, results: LawResults) -> No
     count = len(results.memory)
     if count > MAX_LAW_MEMORY:
         numbers = count_nouns(count, "number")
-        problem = f"memory has {numbers}, at most {MAX_LAW_MEMORY} are kept"
+        problem = f"memory has {numbers}, but at most {MAX_LAW_MEMORY} are allowed"
         raise _law_error(law, site, tick, problem)
     for name, values in zip(results._fields, results, strict=True):
         if all(map(math.isfinite, values)):
@@ -328,7 +329,7 @@ def describe_failure(
     Args:
         law: The law.
         site: Name of the site.
-        tick: Number of the tick (control period). None if the law failed outside of a tick.
+        tick: Number of the tick (control period). None if the law failed outside a tick.
         error: The exception.
     """
     problem = describe_exception(error)
@@ -340,8 +341,8 @@ def describe_failure(
 def _flatten(value: Any) -> Iterator[float]:
     """Yields the numbers of an attribute of a control law as floats, to store them in the log.
 
-    A number yields itself; nested lists yield their numbers in order: [[1, 2], [3]] yields 1, 2
-    and 3.
+    A single number gives itself. Nested lists give their numbers in order: [[1, 2], [3]] gives
+    1, 2 and 3.
     """
     if isinstance(value, Real):
         yield float(value)
@@ -446,7 +447,7 @@ def _law_error(law: UserLaw, site: str, tick: int | None, problem: str) -> LawFa
     Args:
         law: The law.
         site: Name of the site.
-        tick: Number of the tick (control period). None outside of a tick.
+        tick: Number of the tick (control period). None outside a tick.
         problem: The problem, a sentence for the user.
     """
     return LawFailed(problem, site=site, code=law_name(law), tick=tick)

@@ -243,7 +243,7 @@ class _LeafLocator:
         return str(root / self._py_file.parent.name)
 
     def get_source_stamp(self) -> str:
-        # Functions of lanes are outside of the core, whose hash names the directory.
+        # Some leaves are outside of the core, whose hash names the directory.
         return _hash_folder(self._py_file.parent)
 
     def get_disambiguator(self) -> str:
@@ -726,8 +726,8 @@ class _Leaf(CPUDispatcher):
         The code is loaded from the cache on disk if it is there. Otherwise the function is
         compiled, and its code is stored.
         """
-        # The types of several runs side by side (lanes) are defined outside of the core, and
-        # the name of the cache directory contains a hash of the core only.
+        # A leaf for several runs side by side (lanes) is a part of one function for each
+        # structure of runs, so its code would be stored without being loaded again.
         is_stored = not any(map(_is_in_lanes, argument_types))
         if is_stored:
             loaded = self._cache.load_inner(argument_types, self.targetctx)
@@ -878,7 +878,7 @@ def set_lane_form(
 ) -> None:
     """Registers another version of a function, for code that computes several simulations.
 
-    For example, `compute_law` of `execution.lanes.lane_laws` has a version for each control
+    For example, `compute_law` of `lanes.lane_laws` has a version for each control
     law, because the simulations side by side all use the same law.
 
     Args:

@@ -168,7 +168,10 @@ class SiteArrays(NamedTuple):
 
     @classmethod
     def stack(
-        cls, setups: Sequence[SiteSetup], spare: int = 0, longest_us: int = 0, late_ns: int = 0
+        cls,
+        setups: Sequence[SiteSetup],
+        changes: Sequence[CoreChange] = (),
+        late_ns: int = 0,
     ) -> "SiteArrays":
         """Creates the arrays for a simulation of several sites, stacked along a first axis.
 
@@ -178,14 +181,19 @@ class SiteArrays(NamedTuple):
 
         Args:
             setups: Setups of the sites.
-            spare: Number of changes during the run for which there is room, for each link and
+            changes: Changes during the run. There is room for all of them, for each link and
                 for the weights with which each site follows the others.
-            longest_us: Longest delay that the changes can lead to, us.
             late_ns: Longest time by which a sample may arrive after its delivery time, ns.
         """
+        longest_us = 0
         for setup in setups:
             for link in setup.links:
                 longest_us = max(longest_us, max_delay_us(link.models, link.traces))
+        for change in changes:
+            if change.model is not None:
+                # A change cannot set a recorded delay trace.
+                longest_us = max(longest_us, max_delay_us([change.model], [None]))
+        spare = len(changes)
         fastest_hz = max(setup.rate_hz for setup in setups)
         margin_ns = late_ns + _SLACK * NS_PER_S // fastest_hz
         pages = calendar_pages(fastest_hz, longest_us, margin_ns)

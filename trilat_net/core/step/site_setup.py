@@ -403,6 +403,17 @@ class SiteSetup(NamedTuple):
         return layout._replace(bodies=7 * self.bodies)
 
     @property
+    def live_actor(self) -> int:
+        """Index of the live operator among the operators and environments; -1: there is none.
+
+        A live operator is a person or program that moves the arm during the run.
+        """
+        for index, source in enumerate(self.actors):
+            if source.kind in LIVE_KINDS:
+                return index
+        return -1
+
+    @property
     def received_vectors(self) -> tuple[SentVector, ...]:
         """Vectors that the control law of this site reads from each of the other sites.
 

@@ -83,7 +83,7 @@ def choose(condition: bool, if_true: float, if_false: float) -> float:
 
     Both numbers are computed before. With `choose` in place of `if`, a function can also be
     compiled for several simulations side by side (SIMD), where each may need another choice.
-    See `execution/lanes`.
+    See `core/lanes`.
 
     Args:
         condition: The condition.

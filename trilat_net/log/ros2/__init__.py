@@ -25,10 +25,11 @@ __all__ = [
     "NUMBERS_BY_MODE_WORD",
     "SENT_PREFIX",
     "SESSION_CHANNELS",
-    "Ros2Channel",
+    "Ros2Channels",
     "Ros2SiteChannels",
     "SiteMessages",
-    "list_full_topics",
+    "list_log_topics",
+    "list_topics",
     "pack_event",
     "pack_session_diagnostics",
     "read_ros2_channels",
@@ -44,6 +45,7 @@ __all__ = [
     "SPACING_M",
     "WORLD",
     "build_rviz_config",
+    "write_rviz_config",
 ]
 
 if TYPE_CHECKING:
@@ -52,7 +54,8 @@ if TYPE_CHECKING:
     from .published import (
         COMMON_TOPICS,
         SiteMessages,
-        list_full_topics,
+        list_log_topics,
+        list_topics,
         pack_session_diagnostics,
     )
     from .robot_model import SPACING_M, WORLD
@@ -63,12 +66,12 @@ if TYPE_CHECKING:
         NUMBERS_BY_MODE_WORD,
         SENT_PREFIX,
         SESSION_CHANNELS,
-        Ros2Channel,
+        Ros2Channels,
         Ros2SiteChannels,
         pack_event,
         read_ros2_channels,
     )
-    from .rviz_config import build_rviz_config
+    from .rviz_config import build_rviz_config, write_rviz_config
     from .topic_names import (
         DIAGNOSTICS,
         FRAMES_TOPIC,
@@ -82,13 +85,16 @@ else:
         __name__,
         {
             "cdr": "FLOAT64_ARRAY JOINT_STATE POSE STRING TRANSFORMS cdr",
-            "published": "COMMON_TOPICS SiteMessages list_full_topics pack_session_diagnostics",
+            "published": (
+                "COMMON_TOPICS SiteMessages list_log_topics list_topics "
+                "pack_session_diagnostics"
+            ),
             "robot_model": "SPACING_M WORLD",
             "ros2_messages": (
-                "EVENTS FRAMES LINES NUMBERS_BY_MODE_WORD Ros2Channel Ros2SiteChannels "
+                "EVENTS FRAMES LINES NUMBERS_BY_MODE_WORD Ros2Channels Ros2SiteChannels "
                 "SENT_PREFIX SESSION_CHANNELS pack_event read_ros2_channels ros2_messages"
             ),
-            "rviz_config": "build_rviz_config",
+            "rviz_config": "build_rviz_config write_rviz_config",
             "topic_names": (
                 "DIAGNOSTICS FRAMES_TOPIC NAMINGS RobotTable TopicTable make_session_name"
             ),

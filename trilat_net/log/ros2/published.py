@@ -16,7 +16,7 @@ Invariant:
 from collections.abc import Callable, Iterable, Sequence
 
 from ...core import POSE, POSITION
-from ...log import QuaternionSigns
+from ...log import Log, QuaternionSigns
 from ...net import LinkStats, State
 from ...scenario import Scenario
 from . import cdr
@@ -29,7 +29,7 @@ from .ros2_messages import (
     Ros2SiteChannels,
     stack_signals,
 )
-from .topic_names import DIAGNOSTICS, FRAMES_TOPIC, TopicTable
+from .topic_names import DIAGNOSTICS, FRAMES_TOPIC, NAMINGS, TopicTable, make_session_name
 
 Topics = dict[str, Ros2Channel]
 """Topics by name: by the name within trilat-net for one site, by the full name for a session.
@@ -69,31 +69,34 @@ def list_topics(scenario: Scenario, session: str, table: TopicTable) -> Topics:
         table: Names of the topics in ROS 2.
 
     Returns:
-        The description of each topic, by its full name without the "/" at its beginning.
+        The description of each topic, by its full name, which begins with "/".
     """
-    topics = {**COMMON_TOPICS}
+    topics = {f"/{name}": channel for name, channel in COMMON_TOPICS.items()}
     for name, channel in SESSION_CHANNELS.items():
-        topics[f"{session}/{name}"] = channel
+        topics[f"/{session}/{name}"] = channel
     for site in scenario.names:
         site_messages = SiteMessages(scenario, site, epoch_unix_ns=0)
         for name, channel in site_messages.topics.items():
             topic = table.find(session, site, name)
-            topics[topic] = channel
+            topics[f"/{topic}"] = channel
     return topics
 
 
-def list_full_topics(scenario: Scenario, session: str, table: TopicTable) -> Topics:
-    """Lists all ROS 2 topics of a session as `list_topics` does, by names that begin with "/".
+def list_log_topics(log: Log) -> Topics:
+    """Lists the ROS 2 topics under which a bridge would publish the session of a log live.
 
-    Viewers and bags need these names.
+    Files for viewers then work for the log and for the live session. The names follow the first
+    of the built-in conventions.
 
     Args:
-        scenario: Scenario of the session, its description in a TOML file.
-        session: Name of the session.
-        table: Names of the topics in ROS 2.
+        log: Log of the session.
+
+    Returns:
+        The description of each topic, by its full name, which begins with "/".
     """
-    topics = list_topics(scenario, session, table)
-    return {f"/{topic}": channel for topic, channel in topics.items()}
+    session = make_session_name(log.session["session"])
+    table = TopicTable.read(NAMINGS[0])
+    return list_topics(log.scenario, session, table)
 
 
 class SiteMessages:

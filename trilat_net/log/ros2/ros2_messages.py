@@ -15,6 +15,7 @@ Invariant:
 import math
 import struct
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from itertools import product
 from pathlib import Path
 from typing import NamedTuple
 
@@ -73,6 +74,19 @@ class Ros2Channel(NamedTuple):
         """True if the channel contains the URDF (geometry) of an arm, whatever its topic is."""
         content = self.about.get("content")
         return self.kind == cdr.STRING and content == ROBOT_METADATA["content"]
+
+    def name_numbers(self) -> list[str]:
+        """Returns the names of the numbers in a message of the channel, in order.
+
+        The metadata has a list of names for each axis of the numbers, such as "m1 m2; 1 2". The
+        name of a number combines one name of each axis.
+        """
+        axes = [axis.split(" ") for axis in self.about.get("names", "").split("; ")]
+        return [" ".join(filter(None, parts)) for parts in product(*axes)]
+
+
+Ros2Channels = Mapping[str, Ros2Channel]
+"""Channels of standard ROS 2 messages, by topic."""
 
 
 class StandardChannels:

@@ -1,4 +1,4 @@
-"""Makes the configuration with which RViz, the 3D viewer of ROS 2, shows the arms of a session.
+"""Writes the configuration with which RViz, the 3D viewer of ROS 2, shows a session's arms.
 
 The configuration is a YAML file that states which displays are shown, and of which topics. It
 has a display for the model of each arm and for each pose, besides the frames of all links and a
@@ -6,6 +6,7 @@ grid. The same file serves a running session that the live bridge publishes, and
 of this session, because both have the same topics.
 
 Invariant:
+    - An existing file is replaced only with `force`.
     - Each topic of the configuration is a topic of the session, and has its quality of service:
       RViz receives a description that was published before RViz was started.
     - The names of links in the descriptions are the names of their frames, so that no display
@@ -13,15 +14,45 @@ Invariant:
 """
 
 from collections.abc import Mapping
+from pathlib import Path
 from string import Template
 
 from ...errors import UsageError
+from ...files import refuse_existing, write_whole
+from ...log import VIZ_ROOT, open_log
 from .cdr import DEFINITIONS, POSE
+from .published import list_log_topics
 from .robot_model import SPACING_M, WORLD
-from .ros2_messages import Ros2Channel
+from .ros2_messages import Ros2Channel, read_ros2_channels
 
 _SUFFIX = ".rviz"
 """Suffix of the templates, and of configurations."""
+
+
+def write_rviz_config(log: Path, *, force: bool = False) -> Path:
+    """Writes a configuration of RViz, the 3D viewer of ROS, that shows the arms of a log.
+
+    A log is shown while its session is running over ROS, and a bag while it is played.
+
+    Args:
+        log: File of the log or bag.
+        force: True to replace an existing file.
+
+    Returns:
+        The path of the configuration, which is beside the log.
+
+    Raises:
+        UsageError: The bag contains no description of an arm, or the configuration exists.
+        LogError: The log cannot be read.
+    """
+    path = log.with_suffix(_SUFFIX)
+    refuse_existing(path, force=force)
+    channels = read_ros2_channels(log)
+    is_log = any(topic.startswith(VIZ_ROOT) for topic in channels)
+    is_bag = bool(channels) and not is_log
+    topics = channels if is_bag else list_log_topics(open_log(log))
+    write_whole(path, build_rviz_config(topics), force=force)
+    return path
 
 
 def build_rviz_config(topics: Mapping[str, Ros2Channel]) -> str:

@@ -21,7 +21,7 @@ import msgspec
 
 from ...errors import UsageError, suggest_nearest
 from ...files import open_regular
-from ...net import check_ros_name
+from ...net.ros2 import check_ros_name
 
 NAMINGS = ("crisp", "crtk")
 """The two built-in conventions: CRISP, and the Collaborative Robotics Toolkit (CRTK)."""

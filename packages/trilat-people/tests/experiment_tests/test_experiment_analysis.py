@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from people_builders import PAIR, read_table, replace_text, run_protocol
-from trilat_people.experiment.experiment_run import begin_experiment
+from trilat_people.experiment.experiment_run import Experiment
 
 import trilat_net as tn
 from tests.experiments import REACH, answer_form, write_hurried_pair, write_protocol
@@ -165,7 +165,7 @@ def test_missing_answers_are_counted_and_not_averaged(pair: Path, tmp_path: Path
 
 
 def test_an_empty_analysis_is_reported(tmp_path: Path) -> None:
-    begun = begin_experiment(write_protocol(tmp_path), tmp_path / "out")
+    begun = Experiment.begin(write_protocol(tmp_path), tmp_path / "out")
     with pytest.raises(UsageError, match="there are no trials to analyse yet"):
         tn.analyse_experiment(begun.folder)
 

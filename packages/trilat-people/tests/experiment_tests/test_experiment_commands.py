@@ -47,7 +47,7 @@ def test_errors_are_one_sentence(tmp_path: Path) -> None:
     )
     assert "contains no experiment" in trilat("experiment", "status", ".", cwd=tmp_path).err
     assert (
-        "reaching.toml: already exists"
+        "reaching.toml already exists"
         in trilat("experiment", "new", "reaching.toml", cwd=tmp_path).err
     )
 

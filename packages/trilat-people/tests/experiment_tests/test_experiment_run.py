@@ -12,11 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from people_builders import PAIR, read_table, run_protocol
-from trilat_people.experiment.experiment_run import (
-    Experiment,
-    begin_experiment,
-    list_log_problems,
-)
+from trilat_people.experiment.experiment_run import Experiment
 from trilat_people.experiment.tasks import place_slave
 
 import trilat_net as tn
@@ -122,16 +118,16 @@ def test_log_that_was_changed_is_named(done: Experiment, tmp_path: Path) -> None
     rows = again.to_rows()
     (again.folder / rows[0]["log"]).write_bytes(b"other")
     (again.folder / rows[1]["log"]).unlink()
-    problems = list(list_log_problems(tn.open_experiment(again.folder)))
+    problems = list(tn.open_experiment(again.folder).list_log_problems())
     assert len(problems) == 2
     assert "is not the log that the trial wrote" in problems[0]
     assert "is missing" in problems[1]
 
 
 def test_folder_of_another_plan_is_refused(tmp_path: Path) -> None:
-    begun = begin_experiment(write_protocol(tmp_path), tmp_path / "out")
+    begun = Experiment.begin(write_protocol(tmp_path), tmp_path / "out")
     with pytest.raises(UsageError, match="is not empty"):
-        begin_experiment(tmp_path / "short.toml", tmp_path / "out")
+        Experiment.begin(tmp_path / "short.toml", tmp_path / "out")
     file = begun.folder / "protocol.toml"
     file.write_text(
         file.read_text(encoding="utf-8").replace("trials = 2", "trials = 3"), encoding="utf-8"
@@ -147,7 +143,7 @@ def test_killed_experiment_goes_on_whole(done: Experiment, kills: int, tmp_path:
     """SIGKILL at random moments: nothing twice, nothing lost, the same bytes in the end."""
     folder = tmp_path / "out"
     chance = random.Random(1)
-    begin_experiment(write_protocol(tmp_path), folder)
+    Experiment.begin(write_protocol(tmp_path), folder)
     code = "from trilat_net.app.cli import main; main()"
     command = [sys.executable, "-c", code, "experiment", "run", str(folder), "--jobs", "1"]
     exit_codes = []

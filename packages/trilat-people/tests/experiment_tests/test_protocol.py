@@ -7,12 +7,8 @@ from typing import Any
 
 import msgspec
 import pytest
-from trilat_people.experiment.protocol import (
-    Protocol,
-    list_orders,
-    plan_experiment,
-)
-from trilat_people.experiment.questionnaires import Questionnaire, find_form
+from trilat_people.experiment.protocol import ExperimentPlan, ExperimentProtocol, list_orders
+from trilat_people.experiment.questionnaires import Questionnaire
 from trilat_people.experiment.trial_run import ExperimentTrial
 
 import trilat_net as tn
@@ -21,7 +17,7 @@ from trilat_net.scenario import load_scenario
 LIVE = {"sites.m1.hands": [{"kind": "live"}], "sites.m2.hands": [{"kind": "live"}]}
 
 
-def make_protocol(**keys: Any) -> Protocol:
+def make_protocol(**keys: Any) -> ExperimentProtocol:
     """Returns the protocol of four participants and two conditions, with some keys replaced."""
     protocol = {
         "name": "study",
@@ -30,7 +26,7 @@ def make_protocol(**keys: Any) -> Protocol:
         "conditions": {"near": {"link.delay_ms": 0}, "far": {"link.delay_ms": 300}},
         "participants": 4,
     }
-    return msgspec.convert({**protocol, **keys}, Protocol)
+    return msgspec.convert({**protocol, **keys}, ExperimentProtocol)
 
 
 def test_keys_of_a_site_leave_its_others() -> None:
@@ -40,7 +36,7 @@ def test_keys_of_a_site_leave_its_others() -> None:
         "near": {"dominance": {"s": {"m1": 0.8, "m2": 0.2}}},
         "far": {"sites": {"s": {"qd0_rad_s": 0.1}}},
     }
-    plan = plan_experiment(make_protocol(set=nested, conditions=conditions))
+    plan = ExperimentPlan.of_protocol(make_protocol(set=nested, conditions=conditions))
     paper = load_scenario("paper")
     for scenario in plan.scenarios.values():
         assert [site.role for site in scenario.sites.values()] == ["master", "master", "slave"]
@@ -78,7 +74,7 @@ def test_random_orders_are_a_function_of_the_seed() -> None:
 
 
 def test_every_trial_has_its_place_and_seed() -> None:
-    plan = plan_experiment(make_protocol(practice=1, trials=3))
+    plan = ExperimentPlan.of_protocol(make_protocol(practice=1, trials=3))
     assert len(plan.trials) == 4 * 2 * 4
     assert [planned.number for planned in plan.trials] == list(range(1, 33))
     assert len({planned.seed for planned in plan.trials}) == 32
@@ -91,7 +87,7 @@ def test_every_trial_has_its_place_and_seed() -> None:
 
 def test_targets_of_a_block_follow_one_another() -> None:
     """The targets of a block are consecutive, from a first target that is drawn for each block."""
-    plan = plan_experiment(make_protocol(practice=1, trials=3))
+    plan = ExperimentPlan.of_protocol(make_protocol(practice=1, trials=3))
     first_targets = set()
     for first in range(0, 32, 4):
         targets = [planned.target for planned in plan.trials[first : first + 4]]
@@ -101,16 +97,18 @@ def test_targets_of_a_block_follow_one_another() -> None:
 
 
 def test_pairs_hold_two_masters() -> None:
-    plan = plan_experiment(make_protocol(users=["m1", "m2"]))
+    plan = ExperimentPlan.of_protocol(make_protocol(users=["m1", "m2"]))
     groups = list(dict.fromkeys(planned.group for planned in plan.trials))
     assert groups == [("P1", "P2"), ("P3", "P4")]
 
 
 def test_the_digest_covers_the_plan() -> None:
-    first = plan_experiment(make_protocol()).digest
-    assert plan_experiment(make_protocol()).digest == first
-    assert plan_experiment(make_protocol(seed=2)).digest != first
-    assert plan_experiment(make_protocol(set={**LIVE, "rate_hz": 500})).digest != first
+    first = ExperimentPlan.of_protocol(make_protocol()).digest
+    assert ExperimentPlan.of_protocol(make_protocol()).digest == first
+    assert ExperimentPlan.of_protocol(make_protocol(seed=2)).digest != first
+    assert (
+        ExperimentPlan.of_protocol(make_protocol(set={**LIVE, "rate_hz": 500})).digest != first
+    )
 
 
 def test_template_is_a_protocol(tmp_path: Path) -> None:
@@ -120,7 +118,7 @@ def test_template_is_a_protocol(tmp_path: Path) -> None:
 
 
 def test_catch_trials_share_every_other_block() -> None:
-    plan = plan_experiment(
+    plan = ExperimentPlan.of_protocol(
         make_protocol(trials=10, practice=2, catch={"condition": "near", "share": 0.2})
     )
     blocks = defaultdict(list)
@@ -141,7 +139,7 @@ def test_catch_trials_share_every_other_block() -> None:
 
 def test_participant_who_bears_less_has_a_weaker_hand() -> None:
     protocol = make_protocol(force_limit_n={"P2": 7.0})
-    plan = plan_experiment(protocol)
+    plan = ExperimentPlan.of_protocol(protocol)
     for planned in plan.trials:
         trial = ExperimentTrial(
             protocol, plan.scenarios[planned.condition], planned, plan.digest
@@ -154,7 +152,9 @@ def test_participant_who_bears_less_has_a_weaker_hand() -> None:
 def test_people_are_asked_around_their_trials() -> None:
     """A participant consents first, answers after each block, and answers once more at the end."""
     forms = [{"name": "tlx"}, {"name": "sus", "after": "experiment"}]
-    plan = plan_experiment(make_protocol(trials=1, consent="Yes?", questionnaires=forms))
+    plan = ExperimentPlan.of_protocol(
+        make_protocol(trials=1, consent="Yes?", questionnaires=forms)
+    )
     keys = [step.key for step in plan.list_steps() if step.planned.group == ("P1",)]
     assert keys == [
         "consent 1",
@@ -168,7 +168,7 @@ def test_people_are_asked_around_their_trials() -> None:
 
 
 def test_shipped_questionnaires_have_their_published_scores() -> None:
-    forms = {name: find_form(Questionnaire(name=name)) for name in ("tlx", "sus", "agency")}
+    forms = {name: Questionnaire(name=name).find_form() for name in ("tlx", "sus", "agency")}
     assert {name: len(form.items) for name, form in forms.items()} == {
         "tlx": 6,
         "sus": 10,

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from people_builders import People, replace_text, run_protocol
 from scipy.stats import norm
-from trilat_people.experiment.experiment_run import Experiment, begin_experiment
+from trilat_people.experiment.experiment_run import Experiment
 from trilat_people.experiment.staircase import Staircase
 
 import trilat_net as tn
@@ -139,7 +139,7 @@ def test_reruns_are_equal_and_ask_nothing_twice(done: Experiment) -> None:
 
 def test_people_choose_after_each_pair(tmp_path: Path) -> None:
     """Participants who always choose the second trial are asked after each pair of trials."""
-    experiment = begin_experiment(write_stairs(tmp_path, 8), tmp_path / "out")
+    experiment = Experiment.begin(write_stairs(tmp_path, 8), tmp_path / "out")
     people = People(experiment, answer=2.0)
     people.run(lambda watch, _: setattr(people, "ends", watch.trial.planned.number == 9))
     assert [key for _, key in people.steps if "choice" in key] == [

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 from people_builders import PAIR, make_experiment_trial, run_protocol
-from trilat_people.experiment.experiment_run import Experiment, begin_experiment
+from trilat_people.experiment.experiment_run import Experiment
 from trilat_people.experiment.protocol import PlannedTrial
 from trilat_people.experiment.tasks import ContactTrial, ReachTrial, TrackTrial
 from trilat_people.experiment.trial_run import ExperimentTrial, TrialJudge
@@ -129,7 +129,7 @@ def test_two_targets_lie_around_their_middle() -> None:
 def test_authority_moves_from_the_expert_trial_by_trial(tmp_path: Path) -> None:
     """The learner alone before, after and later; the expert's part falls in between."""
     file = write_protocol(tmp_path, PAIR, TRACK, TRAINING)
-    experiment = begin_experiment(file, tmp_path / "out")
+    experiment = Experiment.begin(file, tmp_path / "out")
     plan = experiment.plan
     block = [planned for planned in plan.trials if planned.block == 1]
     assert [(planned.phase, planned.lead) for planned in block] == [

@@ -8,7 +8,7 @@ import msgspec
 import pytest
 from people_builders import PAIR, make_experiment_trial, replace_text
 from playwright.sync_api import Browser, Page
-from trilat_people.experiment.experiment_run import Experiment, begin_experiment
+from trilat_people.experiment.experiment_run import Experiment
 from trilat_people.experiment.trial_run import SyntheticTrial
 from trilat_people.live_page.experiment_stage import Stage, TrialWatch
 from trilat_people.live_page.page_server import PageServer
@@ -209,7 +209,7 @@ def experiment(tmp_path_factory: pytest.TempPathFactory) -> Experiment:
     """An experiment of a pair with every kind of step."""
     folder = tmp_path_factory.mktemp("experiment")
     file = replace_text(write_protocol(folder, PAIR), "trials = 2\n", ASKS)
-    return begin_experiment(file, folder / "out")
+    return Experiment.begin(file, folder / "out")
 
 
 def set_phase(
@@ -290,7 +290,7 @@ def test_stage_in_a_trial_draws_everything(
     task: str, browser: Browser, address: str, tmp_path: Path
 ) -> None:
     text = {"reach": REACH, "apart": APART, "corridor": f"{REACH}\ncorridor_m = 0.03"}[task]
-    experiment = begin_experiment(write_protocol(tmp_path, PAIR, text), tmp_path / "out")
+    experiment = Experiment.begin(write_protocol(tmp_path, PAIR, text), tmp_path / "out")
     clock = ManualClock(1)
     stage = Stage(experiment.plan, clock)
     stage.request_step(

@@ -15,11 +15,7 @@ from people_builders import (
     replace_text,
 )
 from trilat_people.experiment.experiment_analysis import analyse_experiment
-from trilat_people.experiment.experiment_run import (
-    Experiment,
-    begin_experiment,
-    open_experiment,
-)
+from trilat_people.experiment.experiment_run import Experiment, open_experiment
 from trilat_people.experiment.trial_run import ExperimentTrial, SyntheticTrial, TrialJudge
 from trilat_people.live_page.experiment_stage import (
     END_DELAY_NS,
@@ -59,7 +55,7 @@ feedback = ["completion_s"]
 def experiment(tmp_path: Path) -> Experiment:
     """An experiment of a pair with two trials, consent, questionnaires and rest."""
     file = replace_text(write_protocol(tmp_path, PAIR), "trials = 2\n", ASKS)
-    return begin_experiment(file, tmp_path / "out")
+    return Experiment.begin(file, tmp_path / "out")
 
 
 @pytest.fixture
@@ -318,7 +314,7 @@ def test_users_see_own_target_and_corridor(tmp_path: Path, clock: ManualClock) -
     def describe_first_trial(task: str, site: str) -> Any:
         folder = tmp_path / task[-3:] / (site or "-")
         folder.mkdir(parents=True)
-        experiment = begin_experiment(write_protocol(folder, PAIR, task), folder / "out")
+        experiment = Experiment.begin(write_protocol(folder, PAIR, task), folder / "out")
         trial = make_experiment_trial(experiment, experiment.plan.trials[0])
         return TrialWatch(trial, clock).describe(trial.appears_s + 0.5, site)
 

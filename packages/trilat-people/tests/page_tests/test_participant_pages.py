@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 from people_builders import NO_SESSION, PAIR, replace_text
 from playwright.sync_api import Browser, Page, WebSocketRoute
-from trilat_people.experiment.experiment_run import begin_experiment
+from trilat_people.experiment.experiment_run import Experiment
 from trilat_people.live_page.experiment_stage import Stage
 
 from tests.experiments import write_protocol
@@ -35,7 +35,7 @@ def forms(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Json]:
     """By the name of a questionnaire, the stage that a user's page shows for its form."""
     folder = tmp_path_factory.mktemp("forms")
     file = replace_text(write_protocol(folder, PAIR), "trials = 2\n", f"trials = 2\n{FORMS}")
-    experiment = begin_experiment(file, folder / "out")
+    experiment = Experiment.begin(file, folder / "out")
     stage = Stage(experiment.plan, ManualClock(1))
     stages = {}
     for step in experiment.plan.list_steps():

@@ -13,7 +13,7 @@ from trilat_people.live_page.terminal_watch import SessionWatch
 from tests.sites.relay import RelayClock
 from tests.sites.sessions import SESSION, Session
 from trilat_net.analysis.arm_rows import build_arm_rows, joint_positions_m
-from trilat_net.app.monitor import describe_angles
+from trilat_net.app.monitor import StatusRow
 from trilat_net.app.running_session import RunningSession
 from trilat_net.log.log_reader import Log
 from trilat_net.net.bus import Bus
@@ -187,7 +187,8 @@ def test_pages_terminals_and_programs_know_the_same(
                     assert ticks == {name: record.tick for name, record in found.items()}
                     rows = {row["site"]: row["angles"] for row in watch.rows()}
                     assert {name: rows[name] for name in found} == {
-                        name: describe_angles(record.q) for name, record in found.items()
+                        name: StatusRow.of_pose(name, 0.0, record.q)["angles"]
+                        for name, record in found.items()
                     }
                     compared.append(len(found))
                 clock.sleep_until(clock.monotonic_ns() + FRAME_NS)

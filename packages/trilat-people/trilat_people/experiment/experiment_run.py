@@ -1,6 +1,6 @@
 """Runs an experiment and keeps its results in a folder: logs, journals and tables.
 
-`begin_experiment` creates the folder. `Experiment.run` runs the remaining trials with synthetic
+`Experiment.begin` creates the folder. `Experiment.run` runs the remaining trials with synthetic
 participants, which are models of people. `trilat experiment run --live` runs them with people.
 A journal is a file to which each finished trial is appended, so that an interrupted experiment
 can be continued.
@@ -38,8 +38,8 @@ from trilat_net.work import (
 )
 
 from .completion_times import COMPLETION, find_median, is_completed
-from .protocol import Choices, ExperimentPlan, PlannedTrial, plan_experiment, read_protocol
-from .questionnaires import CHOICE, find_form
+from .protocol import Choices, ExperimentPlan, ExperimentProtocol, PlannedTrial
+from .questionnaires import CHOICE
 from .staircase import COMPARISON, Staircase
 from .trial_run import TrialEntry, run_trial
 
@@ -97,7 +97,7 @@ class _ExperimentStatus(NamedTuple):
 class Experiment(Result):
     """An experiment in its folder: the plan, the trials that were run, and their results.
 
-    `begin_experiment` and `open_experiment` create this object.
+    `begin` and `open_experiment` create this object.
 
     Args:
         folder: Folder with the plan, journals and logs of the experiment.
@@ -371,7 +371,7 @@ class Experiment(Result):
         The column of the score has the name of the questionnaire. A score is None if an answer
         is missing.
         """
-        forms = {form.name: find_form(form) for form in self.plan.protocol.questionnaires}
+        forms = {form.name: form.find_form() for form in self.plan.protocol.questionnaires}
         rows: list[dict[str, Any]] = []
         for columns, note in self._read_answer_notes():
             form = forms.get(note.text)
@@ -483,6 +483,49 @@ class Experiment(Result):
                 trial_name = f"trial {note.number}, {note.who}"
                 yield f"{trial_name}, was aborted and is repeated: {note.text}"
 
+    @classmethod
+    def begin(cls, file: str | Path, out: str | Path | None = None) -> "Experiment":
+        """Creates the folder of a new experiment, by default runs/experiment-NAME-N.
+
+        The folder contains the protocol, and the plan of all trials with their scenarios as
+        JSON.
+
+        Args:
+            file: File of the protocol.
+            out: The folder. None for the default.
+        """
+        plan = check_experiment(file)
+        default_name = f"experiment-{plan.protocol.name}"
+        out_path = None if out is None else Path(out)
+        folder = make_results_folder(out_path, default_name, force=None)
+
+        write_whole(folder / PROTOCOL_FILE, Path(file).read_text(encoding="utf-8"))
+        trials = [{**trial._asdict(), "log": f"{LOGS}/{trial.file}"} for trial in plan.trials]
+        facts = {
+            "digest": plan.digest,
+            "protocol": msgspec.to_builtins(plan.protocol),
+            "trials": trials,
+            "scenarios": {name: scenario.text for name, scenario in plan.scenarios.items()},
+        }
+        write_whole(folder / PLAN_FILE, json.dumps(facts, indent=1) + "\n")
+        return cls(folder, plan)
+
+    def list_log_problems(self) -> Iterator[str]:
+        """Yields a sentence for each finished trial whose log is missing or was changed.
+
+        A log proves what happened in its trial. The journal contains the checksum of each log.
+        """
+        finished_trials = self.read_entries()
+        for planned in self.plan.trials:
+            entry = finished_trials.get(planned.number)
+            path = self.folder / LOGS / planned.file
+            if entry is None:
+                continue
+            if not path.exists():
+                yield f"{path}: is missing"
+            elif digest_file(path) != entry.sha256:
+                yield f"{path}: is not the log that the trial wrote"
+
 
 _SHOWN_MEASURES = ("error_end_mm", "error_rms_mm", "path_m", "sparc")
 """Measures whose means the text of the status shows."""
@@ -548,33 +591,7 @@ def check_experiment(file: str | Path) -> ExperimentPlan:
     Raises:
         UsageError: The protocol cannot be carried out. The error lists all problems.
     """
-    return plan_experiment(read_protocol(file), Path(file).parent)
-
-
-def begin_experiment(file: str | Path, out: str | Path | None = None) -> Experiment:
-    """Creates the folder of a new experiment with people, by default runs/experiment-NAME-N.
-
-    The folder contains the protocol, and the plan of all trials with their scenarios as JSON.
-
-    Args:
-        file: File of the protocol.
-        out: The folder. None for the default.
-    """
-    plan = check_experiment(file)
-    default_name = f"experiment-{plan.protocol.name}"
-    out_path = None if out is None else Path(out)
-    folder = make_results_folder(out_path, default_name, force=None)
-
-    write_whole(folder / PROTOCOL_FILE, Path(file).read_text(encoding="utf-8"))
-    trials = [{**trial._asdict(), "log": f"{LOGS}/{trial.file}"} for trial in plan.trials]
-    facts = {
-        "digest": plan.digest,
-        "protocol": msgspec.to_builtins(plan.protocol),
-        "trials": trials,
-        "scenarios": {name: scenario.text for name, scenario in plan.scenarios.items()},
-    }
-    write_whole(folder / PLAN_FILE, json.dumps(facts, indent=1) + "\n")
-    return Experiment(folder, plan)
+    return ExperimentPlan.of_protocol(ExperimentProtocol.read(file), Path(file).parent)
 
 
 def open_experiment(folder: str | Path) -> Experiment:
@@ -599,8 +616,8 @@ def open_experiment(folder: str | Path) -> Experiment:
     scenarios = {}
     for name, text in stored_plan["scenarios"].items():
         scenarios[name] = parse_scenario(text, str(folder_path))
-    protocol = read_protocol(folder_path / PROTOCOL_FILE)
-    plan = plan_experiment(protocol, scenarios=scenarios)
+    protocol = ExperimentProtocol.read(folder_path / PROTOCOL_FILE)
+    plan = ExperimentPlan.of_protocol(protocol, scenarios=scenarios)
     if plan.digest != stored_plan["digest"]:
         raise UsageError(
             f"{folder_path}: the protocol was changed after the experiment began; "
@@ -636,25 +653,5 @@ def run_experiment(
     if Path(source).is_dir():
         experiment = open_experiment(source)
     else:
-        experiment = begin_experiment(source, out)
+        experiment = Experiment.begin(source, out)
     return experiment.run(jobs, progress, on)
-
-
-def list_log_problems(experiment: Experiment) -> Iterator[str]:
-    """Yields a sentence for each finished trial whose log is missing or was changed.
-
-    A log proves what happened in its trial. The journal contains the checksum of each log.
-
-    Args:
-        experiment: The experiment in its folder.
-    """
-    finished_trials = experiment.read_entries()
-    for planned in experiment.plan.trials:
-        entry = finished_trials.get(planned.number)
-        path = experiment.folder / LOGS / planned.file
-        if entry is None:
-            continue
-        if not path.exists():
-            yield f"{path}: is missing"
-        elif digest_file(path) != entry.sha256:
-            yield f"{path}: is not the log that the trial wrote"

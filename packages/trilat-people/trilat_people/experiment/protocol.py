@@ -32,7 +32,7 @@ from trilat_net.presentation import Block, TextTable
 from trilat_net.results import Result
 from trilat_net.scenario import Scenario, load_scenario
 
-from .questionnaires import Name, Questionnaire, find_form
+from .questionnaires import Name, Questionnaire
 from .staircase import COMPARISON, STANDARD, Staircase
 from .synthetic_participant import ParticipantModel, Share
 from .tasks import AnyTask, ReachTrial
@@ -110,7 +110,7 @@ class _Training(Frozen, frozen=True):
         )
 
 
-class Protocol(Frozen, frozen=True):
+class ExperimentProtocol(Frozen, frozen=True):
     """Plan of an experiment with people, as an experimenter writes it in a TOML file.
 
     The attributes are the keys of this file.
@@ -239,6 +239,30 @@ class Protocol(Frozen, frozen=True):
             groups.append(group)
         return groups
 
+    @classmethod
+    def read(cls, file: str | Path) -> "ExperimentProtocol":
+        """Reads the protocol of an experiment from a TOML file, without planning its trials.
+
+        Args:
+            file: Path of the file.
+
+        Raises:
+            UsageError: The file cannot be read, or a key or value in it is not valid.
+        """
+        path = Path(file)
+        try:
+            tables = tomllib.loads(path.read_text(encoding="utf-8"))
+            return msgspec.convert(tables, ExperimentProtocol)
+        except OSError as error:
+            raise UsageError(f"{path}: cannot be read: {error.strerror}") from None
+        except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+            raise UsageError(f"{path}: is not valid TOML: {error}") from None
+        except msgspec.ValidationError as error:
+            valid = ", ".join(
+                key.encode_name for key in msgspec.structs.fields(ExperimentProtocol)
+            )
+            raise UsageError(f"{path}: {error}; the keys of a protocol are {valid}") from None
+
 
 class PlannedTrial(NamedTuple):
     """One trial of an experiment, with its participants, condition and place in the order.
@@ -324,7 +348,7 @@ class Step(NamedTuple):
 class ExperimentPlan(Result):
     """An experiment that is ready to run: its protocol and all trials in their order.
 
-    `plan_experiment` creates this object from a protocol.
+    `of_protocol` creates this object from a protocol.
 
     Attributes:
         protocol: Design of the experiment: conditions, task and participants.
@@ -333,7 +357,7 @@ class ExperimentPlan(Result):
         digest: SHA-256 of protocol and scenarios, in hexadecimal digits.
     """
 
-    protocol: Protocol
+    protocol: ExperimentProtocol
     scenarios: Mapping[str, Scenario]
     trials: Sequence[PlannedTrial]
     digest: str
@@ -391,7 +415,7 @@ class ExperimentPlan(Result):
                 ends_experiment = planned.block == len(protocol.conditions)
                 for questionnaire in protocol.questionnaires:
                     if ends_experiment or questionnaire.after == "block":
-                        yield Step("questionnaire", planned, find_form(questionnaire))
+                        yield Step("questionnaire", planned, questionnaire.find_form())
 
     def judge_choices(self, planned: PlannedTrial, choices: Choices) -> list[bool]:
         """Judges which answers of the participants in a perception test were right.
@@ -538,76 +562,55 @@ class ExperimentPlan(Result):
         yield TextTable(("", "order of conditions"), rows)
         yield f"sha256 of the plan {self.digest}"
 
+    @classmethod
+    def of_protocol(
+        cls,
+        protocol: ExperimentProtocol,
+        folder: Path | None = None,
+        scenarios: Mapping[str, Scenario] | None = None,
+    ) -> "ExperimentPlan":
+        """Plans all trials of an experiment from its protocol, or refuses the protocol.
 
-def read_protocol(file: str | Path) -> Protocol:
-    """Reads the protocol of an experiment from a TOML file, without planning its trials.
+        The protocol is the design of the experiment. With the same protocol, the plan is always
+        the same, so that it can be published before the experiment.
 
-    Args:
-        file: Path of the file.
+        Args:
+            protocol: Design of the experiment: conditions, task and participants.
+            folder: Folder to which the path of the protocol's scenario is relative.
+            scenarios: Scenario of each condition. None loads them from the protocol's scenario.
 
-    Raises:
-        UsageError: The file cannot be read, or a key or value in it is not valid.
-    """
-    path = Path(file)
-    try:
-        tables = tomllib.loads(path.read_text(encoding="utf-8"))
-        return msgspec.convert(tables, Protocol)
-    except OSError as error:
-        raise UsageError(f"{path}: cannot be read: {error.strerror}") from None
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise UsageError(f"{path}: is not valid TOML: {error}") from None
-    except msgspec.ValidationError as error:
-        valid = ", ".join(key.encode_name for key in msgspec.structs.fields(Protocol))
-        raise UsageError(f"{path}: {error}; the keys of a protocol are {valid}") from None
+        Raises:
+            UsageError: The protocol cannot be carried out. The error lists all problems.
+        """
+        problems = list(_find_problems(protocol))
+        condition_scenarios: dict[str, Scenario] = {}
+        if scenarios is not None:
+            condition_scenarios |= scenarios
+        else:
+            source: str | Path = protocol.scenario
+            if folder is not None and (folder / protocol.scenario).is_file():
+                source = folder / protocol.scenario
+            for name, keys in protocol.conditions.items():
+                settings = _list_keys(protocol.set) | _list_keys(keys)
+                try:
+                    scenario = load_scenario(source, settings)
+                    condition_scenarios[name] = _check_scenario(scenario, protocol)
+                except TrilatError as error:
+                    problems.append(f"condition {name}: {error}")
 
+        if problems:
+            raise UsageError(f"{protocol.name}: " + "; ".join(problems))
 
-def plan_experiment(
-    protocol: Protocol,
-    folder: Path | None = None,
-    scenarios: Mapping[str, Scenario] | None = None,
-) -> ExperimentPlan:
-    """Plans all trials of an experiment from its protocol, or refuses the protocol.
-
-    The protocol is the design of the experiment. With the same protocol, the plan is always the
-    same, so that it can be published before the experiment.
-
-    Args:
-        protocol: Design of the experiment: conditions, task and participants.
-        folder: Folder to which the path of the protocol's scenario is relative.
-        scenarios: Scenario of each condition. None loads them from the protocol's scenario.
-
-    Raises:
-        UsageError: The protocol cannot be carried out. The error lists all problems.
-    """
-    problems = list(_find_problems(protocol))
-    condition_scenarios: dict[str, Scenario] = {}
-    if scenarios is not None:
-        condition_scenarios |= scenarios
-    else:
-        source: str | Path = protocol.scenario
-        if folder is not None and (folder / protocol.scenario).is_file():
-            source = folder / protocol.scenario
-        for name, keys in protocol.conditions.items():
-            settings = _list_keys(protocol.set) | _list_keys(keys)
-            try:
-                scenario = load_scenario(source, settings)
-                condition_scenarios[name] = _check_scenario(scenario, protocol)
-            except TrilatError as error:
-                problems.append(f"condition {name}: {error}")
-
-    if problems:
-        raise UsageError(f"{protocol.name}: " + "; ".join(problems))
-
-    # The digest proves later that a trial follows this plan.
-    texts = {name: scenario.text for name, scenario in condition_scenarios.items()}
-    tables = msgspec.to_builtins(protocol)
-    content = msgspec.json.encode([tables, texts], order="sorted")
-    return ExperimentPlan(
-        protocol=protocol,
-        scenarios=condition_scenarios,
-        trials=list(_list_trials(protocol)),
-        digest=hashlib.sha256(content).hexdigest(),
-    )
+        # The digest proves later that a trial follows this plan.
+        texts = {name: scenario.text for name, scenario in condition_scenarios.items()}
+        tables = msgspec.to_builtins(protocol)
+        content = msgspec.json.encode([tables, texts], order="sorted")
+        return cls(
+            protocol=protocol,
+            scenarios=condition_scenarios,
+            trials=list(_list_trials(protocol)),
+            digest=hashlib.sha256(content).hexdigest(),
+        )
 
 
 def _list_keys(table: Mapping[str, Any], path: str = "") -> dict[str, Any]:
@@ -631,7 +634,7 @@ def _list_keys(table: Mapping[str, Any], path: str = "") -> dict[str, Any]:
     return keys
 
 
-def _find_problems(protocol: Protocol) -> Iterator[str]:
+def _find_problems(protocol: ExperimentProtocol) -> Iterator[str]:
     """Yields the problems of a protocol that are visible without its scenario.
 
     Each problem is a sentence that names the key. The author sees all of them at once.
@@ -647,12 +650,12 @@ def _find_problems(protocol: Protocol) -> Iterator[str]:
     yield from _find_group_problems(protocol)
 
 
-def _list_pseudonyms(protocol: Protocol) -> list[str]:
+def _list_pseudonyms(protocol: ExperimentProtocol) -> list[str]:
     """Returns the pseudonyms of all participants, in the order of the groups."""
     return [name for group in protocol.groups for name in group]
 
 
-def _find_pseudonym_problems(protocol: Protocol) -> Iterator[str]:
+def _find_pseudonym_problems(protocol: ExperimentProtocol) -> Iterator[str]:
     """Yields a sentence for each mistake in the pseudonyms of an experiment's participants.
 
     Two participants have the same pseudonym, or a force limit names one that nobody has.
@@ -665,7 +668,7 @@ def _find_pseudonym_problems(protocol: Protocol) -> Iterator[str]:
         yield f"force_limit_n: there is no participant {', '.join(sorted(unknown))}"
 
 
-def _find_table_problems(protocol: Protocol) -> Iterator[str]:
+def _find_table_problems(protocol: ExperimentProtocol) -> Iterator[str]:
     """Yields a sentence for each contradiction in the optional tables of a protocol.
 
     These are [catch] (trials that check attention), [training] and [staircase] (a perception
@@ -692,19 +695,19 @@ def _find_table_problems(protocol: Protocol) -> Iterator[str]:
         yield "a training, a handover and a task with two targets need two users"
 
 
-def _find_form_problems(protocol: Protocol) -> Iterator[str]:
+def _find_form_problems(protocol: ExperimentProtocol) -> Iterator[str]:
     """Yields a sentence for each questionnaire that is unknown or has a name twice."""
     names = [form.name for form in protocol.forms]
     if len(set(names)) < len(names):
         yield "two questionnaires have the same name"
     for form in protocol.questionnaires:
         try:
-            find_form(form)
+            form.find_form()
         except UsageError as error:
             yield str(error)
 
 
-def _find_group_problems(protocol: Protocol) -> Iterator[str]:
+def _find_group_problems(protocol: ExperimentProtocol) -> Iterator[str]:
     """Yields a sentence for each mistake in the number of participants of an experiment.
 
     Some designs balance the orders of conditions only if the number of groups is a multiple of
@@ -731,7 +734,9 @@ def _find_group_problems(protocol: Protocol) -> Iterator[str]:
         )
 
 
-def _find_staircase_problems(protocol: Protocol, staircase: Staircase) -> Iterator[str]:
+def _find_staircase_problems(
+    protocol: ExperimentProtocol, staircase: Staircase
+) -> Iterator[str]:
     """Yields a sentence for each rule of a perception test that the protocol breaks.
 
     A staircase needs exactly one user, an even number of trials, and a key that no condition
@@ -754,7 +759,7 @@ def _find_staircase_problems(protocol: Protocol, staircase: Staircase) -> Iterat
         yield f"staircase.key: {key} must not be set by condition {', '.join(conditions)} too"
 
 
-def _check_scenario(scenario: Scenario, protocol: Protocol) -> Scenario:
+def _check_scenario(scenario: Scenario, protocol: ExperimentProtocol) -> Scenario:
     """Returns the scenario of a condition if the experiment can be run with it.
 
     For example, each user needs a site at which a person can move the arm.
@@ -799,7 +804,7 @@ def _check_scenario(scenario: Scenario, protocol: Protocol) -> Scenario:
 
 
 def limit_forces(
-    scenario: Scenario, protocol: Protocol, group: Sequence[str]
+    scenario: Scenario, protocol: ExperimentProtocol, group: Sequence[str]
 ) -> dict[str, Any]:
     """Lowers the force limits of the arms of participants who must not push hard.
 
@@ -896,15 +901,15 @@ def list_orders(design: str, conditions: Sequence[str], seed: int) -> list[tuple
     return [tuple(conditions[index] for index in row) for row in rows]
 
 
-def _list_trials(protocol: Protocol) -> Iterator[PlannedTrial]:
+def _list_trials(protocol: ExperimentProtocol) -> Iterator[PlannedTrial]:
     """Yields all trials of an experiment in their order.
 
     Each group of participants does one block of trials per condition. The order of the
     conditions is the next one of `list_orders`. A block begins with practice trials. The
-    further trials are those of `Protocol.list_phases`: a trial has a phase (of a training or of
-    a staircase, otherwise empty), and a lead, the first user's part of the authority over the
-    slave arm. Catch trials have another condition than their block. Numbers count from 1, and
-    indices from 0.
+    further trials are those of `ExperimentProtocol.list_phases`: a trial has a phase (of a
+    training or of a staircase, otherwise empty), and a lead, the first user's part of the
+    authority over the slave arm. Catch trials have another condition than their block. Numbers
+    count from 1, and indices from 0.
 
     Each random quantity has a generator of its own, whose seed contains the seed of the
     protocol, the group and the block. A last number distinguishes the quantities: none for the
@@ -956,7 +961,9 @@ def _list_trials(protocol: Protocol) -> Iterator[PlannedTrial]:
             )
 
 
-def _draw_catches(protocol: Protocol, condition: str, group: int, block: int) -> set[int]:
+def _draw_catches(
+    protocol: ExperimentProtocol, condition: str, group: int, block: int
+) -> set[int]:
     """Draws which trials of a block are catch trials, which have an unexpected condition.
 
     Participants cannot rely on the condition of the block then. If they behave differently in a

@@ -125,6 +125,41 @@ class Questionnaire(Frozen, frozen=True):
             return sus_score([int(value) for value in given_answers.values()])
         return float(np.mean(list(given_answers.values())))
 
+    def find_form(self) -> "Questionnaire":
+        """Returns a questionnaire with the questions that participants answer.
+
+        An experiment's protocol may name a shipped questionnaire without stating its questions
+        (items).
+
+        Raises:
+            UsageError: The questionnaire has no items and no shipped one has its name, or its
+                scale does not have 2 to 101 numbers.
+        """
+        name = self.name
+        built_in = _read_shipped()
+        if not self.items:
+            if name not in built_in:
+                raise UsageError(
+                    f"questionnaire {name} has no items; "
+                    f"the built-in questionnaires are {', '.join(built_in)}"
+                )
+            form = msgspec.convert({"name": name, **built_in[name]}, Questionnaire)
+            return replace(form, after=self.after)
+
+        if name in built_in:
+            raise UsageError(
+                f"questionnaire {name} is built in and has its own items; "
+                "give your questionnaire another name"
+            )
+
+        scale_length = self.most - self.least
+        if not self.step <= scale_length <= 100 * self.step:
+            raise UsageError(
+                f"questionnaire {name}: the scale must have 2 to 101 numbers; "
+                "correct least, most or step"
+            )
+        return self
+
 
 @cache
 def _read_shipped() -> dict[str, Any]:
@@ -132,42 +167,3 @@ def _read_shipped() -> dict[str, Any]:
     source = resources.files(__package__) / "questionnaires.txt"
     tables: dict[str, Any] = tomllib.loads(source.read_text(encoding="utf-8"))
     return tables
-
-
-def find_form(questionnaire: Questionnaire) -> Questionnaire:
-    """Returns a questionnaire with the questions that participants answer.
-
-    An experiment's protocol may name a shipped questionnaire without stating its questions
-    (items).
-
-    Args:
-        questionnaire: The questionnaire as the protocol states it.
-
-    Raises:
-        UsageError: The questionnaire has no items and no shipped one has its name, or its scale
-            does not have 2 to 101 numbers.
-    """
-    name = questionnaire.name
-    built_in = _read_shipped()
-    if not questionnaire.items:
-        if name not in built_in:
-            raise UsageError(
-                f"questionnaire {name} has no items; "
-                f"the built-in questionnaires are {', '.join(built_in)}"
-            )
-        form = msgspec.convert({"name": name, **built_in[name]}, Questionnaire)
-        return replace(form, after=questionnaire.after)
-
-    if name in built_in:
-        raise UsageError(
-            f"questionnaire {name} is built in and has its own items; "
-            "give your questionnaire another name"
-        )
-
-    scale_length = questionnaire.most - questionnaire.least
-    if not questionnaire.step <= scale_length <= 100 * questionnaire.step:
-        raise UsageError(
-            f"questionnaire {name}: the scale must have 2 to 101 numbers; "
-            "correct least, most or step"
-        )
-    return questionnaire

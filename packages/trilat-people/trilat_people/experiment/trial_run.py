@@ -39,7 +39,7 @@ from trilat_net.records import NS_PER_S
 from trilat_net.scenario import Change, HandPlayer, HandSite, Scenario, parse_scenario
 
 from .movement_measures import energy_j, measure_pair, movement_time_s, path_length_m, sparc
-from .protocol import PlannedTrial, Protocol, limit_forces
+from .protocol import ExperimentProtocol, PlannedTrial, limit_forces
 from .synthetic_participant import ParticipantModel, SyntheticParticipant
 from .tasks import Outcome, TrialGoal
 
@@ -164,7 +164,11 @@ class ExperimentTrial:
     people = True
 
     def __init__(
-        self, protocol: Protocol, scenario: Scenario, planned: PlannedTrial, digest: str
+        self,
+        protocol: ExperimentProtocol,
+        scenario: Scenario,
+        planned: PlannedTrial,
+        digest: str,
     ) -> None:
         self.protocol = protocol
         self.planned = planned
@@ -537,7 +541,8 @@ class SyntheticTrial(ExperimentTrial):
         sites_and_names = zip(self.protocol.users, self.planned.group, strict=True)
         for user_index, (site, name) in enumerate(sites_and_names):
             operator = scenario.sites[site].find_live_hand(is_open=True)
-            # `plan_experiment` has checked that the scenario has the hands of all users.
+            # `ExperimentPlan.of_protocol` has checked that the scenario has the hands of all
+            # users.
             assert operator is not None
             hand_site = HandSite(
                 scenario=scenario,
@@ -641,7 +646,7 @@ class SyntheticTrial(ExperimentTrial):
         return self.settle(path)
 
 
-def run_trial(task: tuple[Protocol, str, PlannedTrial, str, Path]) -> TrialEntry:
+def run_trial(task: tuple[ExperimentProtocol, str, PlannedTrial, str, Path]) -> TrialEntry:
     """Runs a trial of synthetic participants, which are models of people, and keeps its log.
 
     Worker processes call this function. All inputs are in one argument, because it is sent to

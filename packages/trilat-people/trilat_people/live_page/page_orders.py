@@ -2,7 +2,7 @@
 
 People watch and control a running session on web pages. The role of a person is experimenter,
 user of one arm, or watcher. The server of the pages reads each message of a page with
-`read_page_message`, and checks with `Role.may` that the role permits it. `PageHands` then moves
+`PageMessage.read`, and checks with `Role.may` that the role permits it. `PageHands` then moves
 the arms that the person holds. `OrderDesk` sends other requests to the sites, the processes
 that each control one arm, and receives their replies.
 
@@ -71,6 +71,29 @@ class PageMessage(
     The field `do` of the JSON text names the kind of message, for example {"do": "mark",
     "text": "contact"}. Unknown fields are refused.
     """
+
+    @staticmethod
+    def read(text: str | bytes) -> "PageMessage":
+        """Decodes a message that a page sent, and checks the range of its numbers.
+
+        The content of a message may come from anybody, and must be checked before it moves an
+        arm.
+
+        Args:
+            text: The message as JSON.
+
+        Returns:
+            The message, of the class that its field `do` names.
+
+        Raises:
+            WireError: The text is not a valid message, or a number is out of range.
+        """
+        try:
+            # All numbers are finite: JSON has no infinity, and the decoder refuses 1e999.
+            message: PageMessage = _DECODER.decode(text)
+        except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:
+            raise WireError("malformed", str(error)) from None
+        return message
 
 
 class Seen(PageMessage, frozen=True, kw_only=True, tag="seen"):
@@ -305,28 +328,6 @@ class MessageLimits:
         if is_allowed:
             bucket.tokens -= 1.0
         return is_allowed
-
-
-def read_page_message(text: str | bytes) -> PageMessage:
-    """Decodes a message that a page sent, and checks the range of its numbers.
-
-    The content of a message may come from anybody, and must be checked before it moves an arm.
-
-    Args:
-        text: The message as JSON.
-
-    Returns:
-        The message, of the class that its field `do` names.
-
-    Raises:
-        WireError: The text is not a valid message, or a number is out of range.
-    """
-    try:
-        # All numbers are finite: JSON has no infinity, and the decoder refuses 1e999.
-        message: PageMessage = _DECODER.decode(text)
-    except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:
-        raise WireError("malformed", str(error)) from None
-    return message
 
 
 @dataclass(frozen=True, slots=True)

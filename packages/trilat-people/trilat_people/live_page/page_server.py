@@ -78,7 +78,6 @@ from .page_orders import (
     StageMessage,
     StopArms,
     TakePart,
-    read_page_message,
 )
 from .session_frames import SessionFrames, render_event
 from .session_view import SessionView
@@ -777,7 +776,7 @@ class PageServer:
             return
 
         try:
-            message = read_page_message(text)
+            message = PageMessage.read(text)
             is_release = isinstance(message, MoveHand) and not message.grip
             if is_release or page.limits.allows(type(message), now_ns):
                 self._handle_message(page, message)

@@ -14,7 +14,7 @@ from contextlib import AbstractContextManager, contextmanager, suppress
 
 from rich.console import Console
 
-from trilat_net.app import HEADS, SessionDisplay, SiteRow, describe_angles, describe_site
+from trilat_net.app import SessionDisplay, StatusRow
 from trilat_net.core import LifeAlarm
 from trilat_net.errors import SessionError
 from trilat_net.net import Bus, Clock, Connection, connect_to_session
@@ -179,7 +179,7 @@ class SessionWatch:
                 alarms.append((name, alarm))
         return alarms
 
-    def rows(self) -> list[SiteRow]:
+    def rows(self) -> list[StatusRow]:
         """Composes the table of the sites (processes, one per arm), with one row per site.
 
         If only the view of one user is shown, the user's own site has a complete row. The row
@@ -194,11 +194,11 @@ class SessionWatch:
         view = self.view
         scenario = view.scenario
         as_site = self._as_site
-        rows_by_site: dict[str, SiteRow] = {}
+        rows_by_site: dict[str, StatusRow] = {}
         for name, site in view.sites.items():
             is_shown_completely = as_site in ("", name)  # "" shows all sites
             if scenario is not None and is_shown_completely:
-                rows_by_site[name] = describe_site(
+                rows_by_site[name] = StatusRow.of_site(
                     scenario,
                     name,
                     site.record,
@@ -215,12 +215,10 @@ class SessionWatch:
         visible_ticks = view.find_peer_ticks(as_site, user_record.tick, user_record.used)
         for peer, tick in visible_ticks.items():
             window = view.sites[peer].window
-            row = dict.fromkeys(HEADS, "") | {"site": peer}
+            joint_positions: list[float] = []
             if window.has_record(tick):
-                joint_positions = window.rows(tick, tick).q[0]
-                row["time"] = f"{tick / window.rate_hz:.3f} s"
-                row["angles"] = describe_angles(joint_positions.tolist())
-            rows_by_site[peer] = row
+                joint_positions = window.rows(tick, tick).q[0].tolist()
+            rows_by_site[peer] = StatusRow.of_pose(peer, tick / window.rate_hz, joint_positions)
         return list(rows_by_site.values())
 
 

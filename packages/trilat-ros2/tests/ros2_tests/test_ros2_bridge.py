@@ -64,7 +64,7 @@ from trilat_net.net.clock import SystemClock
 from trilat_net.net.membership import describe_member, liveliness_token
 from trilat_net.net.messages import Event
 from trilat_net.net.requests import ArmMeasurement, Backfill
-from trilat_net.net.ros2_graph import Attachment, QualityOfService, Refusals
+from trilat_net.net.ros2.ros2_graph import Attachment, QualityOfService, Refusals
 from trilat_net.net.wire import decode, encode, encode_state
 from trilat_net.scenario import load_scenario
 
@@ -861,7 +861,8 @@ def test_bags_of_other_scenarios_share_no_topics(
     ends: Any = BridgeEnds(graph, None, None, name, table)  # type: ignore[arg-type]
     for site in log.sites:
         SiteTopics(ends, log.scenario, site, 0, graph.published["tf"])  # type: ignore[arg-type]
-    planned = list_topics(log.scenario, name, table)
+    topics = list_topics(log.scenario, name, table)
+    planned = {topic.removeprefix("/"): channel for topic, channel in topics.items()}
     assert {
         topic: offer for topic, offer in graph.offered.items() if topic in planned
     } == graph.offered

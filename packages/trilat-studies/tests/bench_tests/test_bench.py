@@ -22,7 +22,6 @@ from study_builders import (
 from trilat_studies.bench import (
     BenchResults,
     bench_plan,
-    bench_run,
     plan_bench,
     prepare_bench_folder,
     run_bench,
@@ -60,16 +59,10 @@ from trilat_studies.bench.bench_run import (
     BenchRunItem,
     JudgedRun,
     find_least_energy,
-    lengthen_run,
-    run_bench_task,
 )
 from trilat_studies.measure_run import RecordBatch
 from trilat_studies.tuning import plan_tuning
-from trilat_studies.tuning.candidate import (
-    CandidateClass,
-    load_tuning_scenario,
-    measure_candidate,
-)
+from trilat_studies.tuning.candidate import CandidateClass, CandidateScore, TuningScenario
 from trilat_studies.tuning.search_space import SEARCH_SPACES
 
 import trilat_net
@@ -105,7 +98,7 @@ def replace_gains(cell: BenchCell, **gains: float) -> BenchCell:
 
 def run_cell(cell: BenchCell) -> BenchRun:
     """Returns the run of a cell with its first seed."""
-    return run_bench_task(BenchRunItem(cell, 1))
+    return BenchRunItem(cell, 1).run()
 
 
 def encode_files(results: BenchResults) -> list[str]:
@@ -160,7 +153,7 @@ def test_seeds_differ_only_where_numbers_are_drawn(whole: BenchResults) -> None:
     assert first.random
     assert first.error_rad != second.error_rad
     lossy_cell = whole.plan.cells[1]
-    assert run_bench_task(BenchRunItem(lossy_cell, 2)) == second
+    assert BenchRunItem(lossy_cell, 2).run() == second
 
 
 def test_a_cell_equals_the_log_of_its_command(whole: BenchResults) -> None:
@@ -236,7 +229,7 @@ def test_stiffness_is_measured_two_seconds_after_contact() -> None:
     ends = []
     for settings in (SHORTER_REACH, TASKS["contact"].settings):
         overrides = [*experiment.overrides, *format_settings(settings)]
-        scenario = load_tuning_scenario(experiment.source, overrides).scenario
+        scenario = TuningScenario.load(experiment.source, overrides).scenario
         log = trilat_net.simulate(scenario)
         user = log["m1"]
         slave = log["s"]
@@ -346,7 +339,7 @@ def test_an_interrupted_confirmation_resumes(
         if len(counts) == 4:  # the first of three repetitions
             raise KeyboardInterrupt
 
-    monkeypatch.setattr(bench_run, "run_bench_task", run_bounded)
+    monkeypatch.setattr(BenchRunItem, "run", run_bounded)
     use_single_runs(monkeypatch)
     folder = prepare_bench_folder(plan_small_suite(), tmp_path / "suite")
     with ThreadPoolExecutor(1) as executor, pytest.raises(KeyboardInterrupt):
@@ -391,13 +384,13 @@ def test_run_length_follows_the_slowest_time_constant(
 ) -> None:
     judgement = make_judged_run(rate_per_s)
     monkeypatch.setattr(
-        bench_run,
-        "judge_bench_run",
+        JudgedRun,
+        "simulate",
         lambda scenario, to_s: judgement._replace(
             scenario=msgspec.structs.replace(scenario, duration_s=to_s)
         ),
     )
-    longer = lengthen_run(judgement)
+    longer = judgement.lengthen()
     assert longer.scenario.duration_s == length_s
     assert phrase in longer.text
 
@@ -406,7 +399,7 @@ def test_a_decided_run_at_rest_is_not_extended() -> None:
     fit = EnvelopeFit(EnvelopeTrend.DECAYS, -0.02)
     end = RunEnd(EndBehaviour.CONVERGED, fit, fit, 0.0, 0.0)
     judgement = make_judged_run(-0.001, end=end, stability=Stability.SETTLED)
-    assert lengthen_run(judgement) is judgement
+    assert judgement.lengthen() is judgement
 
 
 def test_a_longer_run_refutes_or_confirms() -> None:
@@ -583,12 +576,12 @@ def test_kept_gains_minimise_error_at_the_margin(tmp_path: Path) -> None:
     by_error.sort(key=lambda n: search.scores[n].error_rad or 0.0)
     assert (tuning[1].settled, tuning[1].tried) == (len(by_error), 8)
 
-    longer_delay = load_tuning_scenario("_bench_two", [*settings, "link.delay_ms=204"])
+    longer_delay = TuningScenario.load("_bench_two", [*settings, "link.delay_ms=204"])
 
     def settles_at_margin(n: int) -> bool:
         """Returns True if a candidate also settles with one and a half times the delay."""
         candidate = longer_delay.with_gains(SEARCH_SPACES["p_d"], KNOWLEDGE, search.tried[n])
-        return measure_candidate(*candidate.texts).outcome is CandidateClass.SETTLED
+        return CandidateScore.measure(*candidate.texts).outcome is CandidateClass.SETTLED
 
     best = next(n for n in by_error if settles_at_margin(n))
     assert (tuning[1].gains, tuning[1].passed) == (search.tried[best], by_error.index(best))
@@ -612,7 +605,7 @@ def test_laws_with_another_promise_can_be_tuned(law: str, gains: dict[str, float
     """Both laws end away from the pose of the hand, and are stable by their own promise."""
     base = bench_plan.load_tuning_task("three", law, 68)
     candidate = base.with_gains(SEARCH_SPACES[law], KNOWLEDGE, gains)
-    score = measure_candidate(*candidate.texts)
+    score = CandidateScore.measure(*candidate.texts)
     assert score.outcome is CandidateClass.SETTLED
     assert score.pose_rad is not None
     assert score.pose_rad > 0.1

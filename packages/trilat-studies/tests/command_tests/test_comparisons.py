@@ -121,7 +121,7 @@ def test_search_reports_time_and_procedure_and_writes_folder(logs: Path) -> None
     assert is_documented("compare --tune", json.loads(again))
 
     trilat("compare", "--tune", "trio.toml", *options, cwd=logs).refuses(
-        "fronts: is not empty", "--force"
+        "fronts is not empty", "--force"
     )
 
 

@@ -6,8 +6,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 from study_builders import SHORT, plan_quick_sweep, run_plan
-from trilat_studies.sweep.sweep_cell import classify_decision
-from trilat_studies.sweep.sweep_results import SweepResults, build_reproduce_command
+from trilat_studies.sweep.sweep_cell import CellClass
+from trilat_studies.sweep.sweep_results import SweepResults
 
 from tests.cli.running import trilat
 from trilat_net.analysis.judge import certify_run
@@ -36,7 +36,7 @@ def test_command_of_cell_gives_its_numbers_bitwise(
     assert any(row["extended"] for row in results.rows)
 
     for row in results.rows:
-        command, note = build_reproduce_command(results, row, tmp_path)
+        command, note = results.build_reproduce_command(row, tmp_path)
         arguments = shlex.split(command)
         done = trilat(*arguments[1:], cwd=tmp_path)
         outcome = results.outcome(row)
@@ -48,7 +48,7 @@ def test_command_of_cell_gives_its_numbers_bitwise(
         assert run_end.end_speed_rad_s == outcome.end_speed_rad_s
         stability = certify_run(log).stability
         assert outcome.stability == stability
-        assert classify_decision(stability, run_end.behaviour) is outcome.verdict
+        assert CellClass.of_decision(stability, run_end.behaviour) is outcome.verdict
 
         peak = max(float(np.abs(log[name].e).max()) for name in log.sites)
         assert peak == outcome.peak_error_rad
@@ -64,7 +64,7 @@ def test_a_changed_scenario_names_the_rows_own(results: SweepResults, tmp_path: 
     row = results.rows[-1]
     source.write_text(SHORT.replace("0.3, -0.2", "0.3, -0.3"))
     try:
-        command, note = build_reproduce_command(results, row, tmp_path)
+        command, note = results.build_reproduce_command(row, tmp_path)
     finally:
         source.write_text(SHORT)
     assert "has changed since the sweep" in note
@@ -78,5 +78,5 @@ def test_a_changed_scenario_names_the_rows_own(results: SweepResults, tmp_path: 
     )
 
     source.rename(source.with_suffix(".away"))
-    assert "or is missing" in build_reproduce_command(results, row, tmp_path)[1]
+    assert "or is missing" in results.build_reproduce_command(row, tmp_path)[1]
     source.with_suffix(".away").rename(source)

@@ -13,7 +13,7 @@ from study_builders import Judge, plan_quick_sweep
 from trilat_studies.sweep import sweep_cell
 from trilat_studies.sweep.sweep_cell import CellClass, apply_diff, diff_lines
 from trilat_studies.sweep.sweep_results import build_sim_command
-from trilat_studies.sweep.sweep_run import CellItem, run_cell
+from trilat_studies.sweep.sweep_run import CellItem
 
 from tests.own_laws import CompiledPD
 from trilat_net.app.cli.options import load_chosen_scenario
@@ -23,13 +23,13 @@ from trilat_net.scenario import load_scenario, parse_scenario
 def test_an_entry_holds_the_text_that_was_judged(tmp_path: Path, judge: Judge) -> None:
     """The stored difference restores the judged scenario, and only draws make it random."""
     plan = plan_quick_sweep(tmp_path, "link.loss=0.1", seeds=2)
-    entry = run_cell(CellItem(plan, plan.cell(5), 2))
+    entry = CellItem(plan, plan.cell(5), 2).run()
     (text,) = judge.texts
     assert apply_diff(entry.scenario, plan.base.text) == text
     assert entry.outcome == judge(text, plan.longest_s)
     assert (entry.cell, entry.seed, entry.random, entry.law) == (5, 2, True, "adaptive")
     same = plan_quick_sweep(tmp_path)
-    assert not run_cell(CellItem(same, same.cell(5), 1)).random
+    assert not CellItem(same, same.cell(5), 1).run().random
 
 
 def test_command_of_cell_runs_its_scenario_and_length(tmp_path: Path, judge: Judge) -> None:
@@ -37,7 +37,7 @@ def test_command_of_cell_runs_its_scenario_and_length(tmp_path: Path, judge: Jud
     overrides = ("link.loss=0.1", "duration_s=0.25")
     plan = plan_quick_sweep(tmp_path, *overrides, laws=["p_d"], over=["link.delay_ms=0,20"])
     cell = plan.cell(1)
-    run_cell(CellItem(plan, cell, 1))
+    CellItem(plan, cell, 1).run()
     command = build_sim_command(plan, cell.overrides, 1, 0.25, "a b.mcap")
     arguments = shlex.split(command)
     assert arguments[:3] == ["trilat", "sim", str(tmp_path / "trio.toml")]
@@ -52,8 +52,8 @@ def test_a_task_makes_equal_entries_in_another_process(tmp_path: Path) -> None:
     plan = plan_quick_sweep(tmp_path, laws=["adaptive", "p_d"], over=["link.delay_ms=0,20"])
     task = CellItem(plan, plan.cell(3), 1)
     restored_task = pickle.loads(pickle.dumps(task))
-    entry = run_cell(restored_task)
-    assert entry == run_cell(task)
+    entry = restored_task.run()
+    assert entry == task.run()
     scenario = parse_scenario(apply_diff(entry.scenario, plan.base.text))
     assert scenario.sites["s"].control.K
 
@@ -61,7 +61,7 @@ def test_a_task_makes_equal_entries_in_another_process(tmp_path: Path) -> None:
 def test_a_cell_without_valid_scenario_is_refused(tmp_path: Path) -> None:
     plan = plan_quick_sweep(tmp_path)
     cell = plan.cell(7)._replace(overrides=("link.delay_ms=60", "control.Kd=-1"))
-    outcome = run_cell(CellItem(plan, cell, 1)).outcome
+    outcome = CellItem(plan, cell, 1).run().outcome
     assert outcome.verdict is CellClass.REFUSED
     assert outcome.verdict.stable is None
     assert re.match(r"cell 7 \(link.delay_ms=60, control.Kd=-1\): .*Kd", outcome.reasons)

@@ -11,15 +11,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 from study_builders import MAP_KEYS, make_map_rows
 from trilat_studies.sweep.stability_map import (
+    MapLine,
     PlaneAxis,
     StabilityCriterion,
     build_stability_map,
-    evaluate_criterion,
     find_criterion_edge,
     load_grid_scenario,
     make_panel_loader,
-    refine_columns,
-    trace_closed_form,
     trace_linear_analysis,
 )
 from trilat_studies.sweep.sweep_plan import (
@@ -164,7 +162,7 @@ def spare(excess: float) -> StabilityCriterion:
 
 def test_the_line_is_half_stiffness_times_delay() -> None:
     """No d of the map is little enough for no delay, or enough for 800 ms."""
-    line = trace_closed_form(at, DELAY, DAMPING)
+    line = MapLine.trace_closed_form(at, DELAY, DAMPING)
     assert line is not None
     crossings = [line.crossings(column, DAMPING) for column in range(6)]
     assert [len(some) for some in crossings] == [0, 1, 1, 1, 1, 0]
@@ -175,7 +173,7 @@ def test_the_line_is_half_stiffness_times_delay() -> None:
 
 def test_a_law_without_a_condition_has_no_line() -> None:
     assert (
-        trace_closed_form(
+        MapLine.trace_closed_form(
             lambda x, _: load_scenario("free", {"link.delay_ms": x}), DELAY, DAMPING
         )
         is None
@@ -184,7 +182,7 @@ def test_a_law_without_a_condition_has_no_line() -> None:
 
 def test_an_unaffected_condition_has_no_line() -> None:
     assert (
-        trace_closed_form(
+        MapLine.trace_closed_form(
             lambda x, _: load_scenario(P_D, {"link.delay_ms": x, "control.d": 9.0}),
             DELAY,
             DAMPING,
@@ -275,7 +273,7 @@ DELAY_MS = st.integers(2, 5000)  # of one tick the sampling asks for more
 
 def excess(scenario: Scenario) -> float:
     """Returns the margin by which a scenario satisfies its stability criterion."""
-    criterion = evaluate_criterion(scenario)
+    criterion = StabilityCriterion.evaluate(scenario)
     assert criterion is not None
     return criterion.excess
 
@@ -348,7 +346,7 @@ def test_digital_scheme_needs_gravity_learnt_slowly_enough() -> None:
 def test_without_its_premises_a_condition_says_nothing(
     name: str, settings: dict[str, Any]
 ) -> None:
-    assert evaluate_criterion(load_scenario(name, settings)) is None
+    assert StabilityCriterion.evaluate(load_scenario(name, settings)) is None
 
 
 def test_play_out_counts_as_delay() -> None:
@@ -363,12 +361,12 @@ def test_play_out_counts_as_delay() -> None:
     ids=["another scheme", "two rates", "d h above the least inertia"],
 )
 def test_a_condition_is_silent_at_other_tick_rates(changes: dict[str, Any]) -> None:
-    assert evaluate_criterion(load_scenario("p_d_margin", changes)) is None
+    assert StabilityCriterion.evaluate(load_scenario("p_d_margin", changes)) is None
 
 
 def test_shares_in_a_circle_have_no_line() -> None:
     circle = {f"dominance.{a}": {b: 1.0} for a, b in (("m1", "m2"), ("m2", "s"), ("s", "m1"))}
-    assert evaluate_criterion(load_scenario("p_d_margin", circle)) is None
+    assert StabilityCriterion.evaluate(load_scenario("p_d_margin", circle)) is None
 
 
 def test_line_between_few_columns_is_that_of_theory() -> None:
@@ -397,13 +395,13 @@ def test_line_between_few_columns_is_that_of_theory() -> None:
 
 def test_columns_of_a_fine_map_are_not_divided() -> None:
     axis = PlaneAxis("link.delay_ms", tuple(np.arange(0.0, 500.0, 10.0).tolist()), "")
-    columns = refine_columns(axis)
+    columns = axis.refine_columns()
     assert columns.values == axis.values
     assert columns.on_grid == tuple(range(50))
 
 
 def test_fine_columns_contain_those_of_the_map() -> None:
     axis = PlaneAxis("link.delay_ms", (1.0, 10.0, 100.0), "")
-    columns = refine_columns(axis)
+    columns = axis.refine_columns()
     assert [columns.values[n] for n in columns.on_grid] == [1.0, 10.0, 100.0]
     assert [columns.positions[n] for n in columns.on_grid] == [0.0, 1.0, 2.0]

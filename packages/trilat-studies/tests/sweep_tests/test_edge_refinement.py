@@ -19,7 +19,7 @@ from trilat_studies.sweep.edge_refinement import (
     EdgeRefinement,
     choose_side,
 )
-from trilat_studies.sweep.stability_map import build_stability_map, find_map_edges
+from trilat_studies.sweep.stability_map import build_stability_map
 from trilat_studies.sweep.sweep_cell import CellClass, CellResult
 from trilat_studies.sweep.sweep_plan import SweepPlan, parse_axis, plan_sweep
 from trilat_studies.sweep.sweep_results import RESULTS_FILE
@@ -151,6 +151,6 @@ def test_an_interrupted_refinement_ends_as_any_other(
         build_stability_map(swept.results, (), linearly=False).plane
         for swept in (whole, refined)
     ]
-    edges = [find_map_edges(plane, plane.panels[0]) for plane in planes]
+    edges = [plane.find_edges(plane.panels[0]) for plane in planes]
     assert edges[0] == edges[1]
     assert len(edges[0]) >= len(planes[0].x.values) - 1

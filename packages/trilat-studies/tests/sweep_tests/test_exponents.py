@@ -17,12 +17,8 @@ from study_builders import (
 )
 from trilat_studies.sweep import prepare_sweep_folder
 from trilat_studies.sweep.map_page import draw_stability_map, tabulate_edges
-from trilat_studies.sweep.stability_map import (
-    StabilityMap,
-    build_plane,
-    build_stability_map,
-)
-from trilat_studies.sweep.sweep_plan import build_sweep_command, plan_from_json, plan_sweep
+from trilat_studies.sweep.stability_map import MapPlane, StabilityMap, build_stability_map
+from trilat_studies.sweep.sweep_plan import SweepPlan, plan_sweep
 from trilat_studies.sweep.sweep_results import SweepResults, read_results
 
 from trilat_net.analysis.theory.linear_edge import GrowthColumn
@@ -109,10 +105,10 @@ def test_a_cell_without_growth_or_decay_is_white() -> None:
 def test_place_is_its_seeds_mean_without_missing_exponents() -> None:
     seeded = [row | {"exponent_per_s": float(row["seed"])} for row in make_map_rows(seeds=3)]
     seeded[0] |= {"exponent_per_s": None}
-    exponents = build_plane(seeded, MAP_KEYS, P_D).panels[0].exponents_per_s
+    exponents = MapPlane.arrange_rows(seeded, MAP_KEYS, P_D).panels[0].exponents_per_s
     assert np.isnan(exponents[0, 0])
     assert np.nanmin(exponents) == np.nanmax(exponents) == 2.0
-    assert not build_plane(list(make_map_rows()), MAP_KEYS, P_D).has_exponents
+    assert not MapPlane.arrange_rows(list(make_map_rows()), MAP_KEYS, P_D).has_exponents
 
 
 def test_a_folder_never_mixes_verdicts_and_exponents(tmp_path: Path) -> None:
@@ -121,7 +117,7 @@ def test_a_folder_never_mixes_verdicts_and_exponents(tmp_path: Path) -> None:
         plan_quick_sweep(tmp_path, judge=judge) for judge in ("verdict", "twins")
     )
     assert "judge" not in verdicts.facts()
-    assert plan_from_json(verdicts.facts()).judge == "verdict"
+    assert SweepPlan.from_facts(verdicts.facts()).judge == "verdict"
     prepare_sweep_folder(verdicts, tmp_path / "o")
     longest = plan_quick_sweep(tmp_path, judge="twins", longest_s=verdicts.longest_s)
     with pytest.raises(UsageError, match="another judge: verdict in the folder, twins now"):
@@ -130,7 +126,9 @@ def test_a_folder_never_mixes_verdicts_and_exponents(tmp_path: Path) -> None:
 
 
 def test_the_command_of_a_map_names_its_judge(tmp_path: Path) -> None:
-    assert build_sweep_command(plan_quick_sweep(tmp_path, judge="twins"), "--map").endswith(
-        " --judge twins --map"
+    assert (
+        plan_quick_sweep(tmp_path, judge="twins")
+        .build_command("--map")
+        .endswith(" --judge twins --map")
     )
-    assert "--judge" not in build_sweep_command(plan_quick_sweep(tmp_path))
+    assert "--judge" not in plan_quick_sweep(tmp_path).build_command()

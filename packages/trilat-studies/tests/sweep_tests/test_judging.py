@@ -7,13 +7,7 @@ from typing import Any
 import msgspec
 import pytest
 from trilat_studies.measure_run import measure_virtual_run
-from trilat_studies.sweep.sweep_cell import (
-    CellClass,
-    CellResult,
-    classify_cell,
-    classify_decision,
-    is_conclusive,
-)
+from trilat_studies.sweep.sweep_cell import CellClass, CellResult, classify_cell
 
 import trilat_net
 from trilat_net.analysis.judge import certify_run
@@ -55,7 +49,7 @@ def test_verdict_and_numbers_are_those_of_a_log(run: str) -> None:
     certificate = certify_run(log)
     expected = certificate.end
     assert result.motion is expected.behaviour
-    assert result.verdict is classify_decision(certificate.stability, expected.behaviour)
+    assert result.verdict is CellClass.of_decision(certificate.stability, expected.behaviour)
     assert result.stability == certificate.stability
     assert (result.end_error_rad, result.end_speed_rad_s) == (
         expected.end_error_rad,
@@ -100,7 +94,7 @@ def test_an_undecided_run_continues_as_longer_run() -> None:
     """A growth of 0.01/s is invisible in 4 s."""
     changes = {"control.d": 0.95, "duration_s": 4.0}
     scenario = load_scenario("p_d_margin", changes)
-    assert not is_conclusive(judge_result(scenario))
+    assert not judge_result(scenario).is_conclusive
 
     result = judge_result(scenario, longest_s=256.0)
     assert result.verdict is CellClass.DIVERGED
@@ -130,7 +124,7 @@ def test_no_run_is_extended_beyond_its_limit() -> None:
     scenario = load_scenario("p_d_margin", {"control.d": 0.99, "duration_s": 4.0})
     result = judge_result(scenario, longest_s=10.0)
     assert (result.ran_s, result.extended) == (10.0, 2)
-    assert not is_conclusive(result)
+    assert not result.is_conclusive
 
 
 @pytest.mark.parametrize("d", [0.95, 1.05])

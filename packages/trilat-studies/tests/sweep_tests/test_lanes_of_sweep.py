@@ -8,8 +8,8 @@ from trilat_studies.side_by_side import describe_runs_alone
 from trilat_studies.sweep import plan_sweep, sweep_run
 from trilat_studies.sweep.sweep_results import RESULTS_FILE
 
+from trilat_net.core.lanes import run_groups
 from trilat_net.execution.fused import FusedRun
-from trilat_net.execution.lanes import run_groups
 
 
 def run_in(folder: Path) -> sweep_run.FinishedSweep:

@@ -5,11 +5,7 @@ from pathlib import Path
 import pytest
 from study_builders import plan_quick_sweep, replace_judge, run_plan
 from trilat_studies.sweep import plan_sweep, read_results
-from trilat_studies.sweep.stability_map import (
-    ZERO_RATE,
-    build_stability_map,
-    find_map_edges,
-)
+from trilat_studies.sweep.stability_map import ZERO_RATE, build_stability_map
 from trilat_studies.sweep.sweep_cell import CellClass, CellResult
 
 from trilat_net.analysis.theory import iterate_linear_edges
@@ -36,7 +32,7 @@ def test_linear_cells_have_the_known_edge(
     assert chart.plane.is_linear
     assert chart.lines[0][0].text == ZERO_RATE
 
-    edges = find_map_edges(chart.plane, panel)
+    edges = chart.plane.find_edges(panel)
     assert len(edges) == 3
     for delay_ms, edge in edges:
         scenario = load_scenario("p_d_margin", {"link.delay_ms": delay_ms})

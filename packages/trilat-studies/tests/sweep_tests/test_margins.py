@@ -14,9 +14,7 @@ from trilat_studies.sweep.margin_search import (
     KeyMargin,
     SearchRange,
     SweepMargins,
-    format_range_axis,
     parse_search_range,
-    search_key_margin,
     search_margins,
 )
 from trilat_studies.sweep.stability_map import StabilityEdge
@@ -33,7 +31,7 @@ WITHIN = SearchRange("control.d", 0.2, 3.0, 0.005)
 def plan_margin_sweep(*over: str, **settings: object) -> SweepPlan:
     """Returns the plan of a search along the damping, at each delay if no axis is given."""
     axes = over or ("link.delay_ms=100,200",)
-    return plan_sweep("p_d_margin", over=[*axes, format_range_axis(WITHIN)], **settings)  # type: ignore[arg-type]
+    return plan_sweep("p_d_margin", over=[*axes, WITHIN.format_axis()], **settings)  # type: ignore[arg-type]
 
 
 @pytest.fixture
@@ -86,7 +84,7 @@ def test_the_number_of_processes_changes_nothing() -> None:
     plan = plan_sweep(
         "p_d_margin",
         brief,
-        over=["link.delay_ms=100,400", format_range_axis(within)],
+        over=["link.delay_ms=100,400", within.format_axis()],
         longest_s=1.0,
     )
     assert search_margins(plan, within, 1) == search_margins(plan, within, 2)
@@ -96,7 +94,7 @@ def test_the_number_of_processes_changes_nothing() -> None:
 def test_whole_number_keys_are_searched_in_integers() -> None:
     """The judge gives 300 Hz and 50 Hz the same verdict; no value between whole numbers may be run."""
     within = SearchRange("rate_hz", 50.0, 300.0, 0.005)
-    plan = plan_sweep("p_d_margin", over=["link.delay_ms=100,200", format_range_axis(within)])
+    plan = plan_sweep("p_d_margin", over=["link.delay_ms=100,200", within.format_axis()])
     assert [margin.margin.stable for margin in search_margins(plan, within, 1)] == [True, True]
 
 
@@ -158,7 +156,7 @@ def test_the_facts_are_json_and_name_the_command() -> None:
 
 def test_a_range_is_read_as_written() -> None:
     assert parse_search_range("control.d=0.2:3") == WITHIN
-    assert format_range_axis(WITHIN) == "control.d=0.2,3"
+    assert WITHIN.format_axis() == "control.d=0.2,3"
 
 
 @given(st.floats(0.25, 2.95), st.booleans(), st.sampled_from([0.05, 0.005, 1e-4]))
@@ -172,7 +170,7 @@ def test_an_edge_is_enclosed_to_the_tolerance(
         values.append(value)
         return (value > edge) is above
 
-    margin = search_key_margin(stable, 0.2, 3.0, tolerance)
+    margin = KeyMargin.search(stable, 0.2, 3.0, tolerance)
     (span,) = margin.spans
     assert span.low <= edge <= span.high
     assert span.high - span.low <= tolerance * span.high
@@ -193,7 +191,7 @@ def test_an_undecided_part_is_the_reported_interval(
     def stable(value: float) -> bool | None:
         return None if abs(value - edge) < width else (value > edge) is above
 
-    margin = search_key_margin(stable, 0.2, 3.0, 0.01)
+    margin = KeyMargin.search(stable, 0.2, 3.0, 0.01)
     (span,) = margin.spans
     assert span.low <= edge - width + 1e-9
     assert edge + width - 1e-9 <= span.high
@@ -207,12 +205,12 @@ def test_an_undecided_part_is_the_reported_interval(
 
 @pytest.mark.parametrize("side", [True, False, None])
 def test_without_change_only_the_side_is_reported(side: bool | None) -> None:
-    margin = search_key_margin(lambda _: side, 0.2, 3.0)
+    margin = KeyMargin.search(lambda _: side, 0.2, 3.0)
     assert (margin.spans, margin.stable, margin.runs) == ((), side, SCAN_POINTS)
 
 
 def test_an_island_has_two_edges() -> None:
-    margin = search_key_margin(lambda value: not 1.0 < value < 1.9, 0.0, 4.0)
+    margin = KeyMargin.search(lambda value: not 1.0 < value < 1.9, 0.0, 4.0)
     first, second = margin.spans
     assert first.low <= 1.0 <= first.high
     assert second.low <= 1.9 <= second.high
@@ -226,7 +224,7 @@ def test_whole_numbers_are_narrowed_to_neighbours(edge: float) -> None:
         assert value == round(value)
         return value > edge
 
-    (span,) = search_key_margin(stable, 20.0, 300.0, 1e-9, whole=True).spans
+    (span,) = KeyMargin.search(stable, 20.0, 300.0, 1e-9, whole=True).spans
     assert (span.low, span.high) == (math.floor(edge), math.floor(edge) + 1) or edge == round(
         edge
     )
@@ -234,7 +232,7 @@ def test_whole_numbers_are_narrowed_to_neighbours(edge: float) -> None:
 
 def test_searching_an_edge_near_zero_ends() -> None:
     """A tolerance relative to 0 is never met."""
-    (span,) = search_key_margin(lambda value: value > 1e-300, 0.0, 1.0).spans
+    (span,) = KeyMargin.search(lambda value: value > 1e-300, 0.0, 1.0).spans
     assert span.low <= 1e-300 <= span.high
-    (span,) = search_key_margin(lambda value: value > 0.0, -1.0, 1.0).spans
+    (span,) = KeyMargin.search(lambda value: value > 0.0, -1.0, 1.0).spans
     assert span.low <= 0.0 <= span.high

@@ -9,13 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from study_builders import SHORT, plan_quick_sweep
-from trilat_studies.sweep.sweep_plan import (
-    SweepPlan,
-    list_axes,
-    parse_axis,
-    plan_from_json,
-    plan_sweep,
-)
+from trilat_studies.sweep.sweep_plan import SweepPlan, list_axes, parse_axis, plan_sweep
 
 from tests.laws import Adaptive
 from trilat_net.errors import ScenarioError, UsageError
@@ -102,7 +96,7 @@ def test_there_is_no_cell_beyond_the_last(cube: SweepPlan) -> None:
 
 
 def test_facts_restore_the_plan(cube: SweepPlan) -> None:
-    again = plan_from_json(json.loads(json.dumps(cube.facts())))
+    again = SweepPlan.from_facts(json.loads(json.dumps(cube.facts())))
     assert again.facts() == cube.facts()
     assert again.base == cube.base
     assert [again.cell(n) for n in range(24)] == [cube.cell(n) for n in range(24)]
@@ -229,7 +223,7 @@ def test_huge_ranges_take_no_memory() -> None:
 )
 def test_overrides_may_need_swept_values(overrides: list[str], laws: list[str]) -> None:
     plan = plan_sweep("free", overrides, over=["link.delay_ms=20:60:20"], laws=laws)
-    again = plan_from_json(json.loads(json.dumps(plan.facts())))
+    again = SweepPlan.from_facts(json.loads(json.dumps(plan.facts())))
     assert again.facts() == plan.facts()
     for number in range(plan.cells):
         cell = plan.cell(number)

@@ -15,13 +15,7 @@ from study_builders import (
     make_map_plane,
     make_map_rows,
 )
-from trilat_studies.sweep.stability_map import (
-    CELL_CLASSES,
-    PlaneAxis,
-    StabilityEdge,
-    build_plane,
-    find_map_edges,
-)
+from trilat_studies.sweep.stability_map import CELL_CLASSES, MapPlane, PlaneAxis, StabilityEdge
 from trilat_studies.sweep.sweep_cell import CellClass
 from trilat_studies.sweep.sweep_plan import label_axis, label_setting
 
@@ -37,7 +31,7 @@ def test_runs_in_any_order_are_counted_once(order: list[int], chance: int) -> No
     shuffled_rows = list(
         make_map_rows(lambda *_, **__: CELL_CLASSES[random.integers(4)], seeds=2)
     )
-    plane = build_plane([shuffled_rows[n] for n in order], MAP_KEYS, P_D)
+    plane = MapPlane.arrange_rows([shuffled_rows[n] for n in order], MAP_KEYS, P_D)
     (panel,) = plane.panels
     assert panel.counts.sum() == 50
     for i, damping in enumerate(DAMPINGS):
@@ -83,13 +77,13 @@ def test_words_and_further_axes_make_panels() -> None:
 
 def test_an_axis_of_words_is_never_drawn() -> None:
     ordered_rows = list(make_map_rows(link__order=("newest", "in_order")))
-    plane = build_plane(ordered_rows, ["link.order", *MAP_KEYS], P_D)
+    plane = MapPlane.arrange_rows(ordered_rows, ["link.order", *MAP_KEYS], P_D)
     assert (plane.x.key, plane.y.key) == MAP_KEYS
     assert len(plane.panels) == 2
 
 
 def test_a_single_axis_is_a_strip() -> None:
-    plane = build_plane(
+    plane = MapPlane.arrange_rows(
         [row for row in make_map_rows() if row["control.d"] == 0.7], ["link.delay_ms"], P_D
     )
     assert (plane.y.key, plane.y.values) == ("", (0.0,))
@@ -111,9 +105,9 @@ def test_uneven_values_are_drawn_one_apart(values: tuple[float, ...], even: bool
 
 def test_no_runs_numbers_or_panels_are_refused() -> None:
     with pytest.raises(UsageError, match="no cell has run"):
-        build_plane([], MAP_KEYS, P_D)
+        MapPlane.arrange_rows([], MAP_KEYS, P_D)
     with pytest.raises(UsageError, match=r"needs a numeric axis, .* not numbers: link\.order"):
-        build_plane(
+        MapPlane.arrange_rows(
             list(make_map_rows(link__order=("newest", "in_order"))), ["link.order"], P_D
         )
     with pytest.raises(UsageError, match=r"at most 12 panels, but rate_hz would give 13"):
@@ -126,12 +120,12 @@ YES, NO, UNKNOWN = CellClass.CONVERGED, CellClass.DIVERGED, CellClass.UNDECIDED
 def list_column_edges(column: tuple[CellClass, ...]) -> list[StabilityEdge]:
     """Returns the edges of the first column of a map whose columns are alike."""
     plane = make_map_plane(lambda _, d, *__: column[DAMPINGS.index(d)])
-    return [edge for x, edge in find_map_edges(plane, plane.panels[0]) if x == DELAYS_MS[0]]
+    return [edge for x, edge in plane.find_edges(plane.panels[0]) if x == DELAYS_MS[0]]
 
 
 def test_the_condition_lies_in_its_own_edges() -> None:
     plane = make_map_plane()
-    measured = find_map_edges(plane, plane.panels[0])
+    measured = plane.find_edges(plane.panels[0])
     assert [x for x, _ in measured] == [100, 200, 300, 400]
     for x, edge in measured:
         assert edge.low <= 5e-3 * x <= edge.high
@@ -164,15 +158,13 @@ def test_majorities_of_runs_decide_and_draws_do_not() -> None:
     three = make_map_plane(
         lambda x, y, seed: judge_by_condition(x, y) if seed < 3 else YES, seeds=3
     )
-    assert find_map_edges(three, three.panels[0]) == find_map_edges(
-        make_map_plane(), make_map_plane().panels[0]
+    assert three.find_edges(three.panels[0]) == make_map_plane().find_edges(
+        make_map_plane().panels[0]
     )
     draw = make_map_plane(
         lambda x, y, seed: judge_by_condition(x, y) if seed < 2 or y > 1.0 else YES, seeds=2
     )
-    assert all(
-        edge.low > 1.0 or edge.high > 1.0 for _, edge in find_map_edges(draw, draw.panels[0])
-    )
+    assert all(edge.low > 1.0 or edge.high > 1.0 for _, edge in draw.find_edges(draw.panels[0]))
 
 
 @pytest.mark.parametrize("half_width_ms", [0.0, 50.0])

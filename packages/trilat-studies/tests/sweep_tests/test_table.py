@@ -17,11 +17,7 @@ from study_builders import (
     replace_judge,
     run_plan,
 )
-from trilat_studies.sweep import (
-    prepare_sweep_folder,
-    read_results,
-    result_table,
-)
+from trilat_studies.sweep import prepare_sweep_folder, read_results, result_table
 from trilat_studies.sweep.result_table import ResultTable
 from trilat_studies.sweep.sweep_cell import RUN_CLASSES, CellRun, diff_lines
 from trilat_studies.sweep.sweep_plan import SweepPlan, plan_sweep
@@ -30,7 +26,6 @@ from trilat_studies.sweep.sweep_results import (
     GridPoint,
     SweepResults,
     build_cell_rows,
-    collect_grid_points,
     iterate_cells,
     reproduction_duration_s,
 )
@@ -100,7 +95,7 @@ def test_a_large_table_stays_in_its_file(
 
     assert stored.of_cell(3) == results.of_cell(3)
     assert list(stored.blocks()) == list(results.blocks())
-    assert collect_grid_points(stored) == collect_grid_points(results)
+    assert stored.list_grid_points() == results.list_grid_points()
     with pytest.raises(IndexError):
         stored.rows[len(stored.rows)]
 
@@ -270,7 +265,7 @@ def points(tmp_path: Path, judge: Judge) -> list[GridPoint]:
     sweep = plan_quick_sweep(tmp_path, over=["link.loss=0:0.5:0.1", DELAYS], seeds=12)
     results = run_plan(sweep, tmp_path / "o").results
     assert len(judge.texts) == 3 + 15 * 12
-    return collect_grid_points(results)
+    return results.list_grid_points()
 
 
 def test_every_run_is_counted_once(points: list[GridPoint]) -> None:

@@ -17,7 +17,6 @@ from trilat_studies.measure_run import (
     SiteStats,
     WindowStats,
     evaluate_expectations,
-    join_batches,
     measure_log,
     measure_virtual_run,
     run_compiled_in_batches,
@@ -429,8 +428,8 @@ def test_compiled_loop_gives_records_of_the_ticks(changes: dict[str, Any]) -> No
     )
     assert run.diverged_s == diverged_at_s
     for name in scenario.names:
-        records = join_batches(compiled[name])
-        expected = join_batches(by_tick[name])
+        records = RecordBatch.join(compiled[name])
+        expected = RecordBatch.join(by_tick[name])
         for column, expected_column in zip(records, expected, strict=True):
             np.testing.assert_array_equal(column, expected_column)
 

@@ -15,7 +15,6 @@ from trilat_studies.tuning.candidate import (
     build_twin,
     check_comparable,
     compute_consensus_pose,
-    measure_candidate,
 )
 
 from tests.execution.builders import make_trajectories
@@ -157,7 +156,7 @@ FIRM = (*FIRM_GAINS, "duration_s=4.0")
 
 def measure_score(scenario: Scenario, twin: Scenario | None = None) -> CandidateScore:
     """Returns the score of a scenario, compared with its copy without disturbances if given."""
-    return measure_candidate(scenario.text, None if twin is None else twin.text)
+    return CandidateScore.measure(scenario.text, None if twin is None else twin.text)
 
 
 def test_error_and_effort_are_the_documented_sums() -> None:

@@ -5,12 +5,7 @@ from pathlib import Path
 import msgspec
 import pytest
 from study_builders import FIRM_GAINS, make_run_end, make_trio_scenario
-from trilat_studies.tuning.candidate import (
-    CLASS_MEANINGS,
-    CandidateClass,
-    check_final_posture,
-    classify_candidate,
-)
+from trilat_studies.tuning.candidate import CLASS_MEANINGS, CandidateClass, check_final_posture
 
 from trilat_net.analysis.run_end import EndBehaviour, RunEnd, Stability
 from trilat_net.app.api import simulate
@@ -40,9 +35,9 @@ CALM = make_run_end()
 def test_class_combines_judgement_and_pose(
     end: RunEnd, fall_rad: float, apart_rad: float, outcome: CandidateClass
 ) -> None:
-    assert classify_candidate((end, end), fall_rad, apart_rad) is outcome
-    assert classify_candidate((end, CALM), fall_rad, apart_rad) is outcome
-    assert classify_candidate((CALM, end), fall_rad, apart_rad) is outcome
+    assert CandidateClass.classify((end, end), fall_rad, apart_rad) is outcome
+    assert CandidateClass.classify((end, CALM), fall_rad, apart_rad) is outcome
+    assert CandidateClass.classify((CALM, end), fall_rad, apart_rad) is outcome
 
 
 def test_judgements_that_decide_a_class_name_it() -> None:

@@ -6,12 +6,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 from study_builders import make_trio_scenario
 from trilat_studies.run_commands import format_toml_value
-from trilat_studies.tuning.candidate import TuningScenario, load_tuning_scenario
+from trilat_studies.tuning.candidate import TuningScenario
 from trilat_studies.tuning.search_space import (
     DEFAULT_LAWS,
     SEARCH_SPACES,
     ModelInformation,
-    build_model_information,
     select_search_spaces,
     weigh_joints,
 )
@@ -37,7 +36,7 @@ def test_candidates_change_their_law_at_every_site(law: str, scenario: str) -> N
     if law == "p_f" and scenario == "free":
         return
     scheme = ["scheme=digital"] if law in HELD else []
-    experiment = load_tuning_scenario(scenario, ["limits.tau_limit_nm=60", *scheme])
+    experiment = TuningScenario.load(scenario, ["limits.tau_limit_nm=60", *scheme])
     candidate = experiment.with_gains(
         SEARCH_SPACES[law], ModelInformation(0.95), MIDDLE[law]
     ).scenario
@@ -59,14 +58,14 @@ def test_candidates_change_their_law_at_every_site(law: str, scenario: str) -> N
 
 
 def test_sites_with_own_control_are_changed_separately() -> None:
-    candidate: TuningScenario = load_tuning_scenario("contact").with_gains(
+    candidate: TuningScenario = TuningScenario.load("contact").with_gains(
         SEARCH_SPACES["p_d"], ModelInformation(), {"K": 31.2, "d": 7.1}
     )
     assert [text.partition("=")[0] for text in candidate.overrides] == [
         "sites.m.control",
         "sites.s.control",
     ]
-    free: TuningScenario = load_tuning_scenario("free").with_gains(
+    free: TuningScenario = TuningScenario.load("free").with_gains(
         SEARCH_SPACES["p_d"], ModelInformation(), {"K": 31.2, "d": 7.1}
     )
     assert (
@@ -91,7 +90,7 @@ def load_six_joints(state: ChainState, **overrides: object) -> TuningScenario:
     """Returns `six_joints` with two equal start poses."""
     start = {f"sites.{name}.q0_rad": state.q.tolist() for name in ("m1", "m2", "s")}
     settings = {"arm.stops": False, **start, **overrides}
-    return load_tuning_scenario(
+    return TuningScenario.load(
         "six_joints", [f"{key}={format_toml_value(value)}" for key, value in settings.items()]
     )
 
@@ -178,7 +177,7 @@ def test_ranges_hold_the_true_parameters_strictly_inside(percent: float) -> None
     """The true parameters lie inside the ranges, as V' <= 0 needs; else the law cannot work."""
     scenario = make_trio_scenario()
     truth = scenario.arms["s"].theta
-    low, high = build_model_information(percent).box_sides(scenario, "s")
+    low, high = ModelInformation.of_gravity(percent).box_sides(scenario, "s")
     assert (np.array(low) < truth).all()
     assert (np.array(high) > truth).all()
 
@@ -186,7 +185,7 @@ def test_ranges_hold_the_true_parameters_strictly_inside(percent: float) -> None
 @given(percent=SHARES)
 def test_candidates_know_equal_gravity_and_no_inertia(percent: float) -> None:
     scenario = make_trio_scenario()
-    prior = np.array(build_model_information(percent).prior(scenario, "m1"))
+    prior = np.array(ModelInformation.of_gravity(percent).prior(scenario, "m1"))
     # (m1 lc1 + m2 l1, m2 lc2) of point masses at the ends, Eq. (24)
     truth = np.array([2.0, 1.0])
     assert (prior[:3] == 0.0).all()
@@ -196,4 +195,4 @@ def test_candidates_know_equal_gravity_and_no_inertia(percent: float) -> None:
 @pytest.mark.parametrize("percent", [0.0, 49.0, 151.0, float("nan"), float("inf")])
 def test_impossible_knowledge_is_refused(percent: float) -> None:
     with pytest.raises(UsageError, match="gravity_percent must be from 50 to 150 %"):
-        build_model_information(percent)
+        ModelInformation.of_gravity(percent)

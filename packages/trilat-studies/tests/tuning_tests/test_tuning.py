@@ -8,10 +8,7 @@ from pathlib import Path
 import pytest
 from study_builders import dominates, make_candidate_score, plan_quick_tuning
 from trilat_studies.tuning import TuningResult
-from trilat_studies.tuning.candidate import (
-    CandidateClass,
-    measure_candidate,
-)
+from trilat_studies.tuning.candidate import CandidateClass, CandidateScore
 from trilat_studies.tuning.search_space import SEARCH_SPACES
 from trilat_studies.tuning.tuning_plan import CandidateSearch, Objective, find_pareto_front
 from trilat_studies.tuning.tuning_report import tabulate_front, tabulate_laws, write_tuning
@@ -91,7 +88,7 @@ def test_the_command_of_a_point_repeats_its_run(tuning_result: TuningResult) -> 
             assert arguments[:2] == ["trilat", "sim"]
             assert arguments[3::2] == ["--set"] * (len(arguments[3:]) // 2)
             assert (
-                measure_candidate(load_scenario(arguments[2], arguments[4::2]).text, None)
+                CandidateScore.measure(load_scenario(arguments[2], arguments[4::2]).text, None)
                 == law.scores[place]
             )
 

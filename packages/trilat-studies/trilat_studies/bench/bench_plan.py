@@ -35,12 +35,7 @@ from trilat_net.scenario import BUILT_IN, GRID_LOSSES_PERCENT, GRID_ROUND_TRIPS_
 from trilat_net.work import Progress, Workers, ignore_progress
 
 from ..run_commands import format_toml_value
-from ..tuning.candidate import (
-    CandidateClass,
-    TuningScenario,
-    load_tuning_scenario,
-    measure_candidate,
-)
+from ..tuning.candidate import CandidateClass, CandidateScore, TuningScenario
 from ..tuning.search_space import SEARCH_SPACES, ModelInformation, SearchSpace
 from ..tuning.tuning_plan import CandidateSearch, plan_tuning
 
@@ -439,7 +434,7 @@ def load_tuning_task(form: str, law: str, round_trip_ms: int) -> TuningScenario:
     """
     task = _OTHER_TUNING_TASKS.get((form, law), TUNING_TASK)
     settings = build_settings(form, task, f"rtt{round_trip_ms}")
-    return load_tuning_scenario(BASES[form], format_settings(settings))
+    return TuningScenario.load(BASES[form], format_settings(settings))
 
 
 TUNING_VERSION = 2
@@ -466,7 +461,7 @@ def _probe_law(task: TuningScenario, space: SearchSpace) -> str:
         geometric_mean = math.sqrt(gain.low * gain.high)
         gains[gain.name] = geometric_mean if gain.low > 0 else 0.5 * gain.high
     candidate = task.with_gains(space, KNOWLEDGE, gains)
-    score = measure_candidate(*candidate.texts)
+    score = CandidateScore.measure(*candidate.texts)
     if score.error_rad is None or score.effort_nm is None:  # the run diverged
         return f"{score.outcome.name} at {score.diverged_s} s"
     return f"{score.outcome.name}: {score.error_rad:.9g} rad, {score.effort_nm:.9g} N m"
@@ -558,9 +553,9 @@ def _has_margin(form: str, round_trip_ms: int, search: CandidateSearch, candidat
         "duration_s": MARGIN_LENGTHS * task.scenario.duration_s,
     }
     overrides = (*task.overrides, *format_settings(longer_delays))
-    longer_task = load_tuning_scenario(task.source, overrides)
+    longer_task = TuningScenario.load(task.source, overrides)
     candidate_task = longer_task.with_controls(control_tables)
-    score = measure_candidate(*candidate_task.texts)
+    score = CandidateScore.measure(*candidate_task.texts)
     return score.outcome is CandidateClass.SETTLED
 
 
@@ -750,7 +745,7 @@ class BenchCell(NamedTuple):
             seed: Seed of the run.
         """
         settings = build_settings(self.form, self.task, self.link, seed)
-        base = load_tuning_scenario(BASES[self.form], format_settings(settings))
+        base = TuningScenario.load(BASES[self.form], format_settings(settings))
         knowledge = ModelInformation(TASKS[self.task].gravity)
         return base.with_gains(SEARCH_SPACES[self.law], knowledge, self.tuned.gains)
 
@@ -821,7 +816,7 @@ def _load_base_text(form: str) -> str:
     Args:
         form: Kind of scenario, a key of `BASES`.
     """
-    return load_tuning_scenario(BASES[form]).scenario.text
+    return TuningScenario.load(BASES[form]).scenario.text
 
 
 def plan_bench(
@@ -943,7 +938,7 @@ def _gets_gravity(form: str, law: str) -> bool:
         law: Name of the control law.
     """
     space = SEARCH_SPACES[law]
-    scenario = load_tuning_scenario(BASES[form]).scenario
+    scenario = TuningScenario.load(BASES[form]).scenario
     least_gains = {knob.name: knob.low for knob in space.knobs}
     with_exact_gravity = space.controls(scenario, KNOWLEDGE, least_gains)
     with_wrong_gravity = space.controls(scenario, ModelInformation(0.9), least_gains)
@@ -1028,7 +1023,7 @@ def _analyse_link(link: str) -> tuple[bool, float]:
         Its mean one-way delay, in ms.
     """
     settings = format_settings({"link": dict(LINKS[link])})
-    scenario = load_tuning_scenario(BASES["two"], settings).scenario
+    scenario = TuningScenario.load(BASES["two"], settings).scenario
     first = next(iter(scenario.links.values()))
     return scenario.random, first.moments().mean_ms
 

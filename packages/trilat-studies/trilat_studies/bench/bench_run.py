@@ -60,15 +60,9 @@ from trilat_net.work import (
     open_worker_pool,
 )
 
-from ..measure_run import (
-    RecordBatch,
-    WholeRun,
-    describe_program,
-    run_whole,
-    run_whole_together,
-)
+from ..measure_run import RecordBatch, WholeRun, describe_program
 from ..side_by_side import RunKind, count_reasons, prepare_kinds
-from ..tuning.candidate import load_tuning_scenario
+from ..tuning.candidate import TuningScenario
 from .bench_plan import (
     SHORTER_REACH,
     TASKS,
@@ -139,6 +133,18 @@ class BenchRunItem(NamedTuple):
     def __str__(self) -> str:
         return f"{self.cell.name}, seed {self.seed}"
 
+    def run(self) -> BenchRun:
+        """Simulates a run of the benchmark, judges its stability, and measures its performance.
+
+        The function needs nothing but its argument. Therefore any worker process can call it.
+
+        Returns:
+            The finished run, ready for the journal. It has the judgement of its stability and
+            measured numbers such as error and effort. A run that diverged has no such numbers.
+        """
+        scenario = _build_scenario(self)
+        return _measure_item(self, scenario, WholeRun.simulate(scenario))
+
 
 class JudgedRun(NamedTuple):
     """A run of the benchmark with all of its records, and the decision whether it is stable.
@@ -175,21 +181,48 @@ class JudgedRun(NamedTuple):
         """True if the simulation ended early because an arm exceeded its safety limits."""
         return self.end.diverged_at_s is not None
 
+    @classmethod
+    def simulate(cls, scenario: Scenario, length_s: float) -> "JudgedRun":
+        """Simulates a scenario, and judges the run's stability as `trilat certify` would.
 
-def run_bench_task(item: BenchRunItem) -> BenchRun:
-    """Simulates a run of the benchmark, judges its stability, and measures its performance.
+        Args:
+            scenario: The scenario. Its own duration is ignored.
+            length_s: Duration of the run, in s.
+        """
+        scenario = msgspec.structs.replace(scenario, duration_s=length_s)
+        return _judge_records(scenario, WholeRun.simulate(scenario))
 
-    The function needs nothing but its argument. Therefore any worker process can call it.
+    def lengthen(self) -> "JudgedRun":
+        """Repeats a run over a longer time if its judgement needs more time.
 
-    Args:
-        item: The run to execute.
+        A run that is stable or settled, and whose arms are at rest at its end, is long enough.
+        Any other run must last for `TIME_CONSTANTS` of its slowest time constants.
 
-    Returns:
-        The finished run, ready for the journal. It has the judgement of its stability and
-        measured numbers such as error and effort. A run that diverged has no such numbers.
-    """
-    scenario = _build_scenario(item)
-    return _measure_item(item, scenario, run_whole(scenario))
+        Returns:
+            The longer run, or the same run if it is long enough.
+        """
+        if self.diverged:
+            return self
+        is_decided = self.stability in (Stability.STABLE, Stability.SETTLED)
+        if is_decided and self.end.behaviour is EndBehaviour.CONVERGED:
+            return self
+
+        length_s = self.scenario.duration_s
+        required_s = TIME_CONSTANTS * _find_slowest_s(self)
+        limit_s = _compute_longest_s(self.scenario)
+        longer_s = float(math.ceil(min(required_s, limit_s)))
+        longer_run = self
+        if longer_s > length_s:
+            longer_run = JudgedRun.simulate(self.scenario, longer_s)
+        if required_s <= limit_s or longer_run.diverged:
+            return longer_run
+
+        limit_text = (
+            f"ended after {longer_run.scenario.duration_s:.4g} s by the safety limit of "
+            f"{MAX_RUN_TICKS} ticks, but {TIME_CONSTANTS:g} of its slowest time constants are "
+            f"{required_s:.4g} s"
+        )
+        return longer_run._replace(text=f"{longer_run.text}; {limit_text}", at_limit=True)
 
 
 LANE_RUNS = 16
@@ -203,7 +236,7 @@ def _run_bench_tasks(items: Sequence[BenchRunItem]) -> Iterator[BenchRun]:
         items: The runs to execute.
 
     Yields:
-        The finished runs in the order of the items, equal to those of `run_bench_task`.
+        The finished runs in the order of the items, equal to those of `BenchRunItem.run`.
     """
     for first in range(0, len(items), LANE_RUNS):
         part = items[first : first + LANE_RUNS]
@@ -211,14 +244,14 @@ def _run_bench_tasks(items: Sequence[BenchRunItem]) -> Iterator[BenchRun]:
         scenarios = {n: _build_scenario(part[n]) for n in chosen}
         finished: dict[int, BenchRun] = {}
         try:
-            for index, whole, _ in run_whole_together(list(scenarios.values())):
+            for index, whole, _ in WholeRun.simulate_together(list(scenarios.values())):
                 n = chosen[index]
                 finished[n] = _measure_item(part[n], scenarios[n], whole)
         except CodeFailed:
             # One by one, the runs before the one whose code fails are kept.
             finished.clear()
         for n, item in enumerate(part):
-            yield finished[n] if n in finished else run_bench_task(item)
+            yield finished[n] if n in finished else item.run()
 
 
 def _build_scenario(item: BenchRunItem) -> Scenario:
@@ -234,7 +267,7 @@ def _build_scenario(item: BenchRunItem) -> Scenario:
 
 
 def _measure_item(item: BenchRunItem, scenario: Scenario, whole: WholeRun) -> BenchRun:
-    """Judges a run of the benchmark and measures its performance, see `run_bench_task`.
+    """Judges a run of the benchmark and measures its performance, see `BenchRunItem.run`.
 
     Args:
         item: The run.
@@ -245,7 +278,7 @@ def _measure_item(item: BenchRunItem, scenario: Scenario, whole: WholeRun) -> Be
     judged = _judge_records(scenario, whole)
     original = scenario
     if item.to_s == 0.0:
-        judged = lengthen_run(judged)
+        judged = judged.lengthen()
     else:
         original = cell.build(item.seed).scenario
 
@@ -273,19 +306,8 @@ def _measure_item(item: BenchRunItem, scenario: Scenario, whole: WholeRun) -> Be
     return run
 
 
-def judge_bench_run(scenario: Scenario, length_s: float) -> JudgedRun:
-    """Simulates a scenario, and decides whether the run is stable as `trilat certify` would.
-
-    Args:
-        scenario: The scenario. Its own duration is ignored.
-        length_s: Duration of the run, in s.
-    """
-    scenario = msgspec.structs.replace(scenario, duration_s=length_s)
-    return _judge_records(scenario, run_whole(scenario))
-
-
 def _judge_records(scenario: Scenario, whole: WholeRun) -> JudgedRun:
-    """Decides whether a simulated run is stable, see `judge_bench_run`.
+    """Decides whether a simulated run is stable, see `JudgedRun.simulate`.
 
     Args:
         scenario: Its scenario, with the duration of the run.
@@ -304,41 +326,6 @@ def _judge_records(scenario: Scenario, whole: WholeRun) -> JudgedRun:
         text="; ".join(decision.reasons) or decision.rests_on or end.text,
         rests_on=decision.rests_on,
     )
-
-
-def lengthen_run(judged: JudgedRun) -> JudgedRun:
-    """Repeats a run over a longer time if its judgement needs more time.
-
-    A run that is stable or settled, and whose arms are at rest at its end, is long enough. Any
-    other run must last for `TIME_CONSTANTS` of its slowest time constants.
-
-    Args:
-        judged: The run.
-
-    Returns:
-        The longer run, or the same run if it is long enough.
-    """
-    if judged.diverged:
-        return judged
-    is_decided = judged.stability in (Stability.STABLE, Stability.SETTLED)
-    if is_decided and judged.end.behaviour is EndBehaviour.CONVERGED:
-        return judged
-
-    length_s = judged.scenario.duration_s
-    required_s = TIME_CONSTANTS * _find_slowest_s(judged)
-    limit_s = _compute_longest_s(judged.scenario)
-    longer_s = float(math.ceil(min(required_s, limit_s)))
-    if longer_s > length_s:
-        judged = judge_bench_run(judged.scenario, longer_s)
-    if required_s <= limit_s or judged.diverged:
-        return judged
-
-    limit_text = (
-        f"ended after {judged.scenario.duration_s:.4g} s by the safety limit of "
-        f"{MAX_RUN_TICKS} ticks, but {TIME_CONSTANTS:g} of its slowest time constants are "
-        f"{required_s:.4g} s"
-    )
-    return judged._replace(text=f"{judged.text}; {limit_text}", at_limit=True)
 
 
 def _compute_longest_s(scenario: Scenario) -> float:
@@ -590,9 +577,9 @@ def _run_variant(
     """
     built = item.cell.build(item.seed)
     overrides = (*built.overrides, *format_settings(settings))
-    scenario = load_tuning_scenario(built.source, overrides).scenario
+    scenario = TuningScenario.load(built.source, overrides).scenario
     scenario = msgspec.structs.replace(scenario, duration_s=duration_s)
-    records, end, _ = run_whole(scenario)
+    records, end, _ = WholeRun.simulate(scenario)
     return None if end.diverged_at_s is not None else (scenario, records)
 
 
@@ -997,7 +984,7 @@ def _run_pending(
     with open_worker_pool(jobs, on, most=len(pending), hint=hint) as pool:
         journal.run_pending(
             pool,
-            run_bench_task,
+            BenchRunItem.run,
             pending,
             done=len(items) - len(pending),
             total=len(items),

@@ -16,8 +16,9 @@ from itertools import product
 from math import prod
 from typing import NamedTuple
 
+from trilat_net.core import describe_structure
 from trilat_net.errors import ScenarioError, count_nouns
-from trilat_net.execution import FusedRun, describe_structure
+from trilat_net.execution import FusedRun
 
 from . import sweep_cell
 from .sweep_plan import SweepPlan, spread_indices

@@ -52,10 +52,6 @@ from .stability_map import (
     PlaneAxis,
     StabilityEdge,
     StabilityMap,
-    compute_borders,
-    fill_panel,
-    find_map_edges,
-    thin_axis,
 )
 from .sweep_cell import CellClass
 
@@ -298,11 +294,11 @@ def _draw_panel(axes: Axes, plane: MapPlane, panel: MapPanel, lines: Sequence[Ma
     """
     axes.grid(visible=False)
     axes.set_facecolor(_EMPTY_COLOUR)
-    filled = fill_panel(panel) if plane.halvings else panel
+    filled = panel.fill_gaps() if plane.halvings else panel
     _draw_cells(axes, plane, filled)
     _draw_edges(axes, plane, panel.simulated)
     if plane.has_exponents and not plane.is_linear:
-        _draw_edges(axes, plane, find_map_edges(plane, panel))
+        _draw_edges(axes, plane, plane.find_edges(panel))
     _hatch_undecided(axes, plane, filled)
     for line in lines:
         _draw_line(axes, plane, line)
@@ -338,8 +334,8 @@ def _draw_cells(axes: Axes, plane: MapPlane, panel: MapPanel) -> None:
         norm = BoundaryNorm(class_borders, count)
         colours = {"cmap": palette, "norm": norm}
 
-    x = compute_borders(plane.x)
-    y = compute_borders(plane.y)
+    x = plane.x.compute_borders()
+    y = plane.y.compute_borders()
     axes.pcolormesh(x, y, values, rasterized=True, **colours)
 
 
@@ -353,8 +349,8 @@ def _hatch_undecided(axes: Axes, plane: MapPlane, panel: MapPanel) -> None:
         plane: Axes of the map.
         panel: Results of the panel.
     """
-    x = compute_borders(plane.x)
-    y = compute_borders(plane.y)
+    x = plane.x.compute_borders()
+    y = plane.y.compute_borders()
     undecided_rows = _find_undecided(plane, panel)
     for row, undecided in enumerate(undecided_rows):
         bottom = y[row]
@@ -460,7 +456,7 @@ def _extend_positions(axis: PlaneAxis) -> Array:
 
     A line that is known at the first and the last value is thereby drawn up to the border.
     """
-    borders = compute_borders(axis)
+    borders = axis.compute_borders()
     first_border = borders[:1]
     last_border = borders[-1:]
     return np.concatenate([first_border, axis.positions, last_border])
@@ -527,8 +523,8 @@ def _set_scale(axes: Axes, plane: MapPlane) -> None:
         axes: The panel in the figure.
         plane: The measured part of the map. With a single axis, the vertical one has no ticks.
     """
-    x = compute_borders(plane.x)
-    y = compute_borders(plane.y)
+    x = plane.x.compute_borders()
+    y = plane.y.compute_borders()
     axes.set_xlim(x[0], x[-1])
     axes.set_ylim(y[0], y[-1])
     _set_ticks(axes.xaxis, plane.x)
@@ -562,7 +558,9 @@ def _find_exponent_limit(plane: MapPlane) -> float:
     so that a few large exponents do not make all others pale.
     """
     # The cells that ran in a refined sweep lie along the edge, where exponents are small.
-    panels = map(fill_panel, plane.panels) if plane.halvings else plane.panels
+    panels = plane.panels
+    if plane.halvings:
+        panels = tuple(panel.fill_gaps() for panel in panels)
     exponents = [panel.exponents_per_s.ravel() for panel in panels]
     magnitudes = np.abs(np.concatenate(exponents))
     quantile = float(np.nanquantile(magnitudes, 0.8))
@@ -662,7 +660,7 @@ def _draw_legend(figure: Figure, plane: MapPlane, lines: Sequence[Sequence[MapLi
     if any(panel.simulated for panel in plane.panels):
         handles.append(Line2D([], [], label=_SIMULATED_EDGE, **_VERDICT_EDGE))
     if plane.has_exponents:
-        has_edges = any(find_map_edges(plane, panel) for panel in plane.panels)
+        has_edges = any(plane.find_edges(panel) for panel in plane.panels)
         if has_edges and not plane.is_linear:
             handles.append(Line2D([], [], label=_VERDICTS_EDGE, **_VERDICT_EDGE))
     elif plane.seeds == 1:
@@ -867,7 +865,7 @@ def tabulate_edges(plane: MapPlane, panel: MapPanel, lines: Sequence[MapLine]) -
     for line in theory:
         heads += [line.text, "difference"]
 
-    verdict_edges = find_map_edges(plane, panel)
+    verdict_edges = plane.find_edges(panel)
     edges = verdict_edges
     if plane.has_exponents:
         edges = []
@@ -877,7 +875,7 @@ def tabulate_edges(plane: MapPlane, panel: MapPanel, lines: Sequence[MapLine]) -
                 edges += _list_crossings(line, plane)
 
     rows = []
-    columns = thin_axis(plane.x, plane.halvings).values
+    columns = plane.x.thin_out(plane.halvings).values
     for x, edge in edges:
         if x not in columns:
             continue

@@ -33,15 +33,8 @@ from trilat_net.work import Progress, Workers, ignore_progress, open_worker_pool
 
 from . import sweep_cell
 from .fixed_gains import FAIR_COMPARISON, describe_fixed_gains
-from .stability_map import StabilityEdge, evaluate_criterion, find_criterion_edge
-from .sweep_plan import (
-    SweepCell,
-    SweepPlan,
-    build_sweep_command,
-    format_override,
-    format_override_value,
-    label_axis,
-)
+from .stability_map import StabilityCriterion, StabilityEdge, find_criterion_edge
+from .sweep_plan import SweepCell, SweepPlan, format_override, format_override_value, label_axis
 
 SCAN_POINTS = 9
 """Number of values of the scan. It detects islands of stability that are wider than an eighth
@@ -77,59 +70,62 @@ class KeyMargin(NamedTuple):
     undecided: int
     runs: int
 
+    @classmethod
+    def search(
+        cls,
+        stable: StabilityTest,
+        low: float,
+        high: float,
+        tolerance: float = MARGIN_TOLERANCE,
+        *,
+        whole: bool = False,
+    ) -> "KeyMargin":
+        """Searches the limits of stability between two values of a scenario key.
 
-def search_key_margin(
-    stable: StabilityTest,
-    low: float,
-    high: float,
-    tolerance: float = MARGIN_TOLERANCE,
-    *,
-    whole: bool = False,
-) -> KeyMargin:
-    """Searches the limits of stability between two values of a scenario key.
+        The function runs a number of evenly spaced values, and then narrows each interval in
+        which stability changes by bisection.
 
-    The function runs a number of evenly spaced values, and then narrows each interval in which
-    stability changes by bisection.
+        Args:
+            stable: Function that runs the scenario at a value of the key. It returns True if
+                the run is stable, False if it is not stable, and None if it is undecided.
+            low: Lower end of the range.
+            high: Upper end of the range.
+            tolerance: Width of an interval, as a fraction of the value, at which the bisection
+                stops.
+            whole: True if the key accepts only whole numbers.
 
-    Args:
-        stable: Function that runs the scenario at a value of the key. It returns True if the
-            run is stable, False if it is not stable, and None if it is undecided.
-        low: Lower end of the range.
-        high: Upper end of the range.
-        tolerance: Width of an interval, as a fraction of the value, at which the bisection
-            stops.
-        whole: True if the key accepts only whole numbers.
-
-    Returns:
-        The intervals that contain the limits. If there are none, the result states whether all
-        values are stable.
-    """
-    results: dict[float, bool | None] = {}
-
-    def classify(value: float) -> bool | None:
-        """Returns whether the scenario is stable at a value of the searched parameter.
-
-        Scan and bisection may come to the same value. It is simulated once, and the result is
-        kept. None means that the run is undecided.
+        Returns:
+            The intervals that contain the limits. If there are none, the result states whether
+            all values are stable.
         """
-        if value not in results:
-            results[value] = stable(value)
-        return results[value]
+        results: dict[float, bool | None] = {}
 
-    scanned_values = np.linspace(low, high, SCAN_POINTS)
-    if whole:
-        scanned_values = np.round(scanned_values)
-    values = list(dict.fromkeys(scanned_values.tolist()))
-    decided = [value for value in values if classify(value) is not None]
+        def classify(value: float) -> bool | None:
+            """Returns whether the scenario is stable at a value of the searched parameter.
 
-    spans = list[StabilityEdge]()
-    for below, above in pairwise(decided):
-        if results[below] != results[above]:
-            spans.append(_narrow_edge(classify, below, above, tolerance=tolerance, whole=whole))
+            Scan and bisection may come to the same value. It is simulated once, and the result
+            is kept. None means that the run is undecided.
+            """
+            if value not in results:
+                results[value] = stable(value)
+            return results[value]
 
-    stable_everywhere = results[decided[0]] if decided and not spans else None
-    undecided = sum(result is None for result in results.values())
-    return KeyMargin(tuple(spans), stable_everywhere, undecided, len(results))
+        scanned_values = np.linspace(low, high, SCAN_POINTS)
+        if whole:
+            scanned_values = np.round(scanned_values)
+        values = list(dict.fromkeys(scanned_values.tolist()))
+        decided = [value for value in values if classify(value) is not None]
+
+        spans = list[StabilityEdge]()
+        for below, above in pairwise(decided):
+            if results[below] != results[above]:
+                spans.append(
+                    _narrow_edge(classify, below, above, tolerance=tolerance, whole=whole)
+                )
+
+        stable_everywhere = results[decided[0]] if decided and not spans else None
+        undecided = sum(result is None for result in results.values())
+        return cls(tuple(spans), stable_everywhere, undecided, len(results))
 
 
 def _narrow_edge(
@@ -207,6 +203,19 @@ class SearchRange(NamedTuple):
     low: float
     high: float
     tolerance: float
+
+    def format_axis(self) -> str:
+        """Returns the text of a sweep axis with two values: the ends of the searched range.
+
+        If a sweep is planned with this axis, the scenario is checked at both ends before any
+        run.
+
+        Returns:
+            The text, as in "control.d=1,20".
+        """
+        low = format_override_value(self.low)
+        high = format_override_value(self.high)
+        return f"{self.key}={low},{high}"
 
 
 class _MarginItem(NamedTuple):
@@ -288,22 +297,6 @@ def parse_search_range(text: str, tolerance: float = MARGIN_TOLERANCE) -> Search
     return search_range
 
 
-def format_range_axis(search_range: SearchRange) -> str:
-    """Returns the text of a sweep axis with two values: the ends of the searched range.
-
-    If a sweep is planned with this axis, the scenario is checked at both ends before any run.
-
-    Args:
-        search_range: Scenario key along which limits of stability are searched, and its range.
-
-    Returns:
-        The text, as in "control.d=1,20".
-    """
-    low = format_override_value(search_range.low)
-    high = format_override_value(search_range.high)
-    return f"{search_range.key}={low},{high}"
-
-
 def search_margins(
     plan: SweepPlan,
     within: SearchRange,
@@ -318,7 +311,7 @@ def search_margins(
 
     Args:
         plan: The sweep. Its last axis must be the searched key with two values, the ends of the
-            range, as from `format_range_axis`.
+            range, as from `SearchRange.format_axis`.
         within: The searched key and its range.
         jobs: Number of worker processes. None uses all cores.
         progress: Function that is called with the number of finished grid points and of all
@@ -396,8 +389,10 @@ def _search_margin_task(task: _MarginItem) -> GridPointMargin:
         load(low + (high - low) / 3.0**0.5)  # an irrational number, never a whole one
     except ScenarioError:
         whole = True  # the key takes whole numbers only
-    margin = search_key_margin(is_stable, low, high, tolerance, whole=whole)
-    closed = find_criterion_edge(lambda value: evaluate_criterion(load(value)), low, high)
+    margin = KeyMargin.search(is_stable, low, high, tolerance, whole=whole)
+    closed = find_criterion_edge(
+        lambda value: StabilityCriterion.evaluate(load(value)), low, high
+    )
     linear, remark = find_root_crossings(load(high), key, low, high)
     return GridPointMargin(
         cell=task.cell,
@@ -446,7 +441,7 @@ class SweepMargins(Result):
         tolerance = format_override_value(self.within.tolerance)
         search_range = f"{self.within.key}={low}:{high}"
         plan = self.plan._replace(axes=self.plan.axes[:-1])
-        return build_sweep_command(plan, "--margin", search_range, "--tolerance", tolerance)
+        return plan.build_command("--margin", search_range, "--tolerance", tolerance)
 
     def table(self) -> TextTable:
         """Returns a table of the limits of stability along the searched key, one row per limit.

@@ -97,6 +97,80 @@ class PlaneAxis(NamedTuple):
             return np.array(self.values)
         return np.arange(len(self.values), dtype=np.float64)
 
+    def compute_borders(self) -> Array:
+        """Returns the borders of a map's cells along an axis, halfway between the swept values.
+
+        If all values are at least zero, so are the borders: a delay of -100 ms does not exist.
+
+        Returns:
+            Positions, shape (n + 1,) for n values.
+        """
+        positions = self.positions
+        first = positions[0]
+        if len(positions) == 1:
+            return np.array([first - 0.5, first + 0.5])
+        outer = positions[[0, -1]]
+        inner = positions[[1, -2]]
+        ends = 1.5 * outer - 0.5 * inner
+        middles = 0.5 * (positions[1:] + positions[:-1])
+        borders: Array = np.concatenate([ends[:1], middles, ends[1:]])
+        if self.is_evenly_spaced and first >= 0.0:
+            return np.maximum(borders, 0.0)
+        return borders
+
+    def refine_columns(self) -> "_FineColumns":
+        """Returns x values for lines from theory, more finely spaced than those of the map.
+
+        The intervals between the columns are divided, unless there are many columns already. If
+        the values are equally spaced, values beside the outer columns let lines reach the
+        borders of the map.
+        """
+        values = np.array(self.values)
+        positions = self.positions
+        intervals = len(values) - 1
+        steps_per_interval = max(1, round(_FINE_COLUMNS / max(intervals, 1)))
+        if intervals < 1 or steps_per_interval == 1:
+            return _keep_columns(self)
+
+        indices = np.arange(intervals * steps_per_interval + 1) / steps_per_interval
+        fine_values = np.interp(indices, np.arange(len(values)), values)
+        fine_positions = np.interp(indices, np.arange(len(values)), positions)
+
+        # Interpolation would round the values of the grid.
+        fine_values[::steps_per_interval] = values
+        on_grid = np.arange(len(values)) * steps_per_interval
+
+        # The first and last cells extend past their values, so the lines do too.
+        if self.is_evenly_spaced:
+            borders = self.compute_borders()
+            # The borders are half a cell away.
+            half_cell_steps = max(1, steps_per_interval // 2)
+            left_of_map = np.linspace(borders[0], values[0], half_cell_steps, endpoint=False)
+            right_of_map = np.linspace(borders[-1], values[-1], half_cell_steps, endpoint=False)
+            right_of_map = right_of_map[::-1]
+            left_of_map = left_of_map[left_of_map < values[0]]
+            fine_values = np.concatenate([left_of_map, fine_values, right_of_map])
+            fine_positions = np.concatenate([left_of_map, fine_positions, right_of_map])
+            on_grid = on_grid + len(left_of_map)
+
+        return _FineColumns(
+            tuple(fine_values.tolist()), tuple(fine_positions.tolist()), tuple(on_grid.tolist())
+        )
+
+    def thin_out(self, halvings: int) -> "PlaneAxis":
+        """Returns the values of an axis that belong to the coarse grid of a refined sweep.
+
+        Such a sweep begins with this grid, and then halves it along the edge of stability.
+
+        Args:
+            halvings: Number of halvings of the refined sweep. 0 returns the whole axis.
+        """
+        stride = 2**halvings
+        last = len(self.values) - 1
+        # the last value is kept even if no whole number of strides leads to it
+        indices = [*range(0, last, stride), last]
+        return self._replace(values=tuple(self.values[n] for n in indices))
+
 
 class MapPanel(NamedTuple):
     """One panel of a stability map: a grid of runs over the two drawn axes.
@@ -162,6 +236,41 @@ class MapPanel(NamedTuple):
         np.divide(stable, decided, out=share, where=decided > 0)
         return share
 
+    def fill_gaps(self) -> "MapPanel":
+        """Fills the grid points that a refined sweep did not run, so that a map can be drawn.
+
+        Such a point gets the class of the nearest point that was run. Growth exponents are
+        interpolated linearly between the grid points that have one.
+        """
+        from scipy.interpolate import griddata
+        from scipy.ndimage import distance_transform_edt
+
+        def find_nearest(is_missing: Any) -> Any:
+            """Returns for each grid point the indices of the nearest point with a result."""
+            return distance_transform_edt(
+                is_missing, return_distances=False, return_indices=True
+            )
+
+        if not self.runs.any():
+            return self
+        rows, columns = find_nearest(self.runs == 0)
+        exponents_per_s = self.exponents_per_s
+        if np.isfinite(exponents_per_s).any():
+            known_points = np.argwhere(np.isfinite(exponents_per_s))
+            all_points = np.indices(exponents_per_s.shape).reshape(2, -1).T
+            nearest = find_nearest(np.isnan(exponents_per_s))
+            filled = exponents_per_s[tuple(nearest)]
+            # points on one line span no area in which to interpolate
+            has_area = min(np.ptp(known_points, axis=0)) > 0
+            if has_area:
+                values = exponents_per_s[tuple(known_points.T)]
+                interpolated = griddata(known_points, values, all_points).reshape(
+                    exponents_per_s.shape
+                )
+                filled = np.where(np.isfinite(interpolated), interpolated, filled)
+            exponents_per_s = filled
+        return self._replace(counts=self.counts[rows, columns], exponents_per_s=exponents_per_s)
+
 
 class MapPlane(NamedTuple):
     """Results of the simulations in a stability map: panels over the same two parameters.
@@ -205,118 +314,117 @@ class MapPlane(NamedTuple):
         """
         return max(int(panel.runs.max()) for panel in self.panels)
 
+    def find_edges(self, panel: MapPanel) -> "list[tuple[float, StabilityEdge]]":
+        """Finds the measured limits of stability along the vertical axis of a stability map.
 
-def fill_panel(panel: MapPanel) -> MapPanel:
-    """Fills the grid points that a refined sweep did not run, so that a map can be drawn.
+        In each column, which is a value of x, the grid points are compared in the order of y. A
+        limit lies between two grid points if the majority of the runs is stable at one of them
+        and not stable at the other. Grid points without a majority are skipped.
 
-    Such a point gets the class of the nearest point that was run. Growth exponents are
-    interpolated linearly between the grid points that have one.
+        Args:
+            panel: Part of the map with the counts of stable runs at each grid point.
 
-    Args:
-        panel: Panel of the map of a refined sweep.
-    """
-    from scipy.interpolate import griddata
-    from scipy.ndimage import distance_transform_edt
+        Returns:
+            Pairs of the x value of a column and an interval of y that contains a limit. The
+            limits of a column are in rising order.
+        """
+        edges = []
+        y = self.y.values
+        for x, stable_share in zip(self.x.values, panel.share.T, strict=True):
+            is_decided = np.isfinite(stable_share) & (stable_share != 0.5)
+            decided = np.flatnonzero(is_decided)
+            is_stable = stable_share[decided] > 0.5
 
-    def find_nearest(is_missing: Any) -> Any:
-        """Returns for each grid point the indices of the nearest point with a result."""
-        return distance_transform_edt(is_missing, return_distances=False, return_indices=True)
+            # Compare each decided grid point with the next decided one.
+            is_change = is_stable[1:] != is_stable[:-1]
+            for position in np.flatnonzero(is_change):
+                lower_index, upper_index = decided[position : position + 2].tolist()
+                # The edge is sharp if no undecided grid point lies between.
+                edge = StabilityEdge(
+                    low=y[lower_index],
+                    high=y[upper_index],
+                    stable_below=bool(is_stable[position]),
+                    sharp=upper_index == lower_index + 1,
+                )
+                edges.append((x, edge))
+        return edges
 
-    if not panel.runs.any():
-        return panel
-    rows, columns = find_nearest(panel.runs == 0)
-    exponents_per_s = panel.exponents_per_s
-    if np.isfinite(exponents_per_s).any():
-        known_points = np.argwhere(np.isfinite(exponents_per_s))
-        all_points = np.indices(exponents_per_s.shape).reshape(2, -1).T
-        nearest = find_nearest(np.isnan(exponents_per_s))
-        filled = exponents_per_s[tuple(nearest)]
-        # points on one line span no area in which to interpolate
-        has_area = min(np.ptp(known_points, axis=0)) > 0
-        if has_area:
-            values = exponents_per_s[tuple(known_points.T)]
-            interpolated = griddata(known_points, values, all_points).reshape(
-                exponents_per_s.shape
-            )
-            filled = np.where(np.isfinite(interpolated), interpolated, filled)
-        exponents_per_s = filled
-    return panel._replace(counts=panel.counts[rows, columns], exponents_per_s=exponents_per_s)
+    @classmethod
+    def arrange_rows(
+        cls,
+        rows: Sequence[Mapping[str, Any]],
+        axes: Sequence[str],
+        scenario: Scenario,
+        grid: Mapping[str, Sequence[Any]] | None = None,
+    ) -> "MapPlane":
+        """Arranges the runs of a sweep for a map over two of the swept parameters.
 
+        The axes are the first two swept keys with numeric values. Each combination of the other
+        keys gets a panel of its own. Rows are read one after the other, so that they need not
+        fit into memory.
 
-def build_plane(
-    rows: Sequence[Mapping[str, Any]],
-    axes: Sequence[str],
-    scenario: Scenario,
-    grid: Mapping[str, Sequence[Any]] | None = None,
-) -> MapPlane:
-    """Arranges the runs of a sweep for a map over two of the swept parameters.
+        Args:
+            rows: One mapping per run. It has a value for each swept key, the result of the run
+                under the key "verdict", such as "converged", and possibly the rate at which a
+                disturbance grows under "exponent_per_s".
+            axes: The swept keys, in the order of the sweep. The key "law" stands for the
+                control law, if several laws were swept.
+            scenario: The swept scenario, from which the labels are taken.
+            grid: All values of each swept key. None collects them from the rows.
 
-    The axes are the first two swept keys with numeric values. Each combination of the other
-    keys gets a panel of its own. Rows are read one after the other, so that they need not fit
-    into memory.
+        Returns:
+            The axes and the panels.
 
-    Args:
-        rows: One mapping per run. It has a value for each swept key, the result of the run
-            under the key "verdict", such as "converged", and possibly the rate at which a
-            disturbance grows under "exponent_per_s".
-        axes: The swept keys, in the order of the sweep. The key "law" stands for the control
-            law, if several laws were swept.
-        scenario: The swept scenario, from which the labels are taken.
-        grid: All values of each swept key. None collects them from the rows.
-
-    Returns:
-        The axes and the panels.
-
-    Raises:
-        UsageError: There are no runs, no key is numeric, or there would be more than
-            `MAX_PANELS` panels.
-    """
-    if not rows:
-        raise UsageError("no cell has run: there is nothing to draw")
-    if grid is None:
-        grid = {key: list(dict.fromkeys(row[key] for row in rows)) for key in axes}
-    numeric_keys = [key for key in axes if all(map(is_number, grid[key]))]
-    drawn_keys = numeric_keys[:2]
-    if not drawn_keys:
-        raise UsageError(
-            "a map needs a numeric axis, but these axes have values that are not numbers: "
-            f"{', '.join(axes)}"
-        )
-
-    plane_axes = []
-    for key in drawn_keys:
-        axis_values = tuple(sorted(grid[key]))
-        label = label_axis(key, scenario)
-        plane_axes.append(PlaneAxis(key, axis_values, label))
-    if len(plane_axes) == 1:
-        no_axis = PlaneAxis("", (0.0,), "")
-        plane_axes.append(no_axis)
-    x, y = plane_axes
-
-    other_keys = [key for key in axes if key not in drawn_keys]
-    panel_keys = [key for key in other_keys if len(grid[key]) > 1]
-    runs_of_panel: dict[PanelSettings, _PanelRuns] = {}
-    refused = 0
-    for row in rows:
-        settings = tuple((key, row[key]) for key in panel_keys)
-        if settings not in runs_of_panel and len(runs_of_panel) == MAX_PANELS:
-            count = math.prod(len(grid[key]) for key in panel_keys)
+        Raises:
+            UsageError: There are no runs, no key is numeric, or there would be more than
+                `MAX_PANELS` panels.
+        """
+        if not rows:
+            raise UsageError("no cell has run: there is nothing to draw")
+        if grid is None:
+            grid = {key: list(dict.fromkeys(row[key] for row in rows)) for key in axes}
+        numeric_keys = [key for key in axes if all(map(is_number, grid[key]))]
+        drawn_keys = numeric_keys[:2]
+        if not drawn_keys:
             raise UsageError(
-                f"a map has at most {MAX_PANELS} panels, but {', '.join(panel_keys)} would "
-                f"give {count}: sweep fewer values of the axes that are not drawn"
+                "a map needs a numeric axis, but these axes have values that are not numbers: "
+                f"{', '.join(axes)}"
             )
-        if settings not in runs_of_panel:
-            runs_of_panel[settings] = _PanelRuns(x, y)
-        if row["verdict"] == CellClass.REFUSED:
-            refused += 1
-        else:
-            runs_of_panel[settings].add(row)
 
-    panels = []
-    for settings, runs in runs_of_panel.items():
-        title = _format_panel_title(settings, scenario)
-        panels.append(MapPanel(title, settings, runs.counts, runs.compute_exponents()))
-    return MapPlane(scenario.name, x, y, tuple(panels), refused=refused)
+        plane_axes = []
+        for key in drawn_keys:
+            axis_values = tuple(sorted(grid[key]))
+            label = label_axis(key, scenario)
+            plane_axes.append(PlaneAxis(key, axis_values, label))
+        if len(plane_axes) == 1:
+            no_axis = PlaneAxis("", (0.0,), "")
+            plane_axes.append(no_axis)
+        x, y = plane_axes
+
+        other_keys = [key for key in axes if key not in drawn_keys]
+        panel_keys = [key for key in other_keys if len(grid[key]) > 1]
+        runs_of_panel: dict[PanelSettings, _PanelRuns] = {}
+        refused = 0
+        for row in rows:
+            settings = tuple((key, row[key]) for key in panel_keys)
+            if settings not in runs_of_panel and len(runs_of_panel) == MAX_PANELS:
+                count = math.prod(len(grid[key]) for key in panel_keys)
+                raise UsageError(
+                    f"a map has at most {MAX_PANELS} panels, but {', '.join(panel_keys)} would "
+                    f"give {count}: sweep fewer values of the axes that are not drawn"
+                )
+            if settings not in runs_of_panel:
+                runs_of_panel[settings] = _PanelRuns(x, y)
+            if row["verdict"] == CellClass.REFUSED:
+                refused += 1
+            else:
+                runs_of_panel[settings].add(row)
+
+        panels = []
+        for settings, runs in runs_of_panel.items():
+            title = _format_panel_title(settings, scenario)
+            panels.append(MapPanel(title, settings, runs.counts, runs.compute_exponents()))
+        return cls(scenario.name, x, y, tuple(panels), refused=refused)
 
 
 class _PanelRuns:
@@ -345,7 +453,7 @@ class _PanelRuns:
         """Counts a finished simulation at its grid point of the map.
 
         Args:
-            run: A row for `build_plane`.
+            run: A row for `MapPlane.arrange_rows`.
         """
         row = self._row_of_y[run[self._y_key]] if self._y_key else 0
         column = self._column_of_x[run[self._x_key]]
@@ -413,42 +521,6 @@ class StabilityEdge(NamedTuple):
         return 0.5 * (self.low + self.high)
 
 
-def find_map_edges(plane: MapPlane, panel: MapPanel) -> list[tuple[float, StabilityEdge]]:
-    """Finds the measured limits of stability along the vertical axis of a stability map.
-
-    In each column, which is a value of x, the grid points are compared in the order of y. A
-    limit lies between two grid points if the majority of the runs is stable at one of them and
-    not stable at the other. Grid points without a majority are skipped.
-
-    Args:
-        plane: The two axes of the map.
-        panel: Part of the map with the counts of stable runs at each grid point.
-
-    Returns:
-        Pairs of the x value of a column and an interval of y that contains a limit. The limits
-        of a column are in rising order.
-    """
-    edges = []
-    y = plane.y.values
-    for x, stable_share in zip(plane.x.values, panel.share.T, strict=True):
-        is_decided = np.isfinite(stable_share) & (stable_share != 0.5)
-        decided = np.flatnonzero(is_decided)
-        is_stable = stable_share[decided] > 0.5
-
-        # Compare each decided grid point with the next decided one.
-        is_change = is_stable[1:] != is_stable[:-1]
-        for position in np.flatnonzero(is_change):
-            lower_index, upper_index = decided[position : position + 2].tolist()
-            edge = StabilityEdge(
-                low=y[lower_index],
-                high=y[upper_index],
-                stable_below=bool(is_stable[position]),
-                sharp=upper_index == lower_index + 1,  # no undecided grid point lies between
-            )
-            edges.append((x, edge))
-    return edges
-
-
 _GRAVITY = slice(3, 5)
 """Indices of the arm parameters of Eq. (24) that appear in the gravity torque."""
 _ROUNDING = 1e-6
@@ -474,34 +546,34 @@ class StabilityCriterion(NamedTuple):
     source: str
     excess: float
 
+    @classmethod
+    def evaluate(cls, scenario: Scenario) -> "StabilityCriterion | None":
+        """Evaluates for a scenario the stability condition in closed form that applies to it.
 
-def evaluate_criterion(scenario: Scenario) -> StabilityCriterion | None:
-    """Evaluates for a scenario the stability condition in closed form that applies to it.
+        For example, equal arms under the law P+d are stable if the damping exceeds a certain
+        multiple of the stiffness times the delay. A map shows where the condition is just met,
+        beside the measured edge.
 
-    For example, equal arms under the law P+d are stable if the damping exceeds a certain
-    multiple of the stiffness times the delay. A map shows where the condition is just met,
-    beside the measured edge.
+        Args:
+            scenario: The scenario to which the condition is applied.
 
-    Args:
-        scenario: The scenario to which the condition is applied.
+        Returns:
+            The condition. None if the scenario violates a hypothesis of every known condition,
+            for example because it changes while it runs, or because a site stops following a
+            peer whose samples are too old.
+        """
+        stops_following = any(spec.on_stale.action != "use" for spec in scenario.sites.values())
+        if scenario.timeline or stops_following:
+            return None
+        if any(arm.shares_pose for arm in scenario.arms.values()):
+            return None
 
-    Returns:
-        The condition. None if the scenario violates a hypothesis of every known condition, for
-        example because it changes while it runs, or because a site stops following a peer
-        whose samples are too old.
-    """
-    stops_following = any(spec.on_stale.action != "use" for spec in scenario.sites.values())
-    if scenario.timeline or stops_following:
-        return None
-    if any(arm.shares_pose for arm in scenario.arms.values()):
-        return None
-
-    criterion = _evaluate_damping_criterion(scenario)
-    if criterion is not None:
-        return criterion
-    if any(arm.chain is not None for arm in scenario.arms.values()):
-        return None  # the other criterion holds only for the planar arm with two joints
-    return _evaluate_sampling_criterion(scenario)
+        criterion = _evaluate_damping_criterion(scenario)
+        if criterion is not None:
+            return criterion
+        if any(arm.chain is not None for arm in scenario.arms.values()):
+            return None  # the other criterion holds only for the planar arm with two joints
+        return _evaluate_sampling_criterion(scenario)
 
 
 def _evaluate_damping_criterion(scenario: Scenario) -> StabilityCriterion | None:
@@ -811,28 +883,6 @@ _ABOUT_ROOTS = "where the rightmost root of the linearised loop crosses the imag
 """Explanation of this line on the page of the map."""
 
 
-def compute_borders(axis: PlaneAxis) -> Array:
-    """Returns the borders of a map's cells along an axis, halfway between the swept values.
-
-    If all values are at least zero, so are the borders: a delay of -100 ms does not exist.
-
-    Returns:
-        Positions, shape (n + 1,) for n values.
-    """
-    positions = axis.positions
-    first = positions[0]
-    if len(positions) == 1:
-        return np.array([first - 0.5, first + 0.5])
-    outer = positions[[0, -1]]
-    inner = positions[[1, -2]]
-    ends = 1.5 * outer - 0.5 * inner
-    middles = 0.5 * (positions[1:] + positions[:-1])
-    borders: Array = np.concatenate([ends[:1], middles, ends[1:]])
-    if axis.is_evenly_spaced and first >= 0.0:
-        return np.maximum(borders, 0.0)
-    return borders
-
-
 _NO_COLUMNS: Array = np.zeros((0, 0))
 _FINE_COLUMNS = 24
 """Least number of steps along x with which a line from theory is drawn."""
@@ -863,48 +913,6 @@ def _keep_columns(axis: PlaneAxis) -> _FineColumns:
     """
     count = len(axis.values)
     return _FineColumns(axis.values, tuple(axis.positions.tolist()), tuple(range(count)))
-
-
-def refine_columns(axis: PlaneAxis) -> _FineColumns:
-    """Returns x values for lines from theory, more finely spaced than those of the map.
-
-    The intervals between the columns are divided, unless there are many columns already. If the
-    values are equally spaced, values beside the outer columns let lines reach the borders of
-    the map.
-
-    Args:
-        axis: Horizontal axis of the map.
-    """
-    values = np.array(axis.values)
-    positions = axis.positions
-    intervals = len(values) - 1
-    steps_per_interval = max(1, round(_FINE_COLUMNS / max(intervals, 1)))
-    if intervals < 1 or steps_per_interval == 1:
-        return _keep_columns(axis)
-
-    indices = np.arange(intervals * steps_per_interval + 1) / steps_per_interval
-    fine_values = np.interp(indices, np.arange(len(values)), values)
-    fine_positions = np.interp(indices, np.arange(len(values)), positions)
-
-    # Interpolation would round the values of the grid.
-    fine_values[::steps_per_interval] = values
-    on_grid = np.arange(len(values)) * steps_per_interval
-
-    # The first and last cells extend past their values, so the lines do too.
-    if axis.is_evenly_spaced:
-        borders = compute_borders(axis)
-        half_cell_steps = max(1, steps_per_interval // 2)  # the borders are half a cell away
-        left_of_map = np.linspace(borders[0], values[0], half_cell_steps, endpoint=False)
-        right_of_map = np.linspace(borders[-1], values[-1], half_cell_steps, endpoint=False)
-        right_of_map = right_of_map[::-1]
-        left_of_map = left_of_map[left_of_map < values[0]]
-        fine_values = np.concatenate([left_of_map, fine_values, right_of_map])
-        fine_positions = np.concatenate([left_of_map, fine_positions, right_of_map])
-        on_grid = on_grid + len(left_of_map)
-
-    return _FineColumns(
-        tuple(fine_values.tolist()), tuple(fine_positions.tolist()), tuple(on_grid.tolist())
-    )
 
 
 class MapLine(NamedTuple):
@@ -1000,6 +1008,61 @@ class MapLine(NamedTuple):
             crossings.append(crossing)
         return crossings
 
+    @classmethod
+    def trace_closed_form(
+        cls, load: PanelLoader, x: PlaneAxis, y: PlaneAxis
+    ) -> "MapLine | None":
+        """Finds the line on a map on which a closed-form stability condition is just met.
+
+        The condition comes from theory, see `StabilityCriterion`. Where it changes between two
+        grid points with the same x, the crossing in y is located with Brent's method, because
+        the condition may be nonlinear.
+
+        Args:
+            load: Function that returns the scenario at values of x and y.
+            x: Horizontal axis of the map.
+            y: Vertical axis of the map.
+
+        Returns:
+            The line. None if no condition is known for the scenario, or if the line does not
+            cross the map.
+        """
+        first_criterion: StabilityCriterion | None = None
+        columns = []
+        for x_value in x.values:
+
+            def evaluate(y_value: float, x_value: float = x_value) -> StabilityCriterion | None:
+                scenario = load(x_value, y_value)
+                return StabilityCriterion.evaluate(scenario)
+
+            criteria = [evaluate(y_value) for y_value in y.values]
+            applicable = [criterion for criterion in criteria if criterion is not None]
+            if first_criterion is None and applicable:
+                first_criterion = applicable[0]
+            excess = []
+            for criterion in criteria:
+                value = np.nan if criterion is None else criterion.excess
+                excess.append(value)
+            edges: dict[int, float] = {}
+            for n in _find_sign_changes(excess):
+                edge = find_criterion_edge(evaluate, y.values[n], y.values[n + 1])
+                if edge is not None:
+                    edges[n] = edge
+            column = _place_zeros(y.values, excess, edges)
+            columns.append(column)
+        if first_criterion is None:
+            return None
+
+        # Labels and source are the same in the whole panel; take those of the first criterion.
+        line = cls(
+            label=first_criterion.symbol,
+            text=first_criterion.text,
+            about=first_criterion.source,
+            excess=np.array(columns).T,
+            rank=0,
+        )
+        return line if line.crosses_map else None
+
 
 ZERO_EXPONENT = "exponent = 0"
 """Name of the measured line of zero growth exponents."""
@@ -1033,59 +1096,6 @@ def _trace_zero_exponent(plane: MapPlane, panel: MapPanel) -> MapLine | None:
         about=_ABOUT_ROOTS if plane.is_linear else _ABOUT_TWINS,
         excess=-panel.exponents_per_s,
         rank=-1,
-    )
-    return line if line.crosses_map else None
-
-
-def trace_closed_form(load: PanelLoader, x: PlaneAxis, y: PlaneAxis) -> MapLine | None:
-    """Finds the line on a map on which a closed-form stability condition is just met.
-
-    The condition comes from theory, see `evaluate_criterion`. Where it changes between two grid
-    points with the same x, the crossing in y is located with Brent's method, because the
-    condition may be nonlinear.
-
-    Args:
-        load: Function that returns the scenario at values of x and y.
-        x: Horizontal axis of the map.
-        y: Vertical axis of the map.
-
-    Returns:
-        The line. None if no condition is known for the scenario, or if the line does not cross
-        the map.
-    """
-    first_criterion: StabilityCriterion | None = None
-    columns = []
-    for x_value in x.values:
-
-        def evaluate(y_value: float, x_value: float = x_value) -> StabilityCriterion | None:
-            scenario = load(x_value, y_value)
-            return evaluate_criterion(scenario)
-
-        criteria = [evaluate(y_value) for y_value in y.values]
-        applicable = [criterion for criterion in criteria if criterion is not None]
-        if first_criterion is None and applicable:
-            first_criterion = applicable[0]
-        excess = []
-        for criterion in criteria:
-            value = np.nan if criterion is None else criterion.excess
-            excess.append(value)
-        edges: dict[int, float] = {}
-        for n in _find_sign_changes(excess):
-            edge = find_criterion_edge(evaluate, y.values[n], y.values[n + 1])
-            if edge is not None:
-                edges[n] = edge
-        column = _place_zeros(y.values, excess, edges)
-        columns.append(column)
-    if first_criterion is None:
-        return None
-
-    # Labels and source are the same in the whole panel; take those of the first criterion.
-    line = MapLine(
-        label=first_criterion.symbol,
-        text=first_criterion.text,
-        about=first_criterion.source,
-        excess=np.array(columns).T,
-        rank=0,
     )
     return line if line.crosses_map else None
 
@@ -1298,8 +1308,8 @@ def build_stability_map(
         title=plan.base.title or plan.base.name,
         fixed=tuple(describe_fixed_gains(plan)),
     )
-    x = thin_axis(plane.x, plan.refine)
-    y = thin_axis(plane.y, plan.refine)
+    x = plane.x.thin_out(plan.refine)
+    y = plane.y.thin_out(plan.refine)
     if not y.key or len(y.values) < 2:
         return stability_map
 
@@ -1308,7 +1318,7 @@ def build_stability_map(
     panel_lines = []
     for panel, load in zip(plane.panels, loaders, strict=True):
         measured_line = _trace_zero_exponent(plane, panel)
-        closed_form_line = trace_closed_form(load, x._replace(values=fine.values), y)
+        closed_form_line = MapLine.trace_closed_form(load, x._replace(values=fine.values), y)
         if closed_form_line is not None:
             closed_form_line = closed_form_line.thin_out(fine)
         panel_lines.append([measured_line, closed_form_line])
@@ -1348,7 +1358,7 @@ def _build_plane_of_sweep(results: SweepResults) -> MapPlane:
     for axis in plan.axes:
         value_count = len(axis.texts)
         grid[axis.key] = [axis.value(n) for n in range(value_count)]
-    plane = build_plane(results.rows, list(grid), plan.base, grid)
+    plane = MapPlane.arrange_rows(results.rows, list(grid), plan.base, grid)
     return plane._replace(halvings=plan.refine, is_linear=plan.judge == "linear")
 
 
@@ -1363,7 +1373,7 @@ def _add_simulated_edges(plane: MapPlane, simulated: MapPlane) -> MapPlane:
         UsageError: The other map has other axes or panels.
     """
     edges_of = {
-        panel.settings: tuple(find_map_edges(simulated, panel)) for panel in simulated.panels
+        panel.settings: tuple(simulated.find_edges(panel)) for panel in simulated.panels
     }
     has_panels = all(panel.settings in edges_of for panel in plane.panels)
     has_axes = (plane.x.key, plane.y.key) == (simulated.x.key, simulated.y.key)
@@ -1377,22 +1387,6 @@ def _add_simulated_edges(plane: MapPlane, simulated: MapPlane) -> MapPlane:
         edges = edges_of[panel.settings]
         panels.append(panel._replace(simulated=edges))
     return plane._replace(panels=tuple(panels))
-
-
-def thin_axis(axis: PlaneAxis, halvings: int) -> PlaneAxis:
-    """Returns the values of an axis that belong to the coarse grid of a refined sweep.
-
-    Such a sweep begins with this grid, and then halves it along the edge of stability.
-
-    Args:
-        axis: The axis.
-        halvings: Number of halvings of the refined sweep. 0 returns the whole axis.
-    """
-    stride = 2**halvings
-    last = len(axis.values) - 1
-    # the last value is kept even if no whole number of strides leads to it
-    indices = [*range(0, last, stride), last]
-    return axis._replace(values=tuple(axis.values[n] for n in indices))
 
 
 def _spread_line(
@@ -1436,7 +1430,7 @@ def _choose_columns(loaders: Sequence[PanelLoader], x: PlaneAxis, y: PlaneAxis) 
     They are those of the map if the scenario is not valid between them, for example because
     only whole numbers are.
     """
-    fine = refine_columns(x)
+    fine = x.refine_columns()
     try:
         for load in loaders:
             for value in fine.values:

@@ -40,7 +40,7 @@ from trilat_net.scenario import Scenario, parse_scenario
 from ..measure_run import refuse_live_only
 
 if TYPE_CHECKING:
-    from trilat_net.execution import RunGroup
+    from trilat_net.core import RunGroup
 
 
 class CellClass(StrEnum):
@@ -66,28 +66,28 @@ class CellClass(StrEnum):
             return None
         return self is CellClass.CONVERGED
 
+    @classmethod
+    def of_decision(cls, stability: Stability, behaviour: EndBehaviour) -> "CellClass":
+        """Returns the class of a run of a sweep, given the decision whether the run is stable.
+
+        A run that is stable or settled counts as converged. A run that is not stable counts as
+        diverged if it left its limits, drifts or grows, and otherwise as bounded.
+
+        Args:
+            stability: The decision.
+            behaviour: How the run ends.
+        """
+        if stability in (Stability.STABLE, Stability.SETTLED):
+            return CellClass.CONVERGED
+        if stability is not Stability.NOT_STABLE:
+            return CellClass.UNDECIDED
+        return CellClass.DIVERGED if behaviour in _DIVERGING else CellClass.BOUNDED
+
 
 RUN_CLASSES = tuple(verdict for verdict in CellClass if verdict is not CellClass.REFUSED)
 """Classes of a cell that ran. A refused cell is not a valid scenario."""
 TOTAL_KEYS = ("rms_error_rad", "effort_nm", "force_peak_n", "walls_j")
 """Fields of a result that summarise the whole run, see `RunTotals`."""
-
-
-def classify_decision(stability: Stability, behaviour: EndBehaviour) -> CellClass:
-    """Returns the class of a run of a sweep, given the decision whether the run is stable.
-
-    A run that is stable or settled counts as converged. A run that is not stable counts as
-    diverged if it left its limits, drifts or grows, and otherwise as bounded.
-
-    Args:
-        stability: The decision.
-        behaviour: How the run ends.
-    """
-    if stability in (Stability.STABLE, Stability.SETTLED):
-        return CellClass.CONVERGED
-    if stability is not Stability.NOT_STABLE:
-        return CellClass.UNDECIDED
-    return CellClass.DIVERGED if behaviour in _DIVERGING else CellClass.BOUNDED
 
 
 _DIVERGING = (EndBehaviour.DIVERGED, EndBehaviour.DRIFTS, EndBehaviour.GROWS)
@@ -153,28 +153,55 @@ class CellResult(msgspec.Struct, frozen=True):
     stability: str = ""
     rests_on: str = ""
 
+    @classmethod
+    def unsimulated(cls, verdict: CellClass, reasons: str) -> "CellResult":
+        """Returns the result of a parameter combination that was decided without a simulation.
 
-def build_unsimulated_result(verdict: CellClass, reasons: str) -> CellResult:
-    """Returns the result of a parameter combination that was decided without a simulation.
+        Args:
+            verdict: Class of the cell.
+            reasons: Why the cell is refused or undecided. Empty if the cell is decided.
+        """
+        return cls(
+            verdict=verdict,
+            motion=None,
+            ran_s=0.0,
+            extended=0,
+            end_error_rad=None,
+            end_speed_rad_s=None,
+            error_rate_per_s=None,
+            speed_rate_per_s=None,
+            peak_error_rad=None,
+            settled_s=None,
+            diverged_s=None,
+            reasons=reasons,
+        )
 
-    Args:
-        verdict: Class of the cell.
-        reasons: Why the cell is refused or undecided. Empty if the cell is decided.
-    """
-    return CellResult(
-        verdict=verdict,
-        motion=None,
-        ran_s=0.0,
-        extended=0,
-        end_error_rad=None,
-        end_speed_rad_s=None,
-        error_rate_per_s=None,
-        speed_rate_per_s=None,
-        peak_error_rad=None,
-        settled_s=None,
-        diverged_s=None,
-        reasons=reasons,
-    )
+    @property
+    def is_conclusive(self) -> bool:
+        """Returns True if a longer run would very probably end in the same way.
+
+        This is so in each of the following cases:
+
+        - An arm left its limits, the arms came to rest, or they drift.
+        - The motion grows with a pronounced trend: over the second half of the run, the largest
+          speed doubled, or error and speed both halved.
+        - The motion is bounded and steady: over the second half of the run, the logarithms of
+        the
+          largest error and of the largest speed changed by at most `FLAT_LOG_CHANGE`.
+
+        Decay is not conclusive. Near the limit of stability, a slowly growing motion can be
+        hidden by a decaying motion until the decaying motion has vanished.
+        """
+        if self.motion is EndBehaviour.BOUNDED:
+            error_change, speed_change = _log_changes(self)
+            return max(abs(error_change), abs(speed_change)) <= FLAT_LOG_CHANGE
+        if self.motion is EndBehaviour.GROWS:
+            return _has_pronounced_trend(self)
+        return self.motion in (
+            EndBehaviour.DIVERGED,
+            EndBehaviour.CONVERGED,
+            EndBehaviour.DRIFTS,
+        )
 
 
 TWINS_OF_A_CELL = 4
@@ -262,7 +289,7 @@ class _CellInProgress:
         decision = judged.decision
         return msgspec.structs.replace(
             self._outcome,
-            verdict=classify_decision(decision.stability, judged.end.behaviour),
+            verdict=CellClass.of_decision(decision.stability, judged.end.behaviour),
             reasons="; ".join(decision.reasons),
             stability=decision.stability.value,
             rests_on=decision.rests_on,
@@ -277,7 +304,7 @@ class _CellInProgress:
         run_trace = RunTrace(self.run.buckets, self.run.tau_x, self.run.diverged_s)
         run_end = run_trace.classify_end(self._scenario)
         self._outcome = _build_result(self.run, run_end, self._totals, self._extended)
-        self._is_finished = is_conclusive(self._outcome)
+        self._is_finished = self._outcome.is_conclusive
         has_own_law = any(isinstance(law, ImportedLaw) for law in self._scenario.controls)
         if self._is_finished and has_own_law and run_end.stability is Stability.NOT_STABLE:
             roots = find_run_roots(self._scenario, self.run)
@@ -287,9 +314,9 @@ class _CellInProgress:
 def classify_cell(text: str, longest_s: float) -> CellResult:
     """Runs a cell in virtual time and classifies the end of the run.
 
-    While a longer run might have another class (see `is_conclusive`), the duration is doubled
-    and the same run continues, at most up to `longest_s`. The decision of the stability
-    certificate about the whole run then gives the class, see `classify_decision`.
+    While a longer run might have another class (see `CellResult.is_conclusive`), the duration
+    is doubled and the same run continues, at most up to `longest_s`. The decision of the
+    stability certificate about the whole run then gives the class, see `CellClass.of_decision`.
 
     A run that chatters at a sampled wall, where its small motions grow, is not extended. Such
     chatter may end after minutes, once the estimates of the law have drifted, but this does not
@@ -336,7 +363,7 @@ def classify_cells(scenarios: Iterable[Scenario], longest_s: float) -> Iterator[
         The results in the order of the cells.
     """
     # A single run must not load the code of lanes.
-    from trilat_net.execution import group_runs
+    from trilat_net.core import group_runs
 
     cells = [_CellInProgress(scenario, longest_s) for scenario in scenarios]
     runs = [cell.run for cell in cells]
@@ -415,15 +442,15 @@ def judge_linearly(scenario: Scenario) -> CellResult:
     (rate_per_s,) = column.growth_per_s
     remarks = "; ".join(column.remarks)
     if math.isnan(rate_per_s):
-        return build_unsimulated_result(CellClass.UNDECIDED, remarks)
+        return CellResult.unsimulated(CellClass.UNDECIDED, remarks)
     if math.isinf(rate_per_s):
-        return build_unsimulated_result(CellClass.UNDECIDED, "nothing moves in the linear loop")
+        return CellResult.unsimulated(CellClass.UNDECIDED, "nothing moves in the linear loop")
 
     verdict = CellClass.DIVERGED if rate_per_s > 0.0 else CellClass.CONVERGED
     basis = "Floquet multipliers" if column.is_sampled else "characteristic roots"
     reasons = [f"{basis} of the linear loop", *column.remarks]
     return msgspec.structs.replace(
-        build_unsimulated_result(verdict, ""),
+        CellResult.unsimulated(verdict, ""),
         exponent_per_s=rate_per_s,
         rests_on="; ".join(reasons),
     )
@@ -443,35 +470,6 @@ def _chatters(scenario: Scenario, run: FusedRun) -> bool:
     if not any(environment.actor.sampled for environment in environments):
         return False
     return find_run_roots(scenario, run).is_refutation
-
-
-def is_conclusive(outcome: CellResult) -> bool:
-    """Returns True if a longer run would very probably end in the same way.
-
-    This is so in each of the following cases:
-
-    - An arm left its limits, the arms came to rest, or they drift.
-    - The motion grows with a pronounced trend: over the second half of the run, the largest
-      speed doubled, or error and speed both halved.
-    - The motion is bounded and steady: over the second half of the run, the logarithms of the
-      largest error and of the largest speed changed by at most `FLAT_LOG_CHANGE`.
-
-    Decay is not conclusive. Near the limit of stability, a slowly growing motion can be hidden
-    by a decaying motion until the decaying motion has vanished.
-
-    Args:
-        outcome: Result of the run, with the largest errors and speeds of its two halves.
-    """
-    if outcome.motion is EndBehaviour.BOUNDED:
-        error_change, speed_change = _log_changes(outcome)
-        return max(abs(error_change), abs(speed_change)) <= FLAT_LOG_CHANGE
-    if outcome.motion is EndBehaviour.GROWS:
-        return _has_pronounced_trend(outcome)
-    return outcome.motion in (
-        EndBehaviour.DIVERGED,
-        EndBehaviour.CONVERGED,
-        EndBehaviour.DRIFTS,
-    )
 
 
 def _has_pronounced_trend(outcome: CellResult) -> bool:
@@ -515,7 +513,7 @@ def _build_result(
         extended: Number of times that the duration was doubled.
     """
     return CellResult(
-        verdict=classify_decision(end.stability, end.behaviour),
+        verdict=CellClass.of_decision(end.stability, end.behaviour),
         motion=end.behaviour,
         ran_s=run.ran_s,
         extended=extended,

@@ -436,7 +436,7 @@ class SweepPlan(NamedTuple):
     def facts(self) -> dict[str, Any]:
         """Returns the plan of a parameter sweep as plain values, which a JSON file stores.
 
-        `plan_from_json` restores the plan from them. The keys "judge" (how runs are judged),
+        `from_facts` restores the plan from them. The keys "judge" (how runs are judged),
         "metrics" (which further quantities are measured) and "refine" (how often the edge of
         stability is refined) are left out if they have their defaults, so that plans of older
         versions give the same file.
@@ -460,6 +460,73 @@ class SweepPlan(NamedTuple):
         if self.refine:
             plan["refine"] = self.refine
         return plan
+
+    @classmethod
+    def from_facts(cls, facts: dict[str, Any]) -> "SweepPlan":
+        """Restores a plan from the plain values that `SweepPlan.facts` returned.
+
+        The scenario is parsed from its stored text. Files that the scenario names are read
+        again.
+
+        Args:
+            facts: The plain values, as read from the JSON file.
+
+        Raises:
+            ScenarioError: The plan cannot run on this machine.
+        """
+        folder = None if facts["folder"] is None else Path(facts["folder"])
+
+        written = ExperimentText(facts["source"], facts["text"], folder)
+        texts = tuple(facts["overrides"])
+        axes = tuple(map(parse_axis, facts["over"]))
+        loaded = _load_base(written, texts, axes, facts["laws"])
+        base = allow_own_code(loaded.scenario)
+        laws = {law: _list_law_overrides(written, texts, loaded, law) for law in facts["laws"]}
+
+        return cls(
+            written=written,
+            overrides=texts,
+            base=base,
+            axes=axes,
+            laws=laws,
+            seeds=tuple(facts["seeds"]),
+            longest_s=facts["longest_s"],
+            judge=facts.get("judge", "verdict"),
+            metrics=tuple(facts.get("metrics", ())),
+            refine=facts.get("refine", 0),
+        )
+
+    def build_command(self, *more: str) -> str:
+        """Returns the shell command that repeats a sweep. Default options are left out.
+
+        Args:
+            more: Further arguments of the command.
+        """
+        arguments = set_options(self.overrides)
+        for axis in self.axes:
+            arguments += ["--over", axis.description]
+
+        count = len(self.seeds)
+        first_seed = self.base.seed
+        consecutive_seeds = tuple(range(first_seed, first_seed + count))
+        if self.seeds != consecutive_seeds:
+            seeds = ",".join(map(str, self.seeds))
+            # A single seed needs a comma, because a number alone is the number of seeds.
+            arguments += ["--seeds", f"{seeds}," if count == 1 else seeds]
+        elif count > 1:
+            arguments += ["--seeds", str(count)]
+
+        if self.laws:
+            arguments += ["--law", ",".join(self.laws)]
+        if self.judge != "verdict":
+            arguments += ["--judge", self.judge]
+        if self.refine:
+            arguments += ["--refine", str(self.refine)]
+        for key in self.metrics:
+            arguments += ["--metric", key]
+        if self.longest_s != self.default_longest_s:
+            arguments += ["--longest", format_override_value(self.longest_s)]
+        return format_command("sweep", self.written.label, *arguments, *more)
 
 
 def plan_sweep(
@@ -540,40 +607,6 @@ def plan_sweep(
     for law_index in range(plan.shape[0]):
         _check_axes(plan, law_index)
     return plan
-
-
-def plan_from_json(facts: dict[str, Any]) -> SweepPlan:
-    """Restores a plan from the plain values that `SweepPlan.facts` returned.
-
-    The scenario is parsed from its stored text. Files that the scenario names are read again.
-
-    Args:
-        facts: The plain values, as read from the JSON file.
-
-    Raises:
-        ScenarioError: The plan cannot run on this machine.
-    """
-    folder = None if facts["folder"] is None else Path(facts["folder"])
-
-    written = ExperimentText(facts["source"], facts["text"], folder)
-    texts = tuple(facts["overrides"])
-    axes = tuple(map(parse_axis, facts["over"]))
-    loaded = _load_base(written, texts, axes, facts["laws"])
-    base = allow_own_code(loaded.scenario)
-    laws = {law: _list_law_overrides(written, texts, loaded, law) for law in facts["laws"]}
-
-    return SweepPlan(
-        written=written,
-        overrides=texts,
-        base=base,
-        axes=axes,
-        laws=laws,
-        seeds=tuple(facts["seeds"]),
-        longest_s=facts["longest_s"],
-        judge=facts.get("judge", "verdict"),
-        metrics=tuple(facts.get("metrics", ())),
-        refine=facts.get("refine", 0),
-    )
 
 
 MOST_HALVINGS = 16
@@ -958,40 +991,6 @@ def _describe_owner(tables: list[str], scenario: Scenario | None) -> str:
             return f"'s share in {site}"
         case _:
             return ""
-
-
-def build_sweep_command(plan: SweepPlan, *more: str) -> str:
-    """Returns the shell command that repeats a sweep. Default options are left out.
-
-    Args:
-        plan: The sweep: its scenario, axes, control laws and seeds.
-        more: Further arguments of the command.
-    """
-    arguments = set_options(plan.overrides)
-    for axis in plan.axes:
-        arguments += ["--over", axis.description]
-
-    count = len(plan.seeds)
-    first_seed = plan.base.seed
-    consecutive_seeds = tuple(range(first_seed, first_seed + count))
-    if plan.seeds != consecutive_seeds:
-        seeds = ",".join(map(str, plan.seeds))
-        # A single seed needs a comma, because a number alone is the number of seeds.
-        arguments += ["--seeds", f"{seeds}," if count == 1 else seeds]
-    elif count > 1:
-        arguments += ["--seeds", str(count)]
-
-    if plan.laws:
-        arguments += ["--law", ",".join(plan.laws)]
-    if plan.judge != "verdict":
-        arguments += ["--judge", plan.judge]
-    if plan.refine:
-        arguments += ["--refine", str(plan.refine)]
-    for key in plan.metrics:
-        arguments += ["--metric", key]
-    if plan.longest_s != plan.default_longest_s:
-        arguments += ["--longest", format_override_value(plan.longest_s)]
-    return format_command("sweep", plan.written.label, *arguments, *more)
 
 
 def format_override(key: str, value: Any) -> str:

@@ -49,7 +49,7 @@ from .sweep_cell import (
     CellRun,
     apply_diff,
 )
-from .sweep_plan import SweepPlan, plan_from_json
+from .sweep_plan import SweepPlan
 
 RESULTS_FILE = "results.csv"
 """Name of the table of runs in the folder of a sweep."""
@@ -123,6 +123,108 @@ class SweepResults(Result):
             row: Row of the run.
         """
         return msgspec.convert(row, CellResult)
+
+    def iterate_grid_points(self) -> "Iterator[GridPoint]":
+        """Yields the summary of each combination of swept parameters.
+
+        `list_grid_points` returns the same as a list.
+        """
+        totals = list_totals(self.plan)
+        groups = groupby(self.rows, key=lambda row: (row["cell"], row["law"]))
+        for (cell, law), group in groups:
+            rows = list(group)
+            counts = Counter(row["verdict"] for row in rows)
+            # The totals of a run that diverged describe a shorter time, so they are not
+            # averaged.
+            rows_within_limits = [row for row in rows if row["diverged_s"] is None]
+            means = []
+            for key in totals:
+                values = [row.get(key) for row in rows_within_limits]
+                means.append(MeanInterval.of_values(values))
+            class_counts = [counts[verdict.value] for verdict in RUN_CLASSES]
+            yield GridPoint(
+                cell=cell,
+                law=law,
+                values=self.plan.cell(cell).values,
+                counts=tuple(class_counts),
+                means=tuple(means),
+            )
+
+    def list_grid_points(self) -> "list[GridPoint]":
+        """Summarises the simulations of a sweep that differ only in their random seeds.
+
+        Returns:
+            A summary for each combination of swept parameters and control law (a grid point).
+            It has the number of runs with each result, and the means of the measured totals.
+            The order is the order in which the combinations first occur in the results.
+        """
+        return list(self.iterate_grid_points())
+
+    def build_reproduce_command(self, row: ResultRow, folder: Path) -> tuple[str, str]:
+        """Returns the command that repeats the run of a row.
+
+        If the source of the scenario has changed since the sweep, the command in the row would
+        run something else. In this case the scenario of the row is written to a file, and the
+        command runs that file.
+
+        Args:
+            row: The run.
+            folder: Folder in which the file is written, if necessary.
+
+        Returns:
+            The command, and a note on a changed scenario. The note is empty if the scenario has
+            not changed.
+        """
+        plan = self.plan
+        source = plan.written.label
+        overrides = plan.cell(row["cell"]).overrides
+
+        try:
+            current_plan = plan._replace(written=ExperimentText.read(source))
+            seed = f"seed={row['seed']}"
+            current_scenario = current_plan.scenario(*overrides, seed)
+            digest = current_scenario.sha256
+        except ScenarioError:
+            digest = ""  # the source is missing or is no longer valid
+        if digest == row["scenario_sha256"]:
+            return row["command"], ""
+
+        name = f"cell-{row['cell']}-seed-{row['seed']}"
+        file = folder / f"{name}.toml"
+        write_whole(file, row["scenario"])
+        duration_s = reproduction_duration_s(plan, self.outcome(row))
+        options = ["--duration", f"{duration_s:.12g}", "-o", f"{name}.mcap"]
+        command = format_command("sim", str(file), *options)
+        note = f"{source} has changed since the sweep, or is missing; as it ran: {file}"
+        return command, note
+
+
+def read_results(path: Path) -> SweepResults:
+    """Reads the results of a finished parameter sweep from its folder.
+
+    Args:
+        path: Folder of the sweep, or its CSV table.
+
+    Raises:
+        UsageError: There are no results, they cannot be read, or the sweep has not finished.
+    """
+    is_folder = path.is_dir()
+    file = path / RESULTS_FILE if is_folder else path
+    if not file.is_file():
+        hint = f"; continue it with: trilat sweep --resume {path}" if is_folder else ""
+        raise UsageError(f"{file}: there are no results of a sweep{hint}")
+    plan_file = file.with_name(PLAN_FILE)
+    if not plan_file.is_file():
+        raise UsageError(
+            f"{file}: contains no results of a sweep: there is no {PLAN_FILE} next to this file"
+        )
+    try:
+        plan_text = plan_file.read_text(encoding="utf-8")
+        plan = SweepPlan.from_facts(json.loads(plan_text))
+    except (OSError, ValueError, KeyError, TypeError):
+        raise UsageError(f"{plan_file}: cannot be read as the plan of a sweep") from None
+
+    return SweepResults(plan, read_rows(file, plan))
 
 
 def iterate_cells(
@@ -235,34 +337,6 @@ def reproduction_duration_s(plan: SweepPlan, outcome: CellResult) -> float:
     return max(outcome.ran_s, planned_s)
 
 
-def read_results(path: Path) -> SweepResults:
-    """Reads the results of a finished parameter sweep from its folder.
-
-    Args:
-        path: Folder of the sweep, or its CSV table.
-
-    Raises:
-        UsageError: There are no results, they cannot be read, or the sweep has not finished.
-    """
-    is_folder = path.is_dir()
-    file = path / RESULTS_FILE if is_folder else path
-    if not file.is_file():
-        hint = f"; continue it with: trilat sweep --resume {path}" if is_folder else ""
-        raise UsageError(f"{file}: there are no results of a sweep{hint}")
-    plan_file = file.with_name(PLAN_FILE)
-    if not plan_file.is_file():
-        raise UsageError(
-            f"{file}: contains no results of a sweep: there is no {PLAN_FILE} next to this file"
-        )
-    try:
-        plan_text = plan_file.read_text(encoding="utf-8")
-        plan = plan_from_json(json.loads(plan_text))
-    except (OSError, ValueError, KeyError, TypeError):
-        raise UsageError(f"{plan_file}: cannot be read as the plan of a sweep") from None
-
-    return SweepResults(plan, read_rows(file, plan))
-
-
 GRID_POINTS_FILE = "places.csv"
 """Name of the table of grid points in the folder of a sweep."""
 
@@ -330,49 +404,6 @@ def list_totals(plan: SweepPlan) -> list[str]:
     """
     keys = (*TOTAL_KEYS, *plan.metrics)
     return list(dict.fromkeys(keys))
-
-
-def collect_grid_points(results: SweepResults) -> list[GridPoint]:
-    """Summarises the simulations of a sweep that differ only in their random seeds.
-
-    Args:
-        results: Results of the sweep: its plan and one row per run.
-
-    Returns:
-        A summary for each combination of swept parameters and control law (a grid point). It
-        has the number of runs with each result, and the means of the measured totals. The order
-        is the order in which the combinations first occur in the results.
-    """
-    return list(iterate_grid_points(results))
-
-
-def iterate_grid_points(results: SweepResults) -> Iterator[GridPoint]:
-    """Yields the summary of each combination of swept parameters.
-
-    `collect_grid_points` returns the same as a list.
-
-    Args:
-        results: Results of the sweep, in which the rows of a cell stand together.
-    """
-    totals = list_totals(results.plan)
-    groups = groupby(results.rows, key=lambda row: (row["cell"], row["law"]))
-    for (cell, law), group in groups:
-        rows = list(group)
-        counts = Counter(row["verdict"] for row in rows)
-        # The totals of a run that diverged describe a shorter time, so they are not averaged.
-        rows_within_limits = [row for row in rows if row["diverged_s"] is None]
-        means = []
-        for key in totals:
-            values = [row.get(key) for row in rows_within_limits]
-            means.append(MeanInterval.of_values(values))
-        class_counts = [counts[verdict.value] for verdict in RUN_CLASSES]
-        yield GridPoint(
-            cell=cell,
-            law=law,
-            values=results.plan.cell(cell).values,
-            counts=tuple(class_counts),
-            means=tuple(means),
-        )
 
 
 def encode_grid_points(plan: SweepPlan, points: Iterable[GridPoint]) -> Iterator[str]:
@@ -631,7 +662,7 @@ def _summarize_seeds(results: SweepResults, not_random: int) -> Iterator[str]:
 
     doubtful = []
     doubtful_count = 0
-    for point in iterate_grid_points(results):
+    for point in results.iterate_grid_points():
         if point.doubtful:
             doubtful_count += 1
             if doubtful_count <= _MAX_CELLS_SHOWN:
@@ -667,45 +698,3 @@ def list_next_commands(folder: Path) -> list[str]:
         f"{command} --cell 0      # the command that makes a log of a cell",
         f"{command} --map         # its map, with the lines of theory",
     ]
-
-
-def build_reproduce_command(
-    results: SweepResults, row: ResultRow, folder: Path
-) -> tuple[str, str]:
-    """Returns the command that repeats the run of a row.
-
-    If the source of the scenario has changed since the sweep, the command in the row would run
-    something else. In this case the scenario of the row is written to a file, and the command
-    runs that file.
-
-    Args:
-        results: Results of the sweep: its plan and one row per run.
-        row: The run.
-        folder: Folder in which the file is written, if necessary.
-
-    Returns:
-        The command, and a note on a changed scenario. The note is empty if the scenario has
-        not changed.
-    """
-    plan = results.plan
-    source = plan.written.label
-    overrides = plan.cell(row["cell"]).overrides
-
-    try:
-        current_plan = plan._replace(written=ExperimentText.read(source))
-        seed = f"seed={row['seed']}"
-        current_scenario = current_plan.scenario(*overrides, seed)
-        digest = current_scenario.sha256
-    except ScenarioError:
-        digest = ""  # the source is missing or is no longer valid
-    if digest == row["scenario_sha256"]:
-        return row["command"], ""
-
-    name = f"cell-{row['cell']}-seed-{row['seed']}"
-    file = folder / f"{name}.toml"
-    write_whole(file, row["scenario"])
-    duration_s = reproduction_duration_s(plan, results.outcome(row))
-    options = ["--duration", f"{duration_s:.12g}", "-o", f"{name}.mcap"]
-    command = format_command("sim", str(file), *options)
-    note = f"{source} has changed since the sweep, or is missing; as it ran: {file}"
-    return command, note

@@ -19,6 +19,7 @@ import math
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -58,7 +59,7 @@ from .cell_groups import find_cell_groups
 from .edge_refinement import NOT_KNOWN, EdgeRefinement, choose_side
 from .result_table import ResultRow, ResultTable, read_rows
 from .sweep_cell import CellClass, CellResult, CellRun
-from .sweep_plan import JUDGES, SweepCell, SweepPlan, plan_from_json
+from .sweep_plan import JUDGES, SweepCell, SweepPlan
 from .sweep_results import (
     GRID_POINTS_FILE,
     PLAN_FILE,
@@ -67,7 +68,6 @@ from .sweep_results import (
     build_cell_rows,
     encode_grid_points,
     iterate_cells,
-    iterate_grid_points,
 )
 
 JOURNAL_FILE = "cells.journal"
@@ -146,7 +146,7 @@ def open_sweep_folder(path: Path, expected: SweepPlan | None = None) -> SweepFol
         ScenarioError: The scenario of the sweep cannot run on this machine.
     """
     stored = _read_facts(path)
-    current = _list_facts(expected or plan_from_json(stored))
+    current = _list_facts(expected or SweepPlan.from_facts(stored))
     for key, difference in _DIFFERENCES.items():
         if stored.get(key) != current.get(key):
             stored_text = _format_fact(key, stored)
@@ -155,7 +155,7 @@ def open_sweep_folder(path: Path, expected: SweepPlan | None = None) -> SweepFol
                 f"{path}: contains a sweep with {difference}: {stored_text} in the folder, "
                 f"{current_text} now; results cannot be mixed: choose another folder"
             )
-    return _build_folder(path, plan_from_json(stored), stored)
+    return _build_folder(path, SweepPlan.from_facts(stored), stored)
 
 
 def _format_fact(key: str, facts: Mapping[str, Any]) -> str:
@@ -285,6 +285,14 @@ class FinishedSweep(NamedTuple):
     jobs: int
     alone: Mapping[str, int] = {}
 
+    def describe_speed(self) -> str:
+        """Returns a sentence on how fast the runs were computed in relation to real time."""
+        processes = count_nouns(self.jobs, "process")
+        wall_time = format_wall_time(self.wall_s)
+        ratio = self.simulated_s / (self.wall_s * self.jobs) if self.wall_s else math.nan
+        effort = f"{self.simulated_s:.4g} s simulated in {wall_time} by {processes}"
+        return f"speed: {ratio:.3g} times real time per process; {effort}"
+
 
 class CellItem(NamedTuple):
     """Everything that a worker process needs to execute one run of a sweep.
@@ -304,30 +312,26 @@ class CellItem(NamedTuple):
     def __str__(self) -> str:
         return f"cell {self.cell.number} ({', '.join(self.cell.overrides)}), seed {self.seed}"
 
+    def run(self) -> CellRun:
+        """Executes one run of a sweep.
 
-def run_cell(task: CellItem) -> CellRun:
-    """Executes one run of a sweep.
+        The function needs nothing but its argument. Therefore any worker process can call it.
 
-    The function needs nothing but its argument. Therefore any worker process can call it.
+        Returns:
+            The finished run with its result, ready for the journal of the sweep.
 
-    Args:
-        task: The run.
-
-    Returns:
-        The finished run with its result, ready for the journal of the sweep.
-
-    """
-    try:
-        scenario = _build_scenario(task)
-        if task.plan.judge == "linear":
-            outcome = sweep_cell.judge_linearly(scenario)
-        else:
-            outcome = sweep_cell.classify_cell(scenario.text, task.plan.longest_s)
-    except CodeWithheld:
-        raise
-    except ScenarioError as error:
-        return _refuse_cell(task, error)
-    return _complete_run(task, scenario, outcome)
+        """
+        try:
+            scenario = _build_scenario(self)
+            if self.plan.judge == "linear":
+                outcome = sweep_cell.judge_linearly(scenario)
+            else:
+                outcome = sweep_cell.classify_cell(scenario.text, self.plan.longest_s)
+        except CodeWithheld:
+            raise
+        except ScenarioError as error:
+            return _refuse_cell(self, error)
+        return _complete_run(self, scenario, outcome)
 
 
 def _refuse_cell(task: CellItem, error: ScenarioError) -> CellRun:
@@ -347,7 +351,7 @@ def _refuse_cell(task: CellItem, error: ScenarioError) -> CellRun:
         law=cell.law,
         sha256="",
         scenario=sweep_cell.diff_lines("", task.plan.base.text),
-        outcome=sweep_cell.build_unsimulated_result(CellClass.REFUSED, reason),
+        outcome=CellResult.unsimulated(CellClass.REFUSED, reason),
         metrics=dict.fromkeys(task.plan.metrics),
     )
 
@@ -359,7 +363,7 @@ def _run_cells(tasks: Sequence[CellItem]) -> Iterator[CellRun]:
         tasks: The runs, of one sweep.
 
     Yields:
-        The finished runs in the order of the tasks, equal to those of `run_cell`.
+        The finished runs in the order of the tasks, equal to those of `CellItem.run`.
     """
     scenarios: dict[int, Scenario] = {}
     refused_runs: dict[int, CellRun] = {}
@@ -375,7 +379,7 @@ def _run_cells(tasks: Sequence[CellItem]) -> Iterator[CellRun]:
         judged_cells = iter(list(sweep_cell.classify_cells(scenarios.values(), longest_s)))
     except (CodeFailed, ScenarioError):
         # One by one, the runs before the one whose code fails are kept.
-        yield from map(run_cell, tasks)
+        yield from map(CellItem.run, tasks)
         return
     for index, task in enumerate(tasks):
         if index in refused_runs:
@@ -464,16 +468,18 @@ def _prepare_lanes(plan: SweepPlan, runs: int) -> bool:
     if plan.judge == "linear" or (runs < 2 and not is_large):
         return False
     # A sweep of single runs must not load the code of lanes.
-    from trilat_net.execution import prepare_lanes
+    from trilat_net.core import prepare_lanes
+    from trilat_net.execution import FusedRun
 
     try:
         scenario = _build_scenario(CellItem(plan, plan.cell(0), plan.seeds[0]))
     except ScenarioError:
         return is_large  # the workers compile the code of other cells
+    make_run = partial(FusedRun, scenario)
     if is_large:
-        prepare_lanes(scenario, LANE_RUNS, least_site_ticks=0)
+        prepare_lanes(make_run, LANE_RUNS, least_site_ticks=0)
         return True
-    return prepare_lanes(scenario, runs, least_site_ticks=math.inf)
+    return prepare_lanes(make_run, runs, least_site_ticks=math.inf)
 
 
 def estimate_sweep(
@@ -516,7 +522,7 @@ def estimate_sweep(
     entries: list[CellRun] = []
     elapsed_s = 0.0
     for probe in probes:
-        entries.append(run_cell(probe))
+        entries.append(probe.run())
         elapsed_s = (clock.monotonic_ns() - started_ns) * 1e-9
         if elapsed_s >= _PROBING_S:
             break
@@ -596,7 +602,7 @@ def run_sweep(
 
     results = SweepResults(plan, read_rows(folder.path / RESULTS_FILE, plan))
     if len(plan.seeds) > 1:
-        points = encode_grid_points(plan, iterate_grid_points(results))
+        points = encode_grid_points(plan, results.iterate_grid_points())
         _write_lines(folder, GRID_POINTS_FILE, points)
     return FinishedSweep(
         results=results,
@@ -799,7 +805,7 @@ class _SweepWork:
         total = max(run_count, len(done))
         self._journal.run_pending(
             pool=self._pool,
-            run=run_cell,
+            run=CellItem.run,
             tasks=missing_runs,
             done=len(done),
             total=total,
@@ -830,16 +836,3 @@ def _find_side(plan: SweepPlan, runs: Sequence[CellRun]) -> int:
         stable = [None if rate is None else rate <= 0.0 for rate in exponents_per_s]
     decided = [is_stable for is_stable in stable if is_stable is not None]
     return choose_side(stable=sum(decided), decided=len(decided))
-
-
-def describe_sweep_speed(speed: FinishedSweep) -> str:
-    """Returns a sentence on how fast the runs were computed in relation to real time.
-
-    Args:
-        speed: The finished sweep, with the simulated and the real time of its runs.
-    """
-    processes = count_nouns(speed.jobs, "process")
-    wall_time = format_wall_time(speed.wall_s)
-    ratio = speed.simulated_s / (speed.wall_s * speed.jobs) if speed.wall_s else math.nan
-    effort = f"{speed.simulated_s:.4g} s simulated in {wall_time} by {processes}"
-    return f"speed: {ratio:.3g} times real time per process; {effort}"

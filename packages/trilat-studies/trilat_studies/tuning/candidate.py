@@ -67,7 +67,7 @@ from trilat_net.scenario import (
 )
 from trilat_net.work import MeanInterval
 
-from ..measure_run import RecordBatch, WholeRun, refuse_live_only, run_whole, run_whole_together
+from ..measure_run import RecordBatch, WholeRun, refuse_live_only
 from ..run_commands import format_command, format_toml_value, set_options
 from .search_space import GainValues, ModelInformation, SearchSpace, SiteControls
 
@@ -274,6 +274,40 @@ class CandidateClass(StrEnum):
             return Stability.STABLE.value
         return self.value
 
+    @classmethod
+    def classify(
+        cls, ends: Sequence[RunEnd], fall_rad: float, apart_rad: float
+    ) -> "CandidateClass":
+        """Classifies how well the arms behaved with a control law and chosen gains.
+
+        The scenario may have walls, and operators who push without a target pose. Then a second
+        run without them shows at which pose the arms would come to rest undisturbed. The arms
+        should rest near the consensus pose q*, which follows from the targets of the other
+        operators.
+
+        Args:
+            ends: Judgements of the end of the run and of the second run. Without a second run,
+                the judgement of the run is given twice.
+            fall_rad: Predicted distance, in rad, between the mean pose of the arms and q*, or
+                the mean of the promised motion, at the end of a run twice as long. The largest
+                distance over the joints counts.
+            apart_rad: Largest distance of a joint from the mean of all arms, or from the
+                promised motion, in the last second, in rad.
+
+        Returns:
+            The worst class that applies to one of the runs.
+        """
+        stabilities = {end.stability for end in ends}
+        if any(end.behaviour is EndBehaviour.DIVERGED for end in ends):
+            return CandidateClass.DIVERGED
+        if Stability.NOT_STABLE in stabilities:
+            return CandidateClass.OSCILLATED
+        if fall_rad > STRAYED_RAD:
+            return CandidateClass.STRAYED
+        if apart_rad > TOGETHER_RAD:
+            return CandidateClass.APART
+        return CandidateClass.OPEN if Stability.OPEN in stabilities else CandidateClass.SETTLED
+
 
 CLASS_MEANINGS = {
     CandidateClass.DIVERGED: "not stable: a joint exceeded the speed limit",
@@ -287,39 +321,6 @@ CLASS_MEANINGS = {
     CandidateClass.SETTLED: "it converged or decays, and no other class applies",
 }
 """Meanings of the classes. docs/reference/stability.md defines the judgement of a run."""
-
-
-def classify_candidate(
-    ends: Sequence[RunEnd], fall_rad: float, apart_rad: float
-) -> CandidateClass:
-    """Classifies how well the arms behaved with a control law and chosen gains.
-
-    The scenario may have walls, and operators who push without a target pose. Then a second run
-    without them shows at which pose the arms would come to rest undisturbed. The arms should
-    rest near the consensus pose q*, which follows from the targets of the other operators.
-
-    Args:
-        ends: Judgements of the end of the run and of the second run. Without a second run, the
-            judgement of the run is given twice.
-        fall_rad: Predicted distance, in rad, between the mean pose of the arms and q*, or the
-            mean of the promised motion, at the end of a run twice as long. The largest distance
-            over the joints counts.
-        apart_rad: Largest distance of a joint from the mean of all arms, or from the promised
-            motion, in the last second, in rad.
-
-    Returns:
-        The worst class that applies to one of the runs.
-    """
-    stabilities = {end.stability for end in ends}
-    if any(end.behaviour is EndBehaviour.DIVERGED for end in ends):
-        return CandidateClass.DIVERGED
-    if Stability.NOT_STABLE in stabilities:
-        return CandidateClass.OSCILLATED
-    if fall_rad > STRAYED_RAD:
-        return CandidateClass.STRAYED
-    if apart_rad > TOGETHER_RAD:
-        return CandidateClass.APART
-    return CandidateClass.OPEN if Stability.OPEN in stabilities else CandidateClass.SETTLED
 
 
 _SHORT_S = 0.5
@@ -453,61 +454,61 @@ class CandidateScore(msgspec.Struct, frozen=True):
     error_half_rad: float | None = None
     effort_half_nm: float | None = None
 
+    @classmethod
+    def average(cls, scores: "Sequence[CandidateScore]") -> "CandidateScore":
+        """Combines the scores of a candidate over runs that differ only in their seeds.
+
+        The class is the worst of all runs, and each number is the mean over the runs. A number
+        that is missing for one of the runs is None.
+
+        Args:
+            scores: Score of each run, at least one.
+        """
+        if len(scores) == 1:
+            return scores[0]
+        rank = list(CandidateClass)
+        worst = min(scores, key=lambda score: rank.index(score.outcome))
+
+        intervals = {}
+        means = {}
+        for field in _AVERAGED:
+            values = [getattr(score, field) for score in scores]
+            interval = MeanInterval.of_values(values)
+            intervals[field] = interval
+            means[field] = None if interval is None else interval.mean
+
+        error = intervals["error_rad"]
+        effort = intervals["effort_nm"]
+        return msgspec.structs.replace(
+            worst,
+            **means,
+            seeds=len(scores),
+            error_half_rad=None if error is None else error.half,
+            effort_half_nm=None if effort is None else effort.half,
+        )
+
+    @classmethod
+    def measure(cls, text: str, twin_text: str | None) -> "CandidateScore":
+        """Runs a candidate and its twin, and scores the candidate.
+
+        The twin is the same run without walls and without operators that have no target pose,
+        see `build_twin`. It shows at which pose the arms would come to rest.
+
+        Args:
+            text: Canonical text of the candidate's scenario.
+            twin_text: Canonical text of the twin's scenario. None if there is no twin. The
+                final pose is then taken from the candidate's own run.
+
+        Returns:
+            The score of the candidate.
+        """
+        run = _measure_run(parse_scenario(text))
+        twin = run if twin_text is None else _measure_run(parse_scenario(twin_text))
+        return _score_candidate(run, twin)
+
 
 _AVERAGED = ("error_rad", "spread_rad", "pose_rad", "effort_nm", "settled_s", "saturated")
 """Fields of a score that are averaged over the seeds."""
-
-
-def average_scores(scores: Sequence[CandidateScore]) -> CandidateScore:
-    """Combines the scores of a candidate over runs that differ only in their random numbers.
-
-    The class is the worst of all runs, and each number is the mean over the runs. A number that
-    is missing for one of the runs is None.
-
-    Args:
-        scores: Score of each run, at least one.
-    """
-    if len(scores) == 1:
-        return scores[0]
-    rank = list(CandidateClass)
-    worst = min(scores, key=lambda score: rank.index(score.outcome))
-
-    intervals = {}
-    means = {}
-    for field in _AVERAGED:
-        values = [getattr(score, field) for score in scores]
-        interval = MeanInterval.of_values(values)
-        intervals[field] = interval
-        means[field] = None if interval is None else interval.mean
-
-    error = intervals["error_rad"]
-    effort = intervals["effort_nm"]
-    return msgspec.structs.replace(
-        worst,
-        **means,
-        seeds=len(scores),
-        error_half_rad=None if error is None else error.half,
-        effort_half_nm=None if effort is None else effort.half,
-    )
-
-
-def measure_candidate(text: str, twin_text: str | None) -> CandidateScore:
-    """Runs a candidate and its twin, and scores the candidate.
-
-    The twin is the same run without walls and without operators that have no target pose, see
-    `build_twin`. It shows at which pose the arms would come to rest.
-
-    Args:
-        text: Canonical text of the candidate's scenario.
-        twin_text: Canonical text of the twin's scenario. None if there is no twin. The final
-            pose is then taken from the candidate's own run.
-
-    Returns:
-        The score of the candidate.
-    """
-    run = _measure_run(parse_scenario(text))
-    twin = run if twin_text is None else _measure_run(parse_scenario(twin_text))
-    return _score_candidate(run, twin)
 
 
 def _score_candidate(run: "_RunMeasures", twin: "_RunMeasures") -> CandidateScore:
@@ -519,7 +520,7 @@ def _score_candidate(run: "_RunMeasures", twin: "_RunMeasures") -> CandidateScor
             itself if there is no twin.
     """
     ends = (run.end, twin.end)
-    outcome = classify_candidate(ends, twin.fall_rad, twin.apart_rad)
+    outcome = CandidateClass.classify(ends, twin.fall_rad, twin.apart_rad)
 
     # The numbers of a run that ended early cannot be compared with those of other runs.
     divergence_times_s = [end.diverged_at_s for end in ends if end.diverged_at_s is not None]
@@ -554,8 +555,8 @@ class _RunMeasures(NamedTuple):
 
     Attributes:
         end: Judgement of the end of the run.
-        fall_rad: Predicted distance from q*, see `classify_candidate`.
-        apart_rad: Distance between the arms at the end, see `classify_candidate`.
+        fall_rad: Predicted distance from q*, see `CandidateClass.classify`.
+        apart_rad: Distance between the arms at the end, see `CandidateClass.classify`.
         spread_rad: RMS distance of the arms from their mean, or from the motion that their law
             promises, in rad.
         pose_rad: RMS distance of the arms' mean from q*, in rad.
@@ -580,7 +581,7 @@ def _measure_run(scenario: Scenario) -> _RunMeasures:
     Args:
         scenario: Scenario of the candidate, with its gains.
     """
-    return _measure_records(scenario, run_whole(scenario))
+    return _measure_records(scenario, WholeRun.simulate(scenario))
 
 
 def _measure_records(scenario: Scenario, whole_run: WholeRun) -> _RunMeasures:
@@ -839,6 +840,23 @@ class TuningScenario(NamedTuple):
         options = set_options(self.overrides)
         return format_command("sim", self.source, *options)
 
+    @classmethod
+    def load(
+        cls, source: str | Path | Mapping[str, Any] | Scenario, overrides: Sequence[str] = ()
+    ) -> "TuningScenario":
+        """Loads a scenario in which control laws are to be compared.
+
+        Args:
+            source: Name of a shipped scenario, a path, a TOML text, its tables, or a scenario.
+            overrides: Overrides KEY=VALUE of the scenario, as on the command line.
+
+        Raises:
+            ScenarioError: The scenario does not exist, or is not valid with the overrides.
+        """
+        experiment = ExperimentText.read(source)
+        scenario = experiment.load(overrides)
+        return cls(experiment, tuple(overrides), scenario)
+
 
 class CandidateItem(NamedTuple):
     """Everything that a worker process needs to simulate a control law with chosen gains.
@@ -858,17 +876,26 @@ class CandidateItem(NamedTuple):
     def __str__(self) -> str:
         return self.name
 
+    @classmethod
+    def of_seeds(cls, seeds: Sequence[TuningScenario]) -> "CandidateItem":
+        """Packs the simulations of one choice of control gains as work for another process.
 
-def build_candidate_item(seeds: Sequence[TuningScenario]) -> CandidateItem:
-    """Packs the simulations of one choice of control gains as work for another process.
+        Args:
+            seeds: The scenario with the law and its gains, once for each random seed. At least
+                one.
+        """
+        first = seeds[0]
+        name = ", ".join(first.overrides) or first.source
+        runs = tuple(seed.texts for seed in seeds)
+        return cls(runs, name)
 
-    Args:
-        seeds: The scenario with the law and its gains, once for each random seed. At least one.
-    """
-    first = seeds[0]
-    name = ", ".join(first.overrides) or first.source
-    runs = tuple(seed.texts for seed in seeds)
-    return CandidateItem(runs, name)
+    def measure(self) -> "MeasuredCandidate":
+        """Runs a candidate, a law with chosen gains, with all of its seeds.
+
+        Any worker process can call it, because it needs nothing but its argument.
+        """
+        scores = [CandidateScore.measure(text, twin_text) for text, twin_text in self.runs]
+        return MeasuredCandidate(CandidateScore.average(scores))
 
 
 class MeasuredCandidate(NamedTuple):
@@ -883,18 +910,6 @@ class MeasuredCandidate(NamedTuple):
     alone: tuple[str, ...] = ()
 
 
-def measure_candidate_task(task: CandidateItem) -> MeasuredCandidate:
-    """Runs a candidate, a law with chosen gains, with all of its seeds.
-
-    Any worker process can call it, because it needs nothing but its argument.
-
-    Args:
-        task: The runs of the candidate.
-    """
-    scores = [measure_candidate(text, twin_text) for text, twin_text in task.runs]
-    return MeasuredCandidate(average_scores(scores))
-
-
 LANE_RUNS = 16
 """Number of runs that a worker computes side by side. All their records are in memory."""
 
@@ -906,7 +921,7 @@ def measure_candidate_tasks(tasks: Sequence[CandidateItem]) -> Iterator[Measured
         tasks: The runs of each candidate.
 
     Yields:
-        The scores in the order of the candidates, equal to those of `measure_candidate_task`.
+        The scores in the order of the candidates, equal to those of `CandidateItem.measure`.
     """
     texts = [
         text
@@ -923,7 +938,7 @@ def measure_candidate_tasks(tasks: Sequence[CandidateItem]) -> Iterator[Measured
     try:
         for first in range(0, len(chosen), LANE_RUNS):
             part = chosen[first : first + LANE_RUNS]
-            runs = run_whole_together([scenarios[text] for text in part])
+            runs = WholeRun.simulate_together([scenarios[text] for text in part])
             for index, run, obstacle in runs:
                 text = part[index]
                 measured[text] = _measure_records(scenarios[text], run)
@@ -931,33 +946,16 @@ def measure_candidate_tasks(tasks: Sequence[CandidateItem]) -> Iterator[Measured
     except CodeFailed:
         # One by one, the candidates before the one whose code fails are kept.
         for task in tasks:
-            yield measure_candidate_task(task)
+            yield task.measure()
         return
 
     for task in tasks:
         if not task.is_side_by_side:
-            yield measure_candidate_task(task)
+            yield task.measure()
             continue
         scores = [
             _score_candidate(measured[text], measured[twin_text or text])
             for text, twin_text in task.runs
         ]
         reasons = [obstacles[text] for texts in task.runs for text in texts if text]
-        yield MeasuredCandidate(average_scores(scores), tuple(filter(None, reasons)))
-
-
-def load_tuning_scenario(
-    source: str | Path | Mapping[str, Any] | Scenario, overrides: Sequence[str] = ()
-) -> TuningScenario:
-    """Loads a scenario in which control laws are to be compared.
-
-    Args:
-        source: Name of a shipped scenario, a path, a TOML text, its tables, or a scenario.
-        overrides: Overrides KEY=VALUE of the scenario, as on the command line.
-
-    Raises:
-        ScenarioError: The scenario does not exist, or is not valid with the overrides.
-    """
-    experiment = ExperimentText.read(source)
-    scenario = experiment.load(overrides)
-    return TuningScenario(experiment, tuple(overrides), scenario)
+        yield MeasuredCandidate(CandidateScore.average(scores), tuple(filter(None, reasons)))

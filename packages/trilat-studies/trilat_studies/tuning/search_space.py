@@ -119,23 +119,24 @@ class ModelInformation(NamedTuple):
             gravity = f"{100.0 * self.gravity:g} % of the true gravity parameters"
         return f"every law gets {gravity}, and no inertia"
 
+    @classmethod
+    def of_gravity(cls, gravity_percent: float) -> "ModelInformation":
+        """Returns what all compared control laws are told about the arms.
 
-def build_model_information(gravity_percent: float) -> ModelInformation:
-    """Returns what all compared control laws are told about the arms.
+        The gravity parameters may be wrong on purpose, to test how robust the laws are.
 
-    The gravity parameters may be wrong on purpose, to test how robust the laws are.
+        Args:
+            gravity_percent: Gravity parameters that the laws get, in per cent of the true
+                values.
 
-    Args:
-        gravity_percent: Gravity parameters that the laws get, in per cent of the true values.
-
-    Raises:
-        UsageError: The number is not from 50 to 150.
-    """
-    if not 50.0 <= gravity_percent <= 150.0:
-        raise UsageError(
-            f"--gravity must be from 50 to 150 % of the true value, not {gravity_percent:g}"
-        )
-    return ModelInformation(gravity_percent / 100.0)
+        Raises:
+            UsageError: The number is not from 50 to 150.
+        """
+        if not 50.0 <= gravity_percent <= 150.0:
+            raise UsageError(
+                f"--gravity must be from 50 to 150 % of the true value, not {gravity_percent:g}"
+            )
+        return cls(gravity_percent / 100.0)
 
 
 GainValues = Mapping[str, float]
@@ -250,6 +251,38 @@ class SearchSpace(NamedTuple):
             longest_ms=longest_ms,
         )
         return {"law": law, **self.kind.write_control(gains, tuning_site)}
+
+    @classmethod
+    def of_user_law(cls, code: str) -> "SearchSpace":
+        """Reads the search space of a user's law from the attribute `tune` of its class.
+
+        The attribute contains (low, high) or (low, high, unit) for each gain, as in `tune =
+        {"K": (10.0, 300.0)}`. If the constructor of the class has an argument `gravity`, it
+        gets the factor by which all laws over- or underestimate gravity.
+
+        Args:
+            code: Module and class, as in "mylaws:Spring".
+
+        Returns:
+            The law with the ranges of its gains.
+
+        Raises:
+            ScenarioError: The class does not exist.
+            UsageError: The class has no ranges, or a range is not valid.
+        """
+        kind = import_named_class(code, "--law")
+
+        ranges = getattr(kind, "tune", None)
+        if not isinstance(ranges, Mapping) or not ranges:
+            raise UsageError(
+                f"--law {code} has no search ranges: its class needs "
+                'tune = {"K": (10.0, 300.0)}'
+            )
+
+        knobs = tuple(_parse_user_range(code, name, entry) for name, entry in ranges.items())
+        takes_gravity = "gravity" in inspect.signature(kind).parameters
+        facts = _GRAVITY_ONLY if takes_gravity else "what it reads from its argument now"
+        return cls(code, knobs, facts)
 
 
 def _find_longest_round_trip_ms(scenario: Scenario) -> float:
@@ -400,38 +433,7 @@ def select_search_spaces(laws: Sequence[str], scenario: Scenario) -> list[Search
         misfit = "" if kind is None else kind.explain_misfit(roles)
         if misfit:
             raise ScenarioError(f"law {name} {misfit}", source=scenario.name)
-    return [SEARCH_SPACES.get(name) or build_user_search_space(name) for name in names]
-
-
-def build_user_search_space(code: str) -> SearchSpace:
-    """Reads the search space of a user's control law from the attribute `tune` of its class.
-
-    The attribute contains (low, high) or (low, high, unit) for each gain, as in
-    `tune = {"K": (10.0, 300.0)}`. If the constructor of the class has an argument `gravity`, it
-    gets the factor by which all laws over- or underestimate gravity.
-
-    Args:
-        code: Module and class, as in "mylaws:Spring".
-
-    Returns:
-        The law with the ranges of its gains.
-
-    Raises:
-        ScenarioError: The class does not exist.
-        UsageError: The class has no ranges, or a range is not valid.
-    """
-    kind = import_named_class(code, "--law")
-
-    ranges = getattr(kind, "tune", None)
-    if not isinstance(ranges, Mapping) or not ranges:
-        raise UsageError(
-            f'--law {code} has no search ranges: its class needs tune = {{"K": (10.0, 300.0)}}'
-        )
-
-    knobs = tuple(_parse_user_range(code, name, entry) for name, entry in ranges.items())
-    takes_gravity = "gravity" in inspect.signature(kind).parameters
-    facts = _GRAVITY_ONLY if takes_gravity else "what it reads from its argument now"
-    return SearchSpace(code, knobs, facts)
+    return [SEARCH_SPACES.get(name) or SearchSpace.of_user_law(name) for name in names]
 
 
 def _parse_user_range(code: str, name: Any, entry: Any) -> _TunedGain:

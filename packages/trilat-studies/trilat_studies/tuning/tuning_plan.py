@@ -47,12 +47,8 @@ from .candidate import (
     CandidateItem,
     CandidateScore,
     TuningScenario,
-    build_candidate_item,
     build_twin,
     check_comparable,
-    load_tuning_scenario,
-    measure_candidate,
-    measure_candidate_task,
     measure_candidate_tasks,
 )
 from .search_space import (
@@ -60,7 +56,6 @@ from .search_space import (
     SEARCH_SPACES,
     ModelInformation,
     SearchSpace,
-    build_model_information,
     select_search_spaces,
     weigh_joints,
 )
@@ -466,10 +461,12 @@ class TuningPlan(NamedTuple):
         scenario = self.base.scenario
         probe_s = min(scenario.duration_s, _PROBE_S)
         probe = msgspec.structs.replace(scenario, duration_s=probe_s).text
-        measure_candidate(probe, None)  # loads the compiled kernel, so that it is not timed
+        CandidateScore.measure(
+            probe, None
+        )  # loads the compiled kernel, so that it is not timed
         clock = SystemClock()
         start_ns = clock.monotonic_ns()
-        measure_candidate(probe, None)
+        CandidateScore.measure(probe, None)
         elapsed_s = (clock.monotonic_ns() - start_ns) * 1e-9
         run_s = elapsed_s * scenario.duration_s / probe_s
         processes = min(jobs or count_cores(), len(self.spaces) * self.budget)
@@ -499,7 +496,7 @@ class TuningPlan(NamedTuple):
         paper_scenarios = [self.build_paper_scenarios(base) for base in bases]
         paper_names = list(paper_scenarios[0])
         paper_items = [
-            build_candidate_item([scenarios[name] for scenarios in paper_scenarios])
+            CandidateItem.of_seeds([scenarios[name] for scenarios in paper_scenarios])
             for name in paper_names
         ]
         total = len(searches) * self.budget + len(paper_items)
@@ -534,7 +531,7 @@ class TuningPlan(NamedTuple):
                 # The scores come in the order of the items: those of each law, and in the first
                 # round those of the printed gains, which remain in the end.
                 measured = pool.map(
-                    measure_candidate_task,
+                    CandidateItem.measure,
                     items,
                     report_progress,
                     together=measure_candidate_tasks if side_by_side else None,
@@ -580,7 +577,7 @@ class TuningPlan(NamedTuple):
         items = []
         for gains in candidates:
             seed_scenarios = [base.with_gains(space, self.knowledge, gains) for base in bases]
-            items.append(build_candidate_item(seed_scenarios))
+            items.append(CandidateItem.of_seeds(seed_scenarios))
         return items
 
 
@@ -823,8 +820,8 @@ def plan_tuning(
             f"--seeds, the number of runs per candidate, must be from 1 to {MAX_TUNING_SEEDS}, "
             f"not {seeds}"
         )
-    knowledge = build_model_information(gravity_percent)
-    base = load_tuning_scenario(source, overrides)
+    knowledge = ModelInformation.of_gravity(gravity_percent)
+    base = TuningScenario.load(source, overrides)
     scenario = base.scenario
     spaces = select_search_spaces([name_law_classes(law) for law in laws], scenario)
     ticks = sum(map(scenario.ticks, scenario.names))
@@ -841,7 +838,7 @@ def plan_tuning(
     if scenario.random:
         for other_seed in range(scenario.seed + 1, scenario.seed + seeds):
             texts = (*overrides, f"seed={other_seed}")
-            others.append(load_tuning_scenario(source, texts))
+            others.append(TuningScenario.load(source, texts))
     for space in spaces:
         # a law may refuse the scenario, for example its scheme: before the search, not in it
         (gains,) = CandidateSearch(space, 1, seed, Objective(objective)).propose_candidates(0)

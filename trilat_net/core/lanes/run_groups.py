@@ -11,10 +11,9 @@ Invariant:
     - The numbers of a run do not depend on the other runs.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 
-from ...scenario import Scenario
-from ..fused import FusedRun
+from ..step.compiled_run import CompiledRun
 from .lane_rows import LANES
 from .lane_run import LaneRun, explain_uncompilable, has_lane_code
 from .lane_structure import RunStructure, find_obstacle, find_structure
@@ -53,7 +52,7 @@ class RunGroup:
     def __init__(
         self,
         members: Sequence[int],
-        runs: Sequence[FusedRun],
+        runs: Sequence[CompiledRun],
         *,
         in_lanes: bool,
         obstacle: str = "",
@@ -98,7 +97,9 @@ class RunGroup:
 
 
 def prepare_lanes(
-    scenario: Scenario, runs: int, least_site_ticks: float = LANE_SITE_TICKS
+    make_run: Callable[[], CompiledRun],
+    runs: int,
+    least_site_ticks: float = LANE_SITE_TICKS,
 ) -> bool:
     """Decides whether a study computes its runs together, and compiles the code in this case.
 
@@ -106,25 +107,24 @@ def prepare_lanes(
     are so long that compiling it pays off.
 
     Args:
-        scenario: Scenario of one of the runs.
+        make_run: Function that returns one of the runs before its first tick.
         runs: Number of runs with this structure.
         least_site_ticks: Number of simulated ticks (control periods), summed over all sites
             (arm controllers) and runs, from which compiling the code pays off. Infinity uses
             existing code only.
     """
-    rates_hz = [spec.rate_hz for spec in scenario.sites.values()]
-    site_ticks = runs * scenario.duration_s * sum(rates_hz)
-    probes = [FusedRun(scenario) for _ in range(LEAST_RUNS)]
+    probes = [make_run() for _ in range(LEAST_RUNS)]
+    site_ticks = runs * probes[0].duration_s * sum(probes[0].rates_hz)
     if runs < LEAST_RUNS or find_obstacle(probes[0]):
         return False
     if site_ticks < least_site_ticks and not has_lane_code(probes[0]):
         return False
     for group in group_runs(probes):
-        group.advance_to(1.0 / max(rates_hz))
+        group.advance_to(1.0 / max(probes[0].rates_hz))
     return True
 
 
-def group_runs(runs: Sequence[FusedRun], record_rows: int = 1) -> Iterator[RunGroup]:
+def group_runs(runs: Sequence[CompiledRun], record_rows: int = 1) -> Iterator[RunGroup]:
     """Divides runs into groups, each of which can be simulated together.
 
     Runs that differ in numbers only, such as gains, come into the same group. A run that must
@@ -132,8 +132,9 @@ def group_runs(runs: Sequence[FusedRun], record_rows: int = 1) -> Iterator[RunGr
 
     Args:
         runs: The runs before their first tick (control period).
-        record_rows: Number of ticks, a power of two, of which `FusedRun.pop_records` must find
-            the records (results of control periods) after each call of `RunGroup.advance_to`.
+        record_rows: Number of ticks, a power of two, of which `CompiledRun.pop_records` must
+            find the records (results of control periods) after each call of
+            `RunGroup.advance_to`.
 
     Yields:
         The groups, each when the work on the previous one has ended.

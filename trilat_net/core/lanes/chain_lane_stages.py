@@ -14,32 +14,26 @@ Invariant:
 from collections.abc import Callable
 from typing import Any
 
-from ...core import (
-    POSE,
-    Array,
-    IntArray,
-    Law,
-    StaleAction,
-    TorqueTable,
+from ...records import Mode
+from ..arms import chain_stages, task_space
+from ..arms.chain import place_joints
+from ..arms.exogenous import TorqueTable
+from ..arms.task_space import POSE
+from ..links.dominance import update_reference
+from ..step.fused_run import first_sent_column, update_peaks, update_sums
+from ..step.jit import lane_leaf, set_lane_form
+from ..step.kernel import (
     adapts,
-    chain_stages,
     emit_stage,
     finish_advance,
-    first_sent_column,
     guard_reference,
     guard_torque,
     hold_motor_torque,
-    lane_leaf,
-    place_joints,
-    set_lane_form,
     sum_trapezoid,
-    task_space,
-    update_peaks,
-    update_reference,
-    update_sums,
     updates_estimate,
 )
-from ...records import Mode
+from ..step.site_setup import Law, StaleAction
+from ..step.vectors import Array, IntArray
 from .lane_laws import compute_law
 from .lane_rows import LaneRow, RowsInLane, in_lane
 from .lane_stages import put_sent_numbers, use_states

@@ -26,19 +26,12 @@ from llvmlite import ir
 from numba.core import cgutils, types
 from numba.core.extending import intrinsic, models, register_jitable, register_model
 
-from ...core import (
-    CHECKED,
-    CompiledLaw,
-    LawForm,
-    RowArray,
-    collect_law_input,
-    digest_sibling_sources,
-    finish_law,
-    leaf,
-    set_lane_form,
-    update_law_view,
-)
 from ...records import Mode
+from ..plug.compiled_law import CHECKED, CompiledLaw, LawForm, collect_law_input, finish_law
+from ..plug.law_view import update_law_view
+from ..plug.plugged import digest_sibling_sources
+from ..step.jit import leaf, set_lane_form
+from ..step.vectors import RowArray
 from .lane_rows import Constants, LaneTable, RowsInLane, offset_rows
 
 _DIVERGED = int(Mode.DIVERGED)

@@ -6,17 +6,3 @@ eight numbers computes the same product for eight runs. Each run gets the same b
 
 Start at `run_groups`, which divides runs into groups that can be computed together.
 """
-
-from .lane_rows import LANES
-from .lane_structure import describe_structure, find_obstacle
-from .run_groups import LEAST_RUNS, RunGroup, group_runs, prepare_lanes
-
-__all__ = [
-    "LANES",
-    "LEAST_RUNS",
-    "RunGroup",
-    "describe_structure",
-    "find_obstacle",
-    "group_runs",
-    "prepare_lanes",
-]

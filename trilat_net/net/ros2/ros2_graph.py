@@ -36,12 +36,8 @@ from typing import Any, NamedTuple, ParamSpec
 import zenoh
 from zenoh import CongestionControl, Reliability, handlers
 
-from ..errors import TrilatError, UsageError
-from .clock import Clock
-from .connection import find_endpoint_addresses
-from .host_names import check_hosts
-from .zenoh_bus import open_zenoh
-from .zenoh_config import Endpoint
+from ...errors import TrilatError, UsageError
+from .. import Clock, Endpoint, check_hosts, find_endpoint_addresses, open_zenoh
 
 TYPE_HASHES = {
     "diagnostic_msgs/msg/DiagnosticArray": (

@@ -18,43 +18,33 @@ from typing import NamedTuple
 import numpy as np
 from numba.core import types
 
-from ...core import (
+from ..links.channel import (
+    LOST,
+    advance_losses,
+    delay_sample,
+    find_delay_us,
+    find_due_ns,
+    loses_samples,
+    select_model,
+)
+from ..links.delay import (
     DELAY,
     LINK_MODEL_DTYPE,
     LOSS,
-    LOST,
-    MAX_ARRIVALS,
-    Array,
-    ChannelArrays,
     DelayKind,
-    DrawKey,
-    IntArray,
-    LinkArrays,
-    LinkRow,
-    Points,
-    ReplayedInputs,
-    Row,
-    RowArray,
-    SiteArrays,
-    accept_sample,
-    advance_losses,
-    call_address,
-    channel_of,
     clamp_delay_us,
-    delay_sample,
     draw_delay_us,
-    find_delay_us,
-    find_due_ns,
-    find_lane_address,
-    first_tick_at,
-    lane_leaf,
-    leaf,
-    loses_samples,
-    release_sample,
-    select_model,
-    tick_ns,
-    uniforms,
 )
+from ..links.link import ChannelArrays, LinkArrays, accept_sample, release_sample
+from ..links.philox import DrawKey, uniforms
+from ..plug.plugged import call_address
+from ..step.fused_run import ReplayedInputs
+from ..step.jit import find_lane_address, lane_leaf, leaf
+from ..step.kernel import channel_of
+from ..step.row_fields import LinkRow
+from ..step.site_arrays import SiteArrays
+from ..step.ticks import MAX_ARRIVALS, first_tick_at, tick_ns
+from ..step.vectors import Array, IntArray, Points, Row, RowArray
 
 BLOCK_TICKS = 500
 """Number of ticks whose deliveries are computed together."""
@@ -97,7 +87,8 @@ class LinkStates(NamedTuple):
         delays_us: Room for the delay of each sample of a block, us.
         stamps_ns: Room for the stamp of each sample of a block, ns.
         times_ns: Room for the nominal time of each tick of a block, ns.
-        made: Room for the number of samples that a peer has made at each tick of a block.
+        sample_counts: Room for the number of samples that a peer has sent before the end of
+            each tick of a block.
     """
 
     links: RowArray
@@ -109,7 +100,7 @@ class LinkStates(NamedTuple):
     delays_us: IntArray
     stamps_ns: IntArray
     times_ns: IntArray
-    made: IntArray
+    sample_counts: IntArray
 
 
 def copy_link_states(tables: Sequence[SiteArrays]) -> LinkStates:
@@ -142,7 +133,7 @@ def copy_link_states(tables: Sequence[SiteArrays]) -> LinkStates:
         delays_us=np.zeros(_MOST_SAMPLES, np.int64),
         stamps_ns=np.zeros(_MOST_SAMPLES, np.int64),
         times_ns=np.zeros(BLOCK_TICKS, np.int64),
-        made=np.zeros(BLOCK_TICKS, np.int64),
+        sample_counts=np.zeros(BLOCK_TICKS, np.int64),
     )
 
 
@@ -587,7 +578,7 @@ def _use_after_delay(
         rate_hz: Tick rate of the peer, Hz.
         newest: Sample in use before the block, or -1.
         states: Contains for each tick its time and the number of samples that the peer has
-            made.
+            sent.
         used: Written, one entry per tick.
 
     Returns:
@@ -595,7 +586,7 @@ def _use_after_delay(
     """
     next_ns = tick_ns(newest + 1, rate_hz) + delay_ns
     for index in range(count):
-        while next_ns <= states.times_ns[index] and newest + 1 < states.made[index]:
+        while next_ns <= states.times_ns[index] and newest + 1 < states.sample_counts[index]:
             newest += 1
             next_ns = tick_ns(newest + 1, rate_hz) + delay_ns
         used[index] = newest
@@ -657,12 +648,12 @@ def use_samples_of_rates(
             next_samples[i, p] = end_sample
             for index in range(end_sample - first_sample):
                 states.stamps_ns[index] = tick_ns(first_sample + index, peer_hz)
-            made = first_tick_at(states.times_ns[0] + 1, peer_hz)
+            sample_count = first_tick_at(states.times_ns[0] + 1, peer_hz)
             for index in range(count):
-                while tick_ns(made, peer_hz) <= states.times_ns[index]:
-                    made += 1
+                while tick_ns(sample_count, peer_hz) <= states.times_ns[index]:
+                    sample_count += 1
                 # The peer may be ahead: a tick may be planned after later ticks of the peer.
-                states.made[index] = max(min(made, end[j]), first[j])
+                states.sample_counts[index] = max(min(sample_count, end[j]), first[j])
             for lane in range(states.links.shape[0]):
                 if ended[lane] >= 0:
                     continue
@@ -699,7 +690,7 @@ def use_samples_of_rates(
                 # Before the next tick of the site, the peer goes on to the end of the block.
                 largest_age = max(largest_age, end[j] - 1 - newest)
                 for index in range(count):
-                    age = states.made[index] - 1 - used[i, p, lane, index]
+                    age = states.sample_counts[index] - 1 - used[i, p, lane, index]
                     largest_age = max(largest_age, age)
     return largest_age
 
@@ -796,9 +787,9 @@ def use_recorded_samples(
                 release_sample(k, rate_hz, link)
                 sample = links[i, p].used
                 used[i, p, 0, k - first[i]] = sample
-                made = first_tick_at(tick_ns(k, rate_hz) + 1, rates_hz[peer])
-                made = max(min(made, end[peer]), first[peer])
-                largest_age = max(largest_age, made - 1 - sample)
+                sample_count = first_tick_at(tick_ns(k, rate_hz) + 1, rates_hz[peer])
+                sample_count = max(min(sample_count, end[peer]), first[peer])
+                largest_age = max(largest_age, sample_count - 1 - sample)
             # Before the next tick of the site, the peer goes on to the end of the block.
             largest_age = max(largest_age, end[peer] - 1 - links[i, p].used)
     return largest_age

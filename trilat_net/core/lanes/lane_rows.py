@@ -212,7 +212,7 @@ def _offset_pointer(builder: Any, pointer: Any, offset: Any) -> Any:
     return builder.gep(pointer, [offset], source_etype=ir.IntType(8))
 
 
-def offset_rows(builder: Any, pointer: Any, words: int) -> Any:
+def offset_rows(builder: Any, pointer: Any, word_count: int) -> Any:
     """Generates LLVM code for an address that lies some numbers of a row behind a pointer.
 
     The rows of several runs are stored side by side, so that each number of a row occupies
@@ -221,10 +221,10 @@ def offset_rows(builder: Any, pointer: Any, words: int) -> Any:
     Args:
         builder: Appends LLVM instructions.
         pointer: The pointer.
-        words: Count of numbers (64-bit words) in a row of one run.
+        word_count: Count of numbers (64-bit words) in a row of one run.
     """
     word = ir.IntType(64)
-    return _offset_pointer(builder, pointer, ir.Constant(word, words * LANES * _WORD))
+    return _offset_pointer(builder, pointer, ir.Constant(word, word_count * LANES * _WORD))
 
 
 @infer_getattr

@@ -15,8 +15,9 @@ from typing import Any, NamedTuple
 import numba
 import numpy as np
 
-from ...core import OWN_KINDS, StaleAction
-from ..fused import FusedRun
+from ..arms.exogenous import OWN_KINDS
+from ..step.compiled_run import CompiledRun
+from ..step.site_setup import StaleAction
 from .lane_laws import LaneLaw, describe_lane_law
 from .lane_rows import Constants
 
@@ -62,7 +63,7 @@ class RunStructure(NamedTuple):
         peers: Number of other sites from which each site receives samples (sent states).
         ramps: Largest number of planned changes of the dominance factors.
         table: Shape and content of the table of numbers of the operators and environments.
-        duration_s: Duration of the scenario, s.
+        duration_s: Planned duration of the run, s.
         settled_rad: Position error below which an arm counts as settled, rad.
     """
 
@@ -84,7 +85,7 @@ def _list_actors(actors: Any) -> list[Any]:
     return [row for row in actors if row["sampled"] in (0, 1)]
 
 
-def find_obstacle(run: FusedRun, *, hand_site: int = -1) -> str:
+def find_obstacle(run: CompiledRun, *, hand_site: int = -1) -> str:
     """Explains why a run cannot be simulated side by side with other runs, for the user.
 
     Args:
@@ -115,7 +116,7 @@ def _list_prismatic(chain: Any, i: int, joints: int) -> tuple[int, ...]:
     return () if chain is None else tuple(chain["prismatic"][i, :joints].tolist())
 
 
-def find_structure(run: FusedRun) -> RunStructure:
+def find_structure(run: CompiledRun) -> RunStructure:
     """Returns the properties of a run that decide with which other runs it can be computed.
 
     For example, two runs with the same control laws but different gains have the same result.
@@ -146,12 +147,12 @@ def find_structure(run: FusedRun) -> RunStructure:
         peers=tables.links.shape[1],
         ramps=tables.ramps.shape[1],
         table=(tables.table.shape, tables.table.tobytes()),
-        duration_s=run.scenario.duration_s,
+        duration_s=run.duration_s,
         settled_rad=memory.settled_rad,
     )
 
 
-def describe_structure(run: FusedRun) -> Hashable:
+def describe_structure(run: CompiledRun) -> Hashable:
     """Returns a key for sorting runs into groups that can be simulated side by side.
 
     The key is equal for runs that differ in numbers only, such as gains.

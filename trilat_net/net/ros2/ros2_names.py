@@ -6,7 +6,7 @@ does not accept. Such a name is therefore refused with an explanation.
 
 import re
 
-from ..errors import UsageError
+from ...errors import UsageError
 
 _NAME = re.compile(r"[A-Za-z_][A-Za-z0-9_]*(/[A-Za-z_][A-Za-z0-9_]*)*")
 """Parts separated by slashes.

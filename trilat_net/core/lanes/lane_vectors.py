@@ -37,7 +37,8 @@ from numba.core.typing.templates import (
     signature,
 )
 
-from ...core import choose, holds_anywhere, round_down, set_lane_form, whole
+from ..step.jit import set_lane_form
+from ..step.vectors import choose, holds_anywhere, round_down, whole
 from .lane_rows import LANES, Constants, LaneField, LaneTable, RowType, make_view, offset_rows
 
 GROUP = 8

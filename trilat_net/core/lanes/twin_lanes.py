@@ -6,8 +6,8 @@ receive the same samples (states of the other arms) at the same times, so the de
 simulated network are computed once for all.
 
 Invariant:
-    - The states and the records are those of `FusedRun`, bit for bit, as long as no arm leaves
-      its limits.
+    - The states and the records are those of `CompiledRun`, bit for bit, as long as no arm
+      leaves its limits.
 """
 
 from collections.abc import Sequence
@@ -16,9 +16,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ...core import Array, IntArray, ReplayedInputs, first_tick_at
 from ...records import NS_PER_S
-from ..fused import FusedRun, mark_floats, scale_differences
+from ..step.compiled_run import CompiledRun
+from ..step.fused_run import ReplayedInputs
+from ..step.run_state import mark_floats, scale_differences
+from ..step.ticks import first_tick_at
+from ..step.vectors import Array, IntArray
 from .lane_deliveries import use_recorded_samples
 from .lane_rows import LANES, Words
 from .lane_run import LaneRun, has_lane_code
@@ -34,7 +37,9 @@ class LaneEndedError(Exception):
     """
 
 
-def suits_twins(run: FusedRun, runs: int, ticks: Sequence[int], least_site_ticks: int) -> bool:
+def suits_twins(
+    run: CompiledRun, runs: int, ticks: Sequence[int], least_site_ticks: int
+) -> bool:
     """Returns True if a run and its twins are computed faster together than one by one.
 
     The twins are copies of the run that start slightly displaced. Computing them together, with
@@ -70,7 +75,7 @@ class TwinLanes(LaneRun):
 
     def __init__(
         self,
-        run: FusedRun,
+        run: CompiledRun,
         count: int,
         ticks: Sequence[int],
         feed: ReplayedInputs,
@@ -96,7 +101,7 @@ class TwinLanes(LaneRun):
             (self._links, mark_floats(self._layout.link)),
         ]
         of_laws = (self._laws, self._sent, self._received)
-        floats += [(words, np.full(words.shape[1], True)) for words in of_laws]
+        floats += [(table, np.full(table.shape[1], True)) for table in of_laws]
         self._changing = floats
 
     def step_to(self, last_ns: int) -> None:
@@ -175,7 +180,7 @@ class TwinLanes(LaneRun):
 class LaneTwin:
     """A run or a slightly displaced copy of it (twin), simulated side by side with others.
 
-    The class has those methods of `FusedRun` with which the growth of the displacement is
+    The class has those methods of `CompiledRun` with which the growth of the displacement is
     measured, so that callers need not know how the runs are simulated.
 
     Args:
@@ -202,16 +207,16 @@ class LaneTwin:
         """Multiplies the difference between the states of this run and another run by a factor.
 
         Every floating-point number x of the state becomes x_other + factor (x - x_other), as in
-        `FusedRun.scale_difference`. This includes the states that are in transit.
+        `CompiledRun.scale_difference`. This includes the states that are in transit.
 
         Args:
             other: The other run that is simulated together with this one.
             factor: The factor.
         """
         lanes = self._lanes
-        for words, is_float in lanes._changing:
-            floats = np.broadcast_to(is_float, words.shape[:2])
-            _scale(words[:, :, self._lane], words[:, :, other._lane], floats, factor)
+        for table, is_float in lanes._changing:
+            floats = np.broadcast_to(is_float, table.shape[:2])
+            _scale(table[:, :, self._lane], table[:, :, other._lane], floats, factor)
         states = lanes._states.view(np.int64)
         mine = states[:, :, self._lane]
         _scale(mine, states[:, :, other._lane], np.full(mine.shape, True), factor)
@@ -220,16 +225,16 @@ class LaneTwin:
         """Adds small offsets to one field of the state of all sites, such as the angles "q".
 
         The measured growth of the resulting difference shows whether the system is stable. For
-        the shape of the offsets see `FusedRun.displace`.
+        the shape of the offsets see `CompiledRun.displace`.
         """
         columns = self._find_columns(field)
-        words = slice(columns.start, columns.start + offsets.shape[1])
-        self._lanes._site.view(np.float64)[:, words, self._lane] += offsets
+        field_words = slice(columns.start, columns.start + offsets.shape[1])
+        self._lanes._site.view(np.float64)[:, field_words, self._lane] += offsets
 
     def measure_distance(self, other: "LaneTwin", field: str) -> float:
         """Returns the largest absolute difference of one field, such as "q", between two runs.
 
-        For the fields and units see `FusedRun.measure_distance`.
+        For the fields and units see `CompiledRun.measure_distance`.
         """
         numbers = self._lanes._site.view(np.float64)[:, self._find_columns(field)]
         difference = numbers[:, :, self._lane] - numbers[:, :, other._lane]

@@ -1,12 +1,12 @@
 """Simulates up to `LANES` runs together, each in one lane of the vector registers.
 
 `LaneRun` takes runs with equal structure, for example the points of a sweep over a gain, and
-advances them to a time. It is the counterpart of `FusedRun`, which simulates one run.
+advances them to a time. It is the counterpart of `CompiledRun`, which simulates one run.
 
 Invariant:
-    - After `advance_to`, each run has the numbers that `FusedRun.advance_to` would give it, bit
-      for bit. Only intermediate results of a tick ("scratch" in `row_fields`), and entries of
-      ring buffers that are not used any more, may differ.
+    - After `advance_to`, each run has the numbers that `CompiledRun.advance_to` would give it,
+      bit for bit. Only intermediate results of a tick ("scratch" in `row_fields`), and entries
+      of ring buffers that are not used any more, may differ.
     - The arrays of the lanes do not overlap in memory, as `advance_site` requires.
 """
 
@@ -20,22 +20,13 @@ from numba.core import types
 from numba.core.errors import NumbaError
 from numpy.typing import NDArray
 
-from ...core import (
-    BUCKETS_PER_S,
-    NEVER_NS,
-    Array,
-    IntArray,
-    ReplayedInputs,
-    SiteArrays,
-    find_lane_address,
-    first_tick_at,
-    is_lane_code_stored,
-    leaf,
-    read_lane_assembly,
-    tick_ns,
-)
 from ...records import NS_PER_S, Mode
-from ..fused import FusedRun, RunMemory
+from ..step.compiled_run import CompiledRun, RunMemory
+from ..step.fused_run import NEVER_NS, ReplayedInputs
+from ..step.jit import find_lane_address, is_lane_code_stored, leaf, read_lane_assembly
+from ..step.site_arrays import SiteArrays
+from ..step.ticks import BUCKETS_PER_S, first_tick_at, tick_ns
+from ..step.vectors import Array, IntArray
 from .chain_lane_stages import advance_chain_site
 from .lane_deliveries import (
     BLOCK_TICKS,
@@ -138,7 +129,7 @@ class _LaneLayout(NamedTuple):
     sent: int
 
 
-def _find_layout(run: FusedRun) -> _LaneLayout:
+def _find_layout(run: CompiledRun) -> _LaneLayout:
     """Returns the data types and lengths of all arrays of a run, on which its code depends.
 
     A run without compiled control laws has arrays of length 0 in their place.
@@ -236,7 +227,7 @@ def _choose_code(layout: _LaneLayout) -> Callable[..., None]:
     return advance_site if layout.chain is None else advance_chain_site
 
 
-def _find_addresses(run: FusedRun, structure: RunStructure, clock: types.Type) -> IntArray:
+def _find_addresses(run: CompiledRun, structure: RunStructure, clock: types.Type) -> IntArray:
     """Returns the address of the compiled code that computes a tick of each site.
 
     The code computes a tick (period of the control loop) for several runs at once. It is
@@ -258,7 +249,7 @@ def _find_addresses(run: FusedRun, structure: RunStructure, clock: types.Type) -
     return np.array(addresses)
 
 
-def explain_uncompilable(run: FusedRun, clock: types.Type = types.int64) -> str:
+def explain_uncompilable(run: CompiledRun, clock: types.Type = types.int64) -> str:
     """Returns why a control law cannot be compiled for several runs at once, for a message.
 
     Such a law may still be compiled for a single run. The function finds the answer by
@@ -279,7 +270,7 @@ def explain_uncompilable(run: FusedRun, clock: types.Type = types.int64) -> str:
     return ""
 
 
-def read_assembly(run: FusedRun, i: int) -> str:
+def read_assembly(run: CompiledRun, i: int) -> str:
     """Returns the machine code for one arm as text, in which tests look for vectors.
 
     Vector instructions must be found there, because the simulation is slow without them.
@@ -313,7 +304,7 @@ def _copy_records(first: IntArray, kept: Array, records: Array) -> None:
                     records[lane, i, tick, column] = kept[i, row, column, lane]
 
 
-def has_lane_code(run: FusedRun) -> bool:
+def has_lane_code(run: CompiledRun) -> bool:
     """Returns True if the code that simulates a run in lanes is stored on the disk already.
 
     A lane is the position of one of several runs that are simulated at once. Without stored
@@ -340,7 +331,7 @@ class _LinksOfRun:
         run: The run before its first tick (control period).
     """
 
-    def __init__(self, run: FusedRun) -> None:
+    def __init__(self, run: CompiledRun) -> None:
         self._run = run
         self._ticks: IntArray = np.zeros_like(run.memory.progress["tick"])
         # A sample of a tick that was planned late arrives at a later tick of the receiver.
@@ -426,7 +417,7 @@ class LaneRun:
 
     clock: types.Type = types.int64
 
-    def __init__(self, runs: Sequence[FusedRun], record_rows: int = 1) -> None:
+    def __init__(self, runs: Sequence[CompiledRun], record_rows: int = 1) -> None:
         assert 0 < len(runs) <= LANES
         structure = find_structure(runs[0])
         assert all(find_structure(run) == structure for run in runs)
@@ -573,7 +564,7 @@ class LaneRun:
 
         A run ends earlier if an arm leaves its limits. The results, and the records (results of
         control periods) of the latest ticks (control periods) if they are kept, are written
-        into the `FusedRun` objects.
+        into the `CompiledRun` objects.
 
         Args:
             until_s: The time, s, later than that of the previous call.
@@ -768,11 +759,11 @@ class LaneRun:
         peaks[:, : self._peaks.shape[1]] = self._peaks
         self._peaks = peaks
 
-    def _write_records(self, lane: int, run: FusedRun, records: Array) -> None:
+    def _write_records(self, lane: int, run: CompiledRun, records: Array) -> None:
         """Copies the latest records of one lane into the object of its run.
 
         A lane is the position of a run among the runs that are simulated together. The caller
-        reads the records from the run with `FusedRun.pop_records`.
+        reads the records from the run with `CompiledRun.pop_records`.
 
         Args:
             lane: Index of the lane.
@@ -791,8 +782,8 @@ class LaneRun:
             sent.t_ns[i, pages] = ticks * NS_PER_S // self._rates_hz[i]
             sent.rows[i, pages] = records[i, ticks - first]
 
-    def _write_back(self, lane: int, run: FusedRun, until_s: float) -> None:
-        """Copies the state of a run that was simulated with others into its `FusedRun` object.
+    def _write_back(self, lane: int, run: CompiledRun, until_s: float) -> None:
+        """Copies the state of a run that was simulated with others into its `CompiledRun`.
 
         Args:
             lane: Index (lane) of the run among the runs that are simulated together.
@@ -851,7 +842,7 @@ class LaneRun:
                 received=self._received[:, :, lane].view(np.float64),
             )
 
-    def _write_sent(self, lane: int, run: FusedRun) -> None:
+    def _write_sent(self, lane: int, run: CompiledRun) -> None:
         """Copies the latest sent states of one run from common arrays into its own records.
 
         Several runs are simulated side by side, each in one lane. A slow site (arm controller)
@@ -865,8 +856,7 @@ class LaneRun:
         sent = run.memory.sent
         kept = min(sent.t_ns.shape[1], self._pages)
         joints = self._layout.joints
-        for i, name in enumerate(run.scenario.names):
-            layout = run.scenario.layout(name)
+        for i, layout in enumerate(run.layouts):
             end = int(self._ticks[i])
             ticks = np.arange(max(end - kept, 0), end)
             pages = ticks % sent.t_ns.shape[1]
@@ -896,15 +886,15 @@ def _find_recorded_hands(
         most_sources: Number of rows of operators and environments of each site.
     """
     coordinates = (feed.hands.shape[2] - 1) // 2
-    words = [*find_words(actor, "grip")]
+    hand_words = [*find_words(actor, "grip")]
     columns = [0]
     for name, first in (("a", 1), ("b", 1 + coordinates)):
         words_of_vector = [*find_words(actor, name)][:coordinates]
-        words += words_of_vector
+        hand_words += words_of_vector
         columns += range(first, first + len(words_of_vector))
     first_rows = np.arange(len(feed.hand_indices)) * most_sources
     rows = np.where(feed.hand_indices < 0, -1, first_rows + feed.hand_indices)
-    return RecordedHands(feed.hands, rows, np.array(words), np.array(columns))
+    return RecordedHands(feed.hands, rows, np.array(hand_words), np.array(columns))
 
 
 def view_rows(table: NDArray[np.float64]) -> NDArray[Any]:

@@ -6,7 +6,7 @@ Therefore each lane has a clock of its own. In each run, a program may move one 
 provides the actions of all programs as an array.
 
 Invariant:
-    - After each call of `advance`, a run has the state that `FusedRun.step_to` gives it with
+    - After each call of `advance`, a run has the state that `CompiledRun.step_to` gives it with
       the same actions, bit for bit.
     - A lane does not depend on the other lanes.
 """
@@ -17,16 +17,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ...core import (
-    LINK_MODEL_DTYPE,
-    Array,
-    HandRules,
-    IntArray,
-    SeveralHands,
-    leaf,
-    tick_ns,
-)
-from ..fused import FusedRun
+from ..life.live_hand import HandRules
+from ..life.several_hands import SeveralHands
+from ..links.delay import LINK_MODEL_DTYPE
+from ..step.compiled_run import CompiledRun
+from ..step.jit import leaf
+from ..step.ticks import tick_ns
+from ..step.vectors import Array, IntArray
 from .lane_deliveries import BLOCK_TICKS, DrawAddresses, LinkStates, use_samples
 from .lane_rows import LANES, LaneNumbers, Words, allocate_words, pointer_to, read_words
 from .lane_run import LaneRun, explain_uncompilable, find_words, put_rows, view_rows
@@ -67,27 +64,27 @@ def _use_samples_of_lanes(
     """
     largest_age = 0
     for lane in range(runs):
-        own = slice(lane, lane + 1)
+        lane_slice = slice(lane, lane + 1)
         of_lane = LinkStates(
-            states.links[own],
-            states.models[own],
-            states.points[own],
-            states.releases[own],
-            states.newest[own],
+            states.links[lane_slice],
+            states.models[lane_slice],
+            states.points[lane_slice],
+            states.releases[lane_slice],
+            states.newest[lane_slice],
             states.uniforms,
             states.delays_us,
             states.stamps_ns,
             states.times_ns,
-            states.made,
+            states.sample_counts,
         )
         age = use_samples(
             first=first[lane],
             count=count,
             rate_hz=rate_hz,
-            ended=skipped[own],
+            ended=skipped[lane_slice],
             states=of_lane,
             draws=draws,
-            used=used[:, :, own],
+            used=used[:, :, lane_slice],
         )
         largest_age = max(largest_age, age)
     return largest_age
@@ -244,7 +241,7 @@ class LaneEpisodes(LaneRun):
     least_runs = LEAST_RUNS
 
     def __init__(
-        self, run: FusedRun, count: int, *, hand_site: int, hand_row: int, period_ticks: int
+        self, run: CompiledRun, count: int, *, hand_site: int, hand_row: int, period_ticks: int
     ) -> None:
         """Allocates the arrays for several episodes that are simulated side by side.
 
@@ -262,17 +259,17 @@ class LaneEpisodes(LaneRun):
         self._clock_addresses = np.array([row.ctypes.data for row in self._clock_words])
         most_sources = len(self._actors) // self._sites
         self._hand_row = hand_site * most_sources + hand_row
-        words = [*find_words(self._layout.actor, "grip")]
+        action_words = [*find_words(self._layout.actor, "grip")]
         for name in ("a", "b"):
-            words += [*find_words(self._layout.actor, name)][: SeveralHands.axes]
-        self._action_words = np.array(words)
+            action_words += [*find_words(self._layout.actor, name)][: SeveralHands.axes]
+        self._action_words = np.array(action_words)
         self._used_before = np.full(self._used.shape[:3], -1)
         self._span_first = self.ticks.copy()
         self._widen_peaks(1)
         self._table_addresses = self._find_tables()
 
     @staticmethod
-    def find_structure(run: FusedRun) -> RunStructure:
+    def find_structure(run: CompiledRun) -> RunStructure:
         """Returns the properties in which runs must agree to be simulated side by side.
 
         Examples are the number of joints and the control laws. Durations may differ, because an
@@ -297,7 +294,7 @@ class LaneEpisodes(LaneRun):
         return SeveralHands.explain(rules, period_ticks, largest_action)
 
     @staticmethod
-    def explain_run(run: FusedRun, hand_site: int) -> str:
+    def explain_run(run: CompiledRun, hand_site: int) -> str:
         """Explains why a run cannot be simulated side by side with others; "" if it can.
 
         The function finds the answer by compiling the code of the simulation, which can take
@@ -312,7 +309,7 @@ class LaneEpisodes(LaneRun):
             obstacle = obstacle or "tick rates that differ between sites"
         return obstacle or explain_uncompilable(run, _CLOCK)
 
-    def load(self, lane: int, run: FusedRun, rules: HandRules) -> None:
+    def load(self, lane: int, run: CompiledRun, rules: HandRules) -> None:
         """Starts a new episode of reinforcement learning in place of one that has ended.
 
         Several episodes (simulated runs) advance side by side, and each has a place in common
@@ -335,8 +332,8 @@ class LaneEpisodes(LaneRun):
             (self._progress, memory.progress),
             (self._ramps, view_rows(tables.ramps)),
         ]
-        for words, rows in pairs:
-            words[:, :, lane] = read_words(rows.reshape(-1))
+        for lane_words, rows in pairs:
+            lane_words[:, :, lane] = read_words(rows.reshape(-1))
         if memory.laws is not None:
             self._laws[:, :, lane] = memory.laws.rows.view(np.int64)
             self._sent[:, :, lane] = memory.laws.sent.view(np.int64)
@@ -349,7 +346,7 @@ class LaneEpisodes(LaneRun):
         self.hands.begin(lane, rules)
         self.runs[lane] = run
 
-    def _load_links(self, lane: int, run: FusedRun) -> None:
+    def _load_links(self, lane: int, run: CompiledRun) -> None:
         """Copies the state of a run's simulated network links into a lane.
 
         A lane is the place of one of the runs that are simulated together. The arrays that all
@@ -558,8 +555,8 @@ class LaneEpisodes(LaneRun):
             name: Name of the field.
             dtype: Data type of the field.
         """
-        words = find_words(layout, name)
-        columns = slice(words.start, words.stop)
+        word_range = find_words(layout, name)
+        columns = slice(word_range.start, word_range.stop)
         runs = len(self.runs)
         numbers = present[:, columns, :runs]
         has_ended = self.has_ended
@@ -585,7 +582,7 @@ class LaneEpisodes(LaneRun):
         return is_new
 
     def write_back(self, lane: int) -> None:
-        """Copies the present state of a run into its `FusedRun` object, where callers read it.
+        """Copies the present state of a run into its `CompiledRun`, where callers read it.
 
         The run cannot continue alone from there, because its simulated network links still have
         their initial state.

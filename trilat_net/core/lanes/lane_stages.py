@@ -15,42 +15,32 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ...core import (
-    BUCKETS_PER_S,
-    NEVER_NS,
+from ...records import Mode
+from ..arms import two_link_stages
+from ..arms.exogenous import (
     NO_TORQUE,
-    Array,
-    IntArray,
-    Law,
     SourceTorque,
-    StaleAction,
     TorqueTable,
-    Vector,
-    adapts,
     add_source_torque,
-    call_address,
+    torque_on_arm,
+)
+from ..links.dominance import update_reference
+from ..plug.plugged import call_address
+from ..step.fused_run import NEVER_NS, first_sent_column, update_peaks, update_sums
+from ..step.jit import lane_leaf, leaf, set_lane_form
+from ..step.kernel import (
+    adapts,
     emit_stage,
     error_stages,
     finish_advance,
-    first_sent_column,
-    five,
     guard_reference,
     guard_torque,
     hold_motor_torque,
-    lane_leaf,
-    leaf,
-    pair,
-    put_pair,
-    set_lane_form,
-    tick_ns,
-    torque_on_arm,
     torque_stage,
-    two_link_stages,
-    update_peaks,
-    update_reference,
-    update_sums,
 )
-from ...records import Mode
+from ..step.site_setup import Law, StaleAction
+from ..step.ticks import BUCKETS_PER_S, tick_ns
+from ..step.vectors import Array, IntArray, Vector, five, pair, put_pair
 from .lane_laws import compute_law
 from .lane_rows import Words, in_lane, number_of, pointer_to, select_row
 
@@ -631,13 +621,13 @@ class RecordedHands(NamedTuple):
     Attributes:
         actions: Numbers of the operators, shape (N, ticks, C).
         rows: Row of the operator of each site among all operators and environments; -1: none.
-        words: Words of the row that the numbers replace.
+        row_words: Words of the row that the numbers replace.
         columns: Index of the number for each of these words.
     """
 
     actions: Array
     rows: IntArray
-    words: IntArray
+    row_words: IntArray
     columns: IntArray
 
 
@@ -658,10 +648,10 @@ def _apply_recorded_hand(
     """
     if hands.rows[i] < 0 or k >= hands.actions.shape[1]:
         return
-    for n in range(hands.words.shape[0]):
+    for n in range(hands.row_words.shape[0]):
         for lane in range(lanes):
             action = hands.actions[i, k, hands.columns[n]]
-            actors[hands.rows[i], hands.words[n], lane] = action
+            actors[hands.rows[i], hands.row_words[n], lane] = action
 
 
 @leaf

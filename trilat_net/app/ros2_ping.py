@@ -1,0 +1,190 @@
+"""Measures the delays of the messages on a ROS 2 topic, for `trilat ping --ros2`.
+
+ROS 2 is the Robot Operating System. Each message of its programs carries the time at which it
+was sent, so that the delay is known on arrival.
+
+Invariant:
+    - The measurement does not disturb the publishers. This process only receives.
+"""
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from ..errors import RunFailed
+from ..net import Clock, RouterSilent, SystemClock
+from ..net.ros2 import ROUTER_ADVICE, Attachment, Refusals, Ros2Graph, check_ros_name
+from ..records import NS_PER_S
+from ..results import Result
+from ..signals import Interrupt
+
+_POLL_NS = 10_000_000
+"""Pause between two checks whether the measurement is over, in ns."""
+
+
+def ping_topic(
+    topic: str,
+    routers: Sequence[str],
+    domain: int,
+    lasts_s: float,
+    report: Callable[[str], None],
+) -> "TopicDelays":
+    """Measures the delays of a topic of the ROS 2 programs that a router connects.
+
+    Ctrl-C ends the measurement earlier.
+
+    Args:
+        topic: Name of the topic.
+        routers: Endpoints of the Zenoh router of ROS. The first one that answers is used.
+        domain: Number of the ROS domain.
+        lasts_s: Duration of the measurement, in s.
+        report: Function that receives a sentence about messages that could not be used.
+
+    Raises:
+        UsageError: The name of the topic is not valid.
+        RouterSilent: No router answers.
+        RunFailed: Nobody has published on the topic.
+    """
+    name = check_ros_name(topic, "topic")
+    clock = SystemClock()
+    try:
+        graph = Ros2Graph(
+            refusals=Refusals(report),
+            routers=routers,
+            namespace="",
+            name="trilat_ping",
+            clock=clock,
+            domain=domain,
+        )
+    except RouterSilent as silent:
+        raise RouterSilent(f"{silent}; {ROUTER_ADVICE}") from None
+
+    with graph, Interrupt() as interrupt:
+        return measure_topic_delays(graph, clock, name, lasts_s, interrupt.is_requested)
+
+
+@dataclass(frozen=True, repr=False)
+class TopicDelays(Result):
+    """Delays of the messages on a ROS 2 topic, for each program that publishes them.
+
+    A delay is the time from the time stamp with which a message was sent to its arrival at this
+    process. Between two machines it contains the offset of their clocks.
+
+    Attributes:
+        topic: Name of the topic.
+        lasted_s: Duration of the measurement, in s.
+        publishers: One table row per publisher, with the number and the delays of its messages.
+    """
+
+    topic: str
+    lasted_s: float
+    publishers: list[dict[str, Any]]
+
+    def to_rows(self) -> list[dict[str, Any]]:
+        """Returns a table row for each program that publishes on the ROS 2 topic.
+
+        A row contains the number of messages of the program, and their delays.
+        """
+        return self.publishers
+
+    def blocks(self) -> Iterator[Any]:
+        """Returns the table of delays that `trilat ping --ros2` prints.
+
+        The module that composes the texts is imported inside this method, because its import is
+        of no use to a program that only reads the numbers.
+        """
+        from ..presentation import compose_topic_delays
+
+        return compose_topic_delays(self)
+
+
+def measure_topic_delays(
+    graph: Ros2Graph,
+    clock: Clock,
+    topic: str,
+    lasts_s: float,
+    stopped: Callable[[], bool],
+) -> TopicDelays:
+    """Measures the delays of a ROS 2 topic, from the sending time that each message carries.
+
+    The function receives the messages of the topic for some time, and then evaluates them for
+    each program that publishes on the topic.
+
+    Args:
+        graph: Connection to the ROS 2 programs.
+        clock: Clock of this process.
+        topic: Name of the topic.
+        lasts_s: Duration of the measurement, in s.
+        stopped: Function that returns True to end the measurement earlier.
+
+    Raises:
+        RunFailed: Nobody has published on the topic.
+    """
+    # Number and delay of each message, and the type of the messages, by publisher.
+    samples: dict[bytes, list[tuple[int, int]]] = {}
+    types: dict[bytes, str] = {}
+
+    def receive(kind: str, attachment: Attachment) -> None:
+        """Stores the number and the delay of a ROS 2 message for the program that sent it.
+
+        The function is called in a thread of the network library Zenoh.
+
+        Args:
+            kind: Type of the message.
+            attachment: Additional data of the message: its publisher, number and sending time.
+        """
+        delay_ns = clock.unix_ns() - attachment.sent_unix_ns
+        types[attachment.gid] = kind
+        samples.setdefault(attachment.gid, []).append((attachment.number, delay_ns))
+
+    graph.tap(topic, receive)
+    begun_ns = clock.monotonic_ns()
+    while not stopped() and clock.monotonic_ns() - begun_ns < lasts_s * NS_PER_S:
+        clock.sleep_until(clock.monotonic_ns() + _POLL_NS)
+    lasted_s = (clock.monotonic_ns() - begun_ns) / NS_PER_S
+
+    if not samples:
+        raise RunFailed(
+            f"no publisher sent a message on /{topic} in {lasted_s:.3g} s: check the topic "
+            "with ros2 topic list, and the domain with --domain"
+        )
+
+    publishers = []
+    # The lists are copied, because messages still arrive.
+    for gid, publisher_samples in list(samples.items()):
+        # DDS calls a type "std_msgs::msg::dds_::Bool_" that ROS calls "std_msgs/msg/Bool".
+        kind = types[gid].replace("::dds_::", "/").replace("::", "/").removesuffix("_")
+        delays = _describe_delays(list(publisher_samples), lasted_s)
+        publishers.append({"gid": gid.hex(), "type": kind} | delays)
+    return TopicDelays(topic, lasted_s, publishers)
+
+
+def _describe_delays(samples: Sequence[tuple[int, int]], lasted_s: float) -> dict[str, Any]:
+    """Returns the table row of one publisher on a ROS 2 topic, with a histogram of its delays.
+
+    A publisher is a program that sends messages on the topic. The table lets the user compare
+    the publishers.
+
+    Args:
+        samples: Number and delay in ns of each message that arrived. The publisher numbers its
+            messages consecutively, so that a gap in the numbers shows lost messages.
+        lasted_s: Duration of the measurement, in s.
+    """
+    numbers = {number for number, _ in samples}
+    sent = max(numbers) - min(numbers) + 1
+
+    delays_us = np.array([delay_ns for _, delay_ns in samples]) / 1e3
+    counts, edges_us = np.histogram(delays_us, bins=20)
+    quantiles_us = {}
+    for name, percent in (("min", 0.0), ("p50", 50.0), ("p99", 99.0), ("max", 100.0)):
+        quantiles_us[name] = float(np.percentile(delays_us, percent))
+
+    return {
+        "messages": len(samples),
+        "lost": sent - len(numbers),
+        "rate_hz": len(samples) / lasted_s,
+        "delay_us": quantiles_us,
+        "histogram": {"edges_us": edges_us.tolist(), "counts": counts.tolist()},
+    }

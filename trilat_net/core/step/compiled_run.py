@@ -1,0 +1,870 @@
+"""Simulates the arms of several sites in one compiled loop, from the setups of the sites.
+
+The loop does not store every tick (period of the control loop), but the largest values of every
+interval of 50 ms, and sums over the run.
+
+Invariant:
+    - Two runs with the same setups may differ by a small disturbance.
+      `CompiledRun.scale_difference` multiplies this difference by a factor, for all
+      floating-point numbers of the state. Numbers that are equal in both runs keep their bits.
+"""
+
+import math
+from collections import deque
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from functools import cached_property
+from typing import NamedTuple, Protocol
+
+import numpy as np
+
+from ...errors import LawFailed
+from ...records import NS_PER_S, Mode
+from ..arms.exogenous import TorqueKind
+from ..plug.compiled_law import CompiledLaw, plug_law
+from ..plug.law_view import PlainLaw
+from .fused_run import (
+    NEVER_NS,
+    PROGRESS_DTYPE,
+    LawArrays,
+    RecentRecords,
+    ReplayedInputs,
+    finish_site,
+    max_over_joints,
+    run_until,
+    sense_site,
+    sums_dtype,
+)
+from .run_inputs import RunInputs
+from .run_state import RunState
+from .site_arrays import SiteArrays, apply_change
+from .site_setup import SiteSetup
+from .ticks import BUCKETS_PER_S, PlantState, tick_ns
+from .vectors import Array, IntArray, Row, RowArray
+
+
+class _HandActor(Protocol):
+    """Interface of a live operator in a compiled run.
+
+    A live operator is a person or program that moves an arm while the run is in progress. The
+    compiled loop asks for the operator's actions in advance, for as many ticks (control
+    periods) as possible, so that it rarely has to leave compiled code.
+    """
+
+    def compute_actions(self, k: int, end: int, arrays: SiteArrays) -> Array:
+        """Returns the operator's next actions: how firmly and where the operator pulls the arm.
+
+        The actions begin with tick `k`. A tick is one period of the site's control loop. The
+        result ends before the first tick whose action depends on a state of the arm that has
+        not been computed yet.
+
+        Args:
+            k: Number of the first tick.
+            end: Number of the tick before which the result ends at the latest.
+            arrays: State of the site (arm controller) before tick `k`.
+
+        Returns:
+            An array with one row per tick. A row contains the numbers of `HandInForce`.
+        """
+
+
+class _Plant(Protocol):
+    """Interface of a user's own program that computes the motion of an arm.
+
+    Attributes:
+        state: State of the arm in the next tick (control period).
+    """
+
+    state: PlantState
+
+    def move(self, tick: int, tau: Sequence[float]) -> None:
+        """Moves the arm by one control period.
+
+        Args:
+            tick: Number of the tick.
+            tau: Control torque ON the joints in this tick, in N m, shape (n,).
+        """
+
+
+class RunTotals(NamedTuple):
+    """Numbers that summarise a whole simulated run, such as its largest mean error.
+
+    `CompiledRun.totals` returns them.
+
+    Attributes:
+        rms_error_rad: Root mean square of the synchronisation error e over the run, in rad. e
+            is the difference between the angle of a joint and its reference. The value is that
+            of the joint of all sites (arm controllers) for which it is largest.
+        effort_nm: Root mean square of tau - G(q) over sites and joints, in N m. tau is the
+            control torque, and G(q) is the torque that compensates gravity in the pose q.
+        force_peak_n: Largest force of a wall on an arm, in N. None if there is no wall.
+        walls_j: Work of the environments on the arms, in J. An environment is a wall or another
+            body that acts on an arm. None if there is none.
+    """
+
+    rms_error_rad: float
+    effort_nm: float
+    force_peak_n: float | None
+    walls_j: float | None
+
+
+class RunMemory(NamedTuple):
+    """All arrays of a simulated run, for modules that compute several runs side by side.
+
+    N is the number of sites (processes that run one arm), and P the largest number of peers
+    (other sites) from which a site receives samples (sent states).
+
+    Attributes:
+        tables: Arrays of all sites.
+        progress: How far each site is, shape (N,), see `ProgressRow`.
+        next_samples: For each site and peer the next sample to accept, shape (N, P).
+        sent: Latest records (results of control periods) of the sites.
+        peaks: Peaks in intervals of 50 ms, see `run_until`.
+        sums: Sums over the records, shape (N,), see `SumsRow`.
+        settled_rad: Position error below which an arm counts as settled, rad.
+        laws: Numbers of compiled laws that are not a part of the kernel. None if no site has
+            such a law.
+        compiled_laws: These laws, by the index of their site.
+        has_plain_law: True if a site has a law in plain Python.
+        feed: Inputs of a recorded run.
+    """
+
+    tables: SiteArrays
+    progress: RowArray
+    next_samples: IntArray
+    sent: RecentRecords
+    peaks: Array
+    sums: RowArray
+    settled_rad: float
+    laws: LawArrays | None
+    compiled_laws: Mapping[int, CompiledLaw]
+    has_plain_law: bool
+    feed: ReplayedInputs
+
+
+class CompiledRun:
+    """Simulation of several arms, each with its controller (site), in one compiled loop.
+
+    Control laws that can be compiled are executed within the loop. Laws in plain Python are
+    called between the stages of a tick. The loop also pauses before each tick for which an
+    operator's program needs the state of the arm, and after each tick of a site whose arm is
+    moved by a user's program.
+
+    Args:
+        setups: Setups of all sites, in the order of the scenario.
+        first_environments: For each site the index of the first environment among its torque
+            sources. -1 if the site has no environment.
+        duration_s: Duration of the whole run, in s.
+        settled_rad: A site counts as settled while |e| of all joints is below this limit, in
+            rad.
+        keep: Number of recent records of each site that are stored for `pop_records`.
+        inputs: Inputs of a recorded run that is repeated. Without them, every sample arrives
+            promptly.
+        hands: Live operators by the index of their site. They must be empty if there are inputs
+            of a recorded run, which contain the actions.
+        plants: Users' programs that move external arms, by the index of their site.
+
+    Attributes:
+        layouts: Layout of the records of each site.
+        rates_hz: Tick rate of each site, in Hz.
+        duration_s: As the argument.
+        ran_s: Time up to which `advance_to` has executed the run, in s.
+        pending_deliveries: Function that brings the links up to date, if the run was advanced
+            together with other runs. It is called before the run continues alone.
+    """
+
+    def __init__(
+        self,
+        setups: Sequence[SiteSetup],
+        *,
+        first_environments: Sequence[int],
+        duration_s: float,
+        settled_rad: float = 0.01,
+        keep: int = 0,
+        inputs: RunInputs | None = None,
+        hands: Mapping[int, _HandActor] = {},
+        plants: Mapping[int, _Plant] = {},
+    ) -> None:
+        count = len(setups)
+        self.duration_s = duration_s
+        self.ran_s = 0.0
+        self.pending_deliveries: Callable[[], None] | None = None
+        self._settled_rad = settled_rad
+        self._keep = keep
+        self._hands = dict(hands)
+        self._inputs = inputs or RunInputs.prompt(count).with_hands(setups, hands, ticks=0)
+        self._changes = deque(self._inputs.changes)
+        changes = [change for _, _, change in self._inputs.changes]
+        self._tables = SiteArrays.stack(setups, changes, self._inputs.late_ns)
+        self.layouts = [setup.layout for setup in setups]
+        self.rates_hz = [setup.rate_hz for setup in setups]
+        self._plug_laws(setups)
+        self._progress: RowArray = np.zeros(count, PROGRESS_DTYPE)
+        self._progress["rate_hz"] = self.rates_hz
+        self._progress["unsettled_ns"] = -1
+        self._progress["diverged_ns"] = -1
+        self._next_samples = np.zeros((count, count - 1), dtype=np.int64)
+        self._sent = self._allocate_records(keep)
+        joints = max(max(layout.joints, layout.shared) for layout in self.layouts)
+        self._peaks = np.full((count, 0, 3 * joints), -1.0)
+        self._sums: RowArray = np.zeros(count, sums_dtype(joints))
+        self._sums["first_environment"] = first_environments
+        sources = [source for setup in setups for source in setup.actors]
+        self._has_wall = any(source.kind == TorqueKind.WALL for source in sources)
+        self._plants = dict(plants)
+        self._torque_columns = {i: self.layouts[i].columns()["tau"] for i in plants}
+        # For each site: the first tick that `pop_records` has not returned yet, the tick after
+        # the last action of the operator, and the tick up to which the plant has moved.
+        self._popped_ticks = [0] * count
+        self._action_ends: dict[int, int] = {}
+        self._plant_ticks = dict.fromkeys(plants, 0)
+        self._selected: dict[int, SiteArrays] = {}
+
+    def _allocate_records(self, keep: int) -> RecentRecords:
+        """Allocates memory for the recent records of every site (arm controller).
+
+        A record is the stored result of one tick (period of the control loop). It must be
+        stored until `pop_records` returns it, until the slowest peer has received it, and, in a
+        repeated run, until the latest sample (sent state) has arrived.
+
+        Args:
+            keep: Number of recent records of each site that `pop_records` must find.
+
+        Returns:
+            Ring buffers for at least as many records per site as are needed. Their length is a
+            power of two, so that the compiled loop finds the place of a tick with a bit mask.
+        """
+        site_count = len(self.layouts)
+        fastest_hz = int(self._progress["rate_hz"].max())
+        # Ticks of the fastest site until the latest sample arrives, with a margin for rounding.
+        late_ticks = self._inputs.late_ns * fastest_hz // NS_PER_S + 2
+        slowest_hz = int(self._progress["rate_hz"].min())
+        ticks_per_slow_tick = math.ceil(fastest_hz / slowest_hz)
+        # The last tick of a slow site may be planned half of its period late, see `advance_to`.
+        needed = max(2 * ticks_per_slow_tick + 1, keep, late_ticks)
+        pages = 1 << needed.bit_length()  # the least power of two above `needed`
+        floats = max(layout.floats for layout in self.layouts)
+        return RecentRecords(
+            t_ns=np.zeros((site_count, pages), dtype=np.int64),
+            rows=np.zeros((site_count, pages, floats)),
+        )
+
+    def _plug_laws(self, setups: Sequence[SiteSetup]) -> None:
+        """Creates the users' control laws, and connects them to the arrays of the run.
+
+        A law that can be compiled is called within the compiled loop. A law in plain Python is
+        called between the stages of a tick (control period). The laws are stored in
+        `self._laws`, and the arrays that the compiled loop needs in `self._law_arrays`, which
+        stays None without users' laws.
+
+        Args:
+            setups: Setups of the sites (arm controllers), in the order of the scenario.
+        """
+        self._laws: dict[int, PlainLaw | CompiledLaw] = {}
+        self._law_arrays: LawArrays | None = None
+        # The arrays for numbers that laws send exist only if a site has a user's law.
+        has_user_laws = self._tables.channel is not None
+        if not has_user_laws:
+            return
+
+        site_count = len(setups)
+        most_sent_numbers = max(setup.channel.record_size for setup in setups)
+        sent = np.zeros((site_count, most_sent_numbers))
+        for i, setup in enumerate(setups):
+            if setup.law_factory is not None:
+                arrays = self._tables.select(i, setup.layout)
+                law = setup.law_factory(setup.law_context())
+                sent_by_law = sent[i, : setup.channel.record_size]
+                self._laws[i] = plug_law(law, setup, arrays, sent_by_law)
+
+        # The loop calls a compiled law by its address, with its gains and memory as a row of
+        # one array.
+        compiled = {i: law for i, law in self._laws.items() if isinstance(law, CompiledLaw)}
+        addresses = np.zeros(site_count, dtype=np.int64)
+        longest_row = max((len(law.row) for law in compiled.values()), default=0)
+        rows = np.zeros((site_count, longest_row))
+        for i, compiled_law in compiled.items():
+            rows[i, : len(compiled_law.row)] = compiled_law.row
+            # The law and the loop share the row, so that both see the same memory of the law.
+            compiled_law.row = rows[i]
+            addresses[i] = compiled_law.address
+        self._law_arrays = LawArrays(addresses, rows, sent)
+
+    @property
+    def memory(self) -> RunMemory:
+        """All arrays of the simulated run, as views that change while the run advances."""
+        return RunMemory(
+            tables=self._tables,
+            progress=self._progress,
+            next_samples=self._next_samples,
+            sent=self._sent,
+            peaks=self._peaks,
+            sums=self._sums,
+            settled_rad=self._settled_rad,
+            laws=self._law_arrays,
+            compiled_laws={
+                i: law for i, law in self._laws.items() if isinstance(law, CompiledLaw)
+            },
+            has_plain_law=any(isinstance(law, PlainLaw) for law in self._laws.values()),
+            feed=self._inputs.feed,
+        )
+
+    def _update_links(self) -> None:
+        """Brings the links up to date, if the run was advanced together with other runs."""
+        deliver = self.pending_deliveries
+        self.pending_deliveries = None
+        if deliver is not None:
+            deliver()
+
+    def step_to(self, last_ns: int) -> None:
+        """Executes all planned ticks up to a time, and applies the changes up to that time.
+
+        Nothing happens if a site (arm controller) has diverged, that is, if its arm has left
+        its limits.
+
+        Args:
+            last_ns: Time of the last tick (control period) to be executed, in ns after the
+                epoch. The epoch is the common start time of the sites.
+
+        Raises:
+            LawFailed: A user's control law failed.
+        """
+        self._update_links()
+        rates_hz = [int(progress["rate_hz"]) for progress in self._progress]
+        while self._changes and self.diverged_s is None:
+            tick, i, change = self._changes[0]
+            t_ns = tick_ns(tick, rates_hz[i])
+            if t_ns > last_ns:
+                break
+            self._step_until(t_ns - 1)
+            apply_change(self.arrays(i), change, t_ns)
+            self._changes.popleft()
+        if self.diverged_s is None:
+            self._step_until(last_ns)
+
+    def _step_until(self, last_ns: int) -> None:
+        """Executes the planned ticks up to a time, and calls users' programs in between.
+
+        The programs act as operators, or compute the motion of an arm (plants). A program needs
+        the state of the arm at a certain time. Therefore the compiled loop pauses before the
+        tick (control period) of this time, and the program is called. Between two pauses, the
+        loop executes many ticks at once.
+
+        Args:
+            last_ns: Time of the last tick to be executed, in ns after the epoch, the common
+                start time of the sites.
+        """
+        while self.has_programs and self.diverged_s is None:
+            # Both methods call a program if it is due, and return when it is due again.
+            pauses_ns = [self._request_actions(i) for i in self._hands]
+            pauses_ns += [self._move_plant(i) for i in self._plants]
+            next_pause_ns = min(pauses_ns)
+            if next_pause_ns > last_ns:
+                break
+            self._step_piece(next_pause_ns - 1)  # up to the last tick before the pause
+        if self.diverged_s is None:
+            self._step_piece(last_ns)
+        # The arms of plants move on by the last tick, as all other arms did within the loop.
+        for i in self._plants:
+            self._move_plant(i)
+
+    def _move_plant(self, i: int) -> int:
+        """Lets a user's own program compute the motion of an arm in one control period.
+
+        Such a program is called a plant, and a control period a tick. The plant moves once per
+        tick, by the control torque of the last executed tick. The new state of the arm is
+        copied to the arrays of the run, from which the next tick reads it.
+
+        Args:
+            i: Index of the site.
+
+        Returns:
+            Time before which the plant must move again, in ns after the epoch. `NEVER_NS` after
+            the last tick.
+        """
+        next_tick = int(self._progress[i]["tick"])
+        plant = self._plants[i]
+        # If no tick was executed since the last call, the arm has moved this far already.
+        has_new_torque = next_tick > self._plant_ticks[i]
+        if has_new_torque:
+            last_record = self._last_row(i)
+            control_torque = last_record[self._torque_columns[i]]
+            plant.move(next_tick - 1, control_torque.tolist())
+        self._plant_ticks[i] = next_tick
+
+        joints = self.layouts[i].joints
+        site = self.arrays(i).site[0]
+        site["q"][:joints] = plant.state.q
+        site["qd"][:joints] = plant.state.qd
+        # `tau_x` is subtracted in the equation of motion, whereas `sensed` is the torque ON the
+        # arm. A plant that does not know the torque of contacts returns an empty tau_x.
+        site["sensed"][:joints] = [-torque for torque in plant.state.tau_x] or 0.0
+
+        has_finished = self._progress[i]["t_ns"] == NEVER_NS
+        if has_finished:
+            return NEVER_NS
+        return tick_ns(next_tick + 1, int(self._progress[i]["rate_hz"]))
+
+    def _request_actions(self, i: int) -> int:
+        """Requests the next actions of an operator, if the site has executed the previous ones.
+
+        The operator is a program that answers with its actions for some ticks (periods of the
+        control loop) in advance. They are written to the inputs of the compiled loop.
+
+        Args:
+            i: Index of the site.
+
+        Returns:
+            Time at which the operator needs the state of the arm again, in ns after the epoch.
+            `NEVER_NS` after the last tick.
+        """
+        progress = self._progress[i]
+        if progress["t_ns"] == NEVER_NS:
+            return NEVER_NS
+        k = int(progress["tick"])
+        if k >= self._action_ends.get(i, 0):
+            end = int(progress["ticks"])
+            actions = self._hands[i].compute_actions(k, end, self.arrays(i))
+            self._inputs.write_actions(i, k, actions)
+            self._action_ends[i] = k + len(actions)
+        return tick_ns(self._action_ends[i], int(progress["rate_hz"]))
+
+    def _step_piece(self, last_ns: int) -> None:
+        """Executes the planned ticks up to a time for which no user's program is needed.
+
+        These programs are those of operators and plants (simulated arms). Control laws are
+        called. If a user's law is plain Python, the loop over the ticks (control periods) runs
+        in Python too. Otherwise the whole loop is compiled.
+
+        Args:
+            last_ns: Time of the last tick to be executed, in ns after the epoch, the common
+                start time of the sites.
+
+        Raises:
+            LawFailed: A user's control law failed.
+        """
+        compiled = [law for law in self._laws.values() if isinstance(law, CompiledLaw)]
+        has_plain_law = len(compiled) < len(self._laws)
+        try:
+            if has_plain_law:
+                self._run_plain_until(last_ns)
+            else:
+                run_until(
+                    last_ns=last_ns,
+                    settled_rad=self._settled_rad,
+                    progress=self._progress,
+                    next_samples=self._next_samples,
+                    sent=self._sent,
+                    feed=self._inputs.feed,
+                    peaks=self._peaks,
+                    sums=self._sums,
+                    arrays=self._tables,
+                    chains=self._tables.chain,
+                    laws=self._law_arrays,
+                )
+        except LawFailed:
+            raise
+        except Exception as error:
+            # A compiled law may raise any error. Each law knows whether the error is its own.
+            failures = [law.find_failure(error) for law in compiled]
+            law_failures = filter(None, failures)
+            # An error that comes from no law is raised unchanged.
+            raise next(law_failures, error) from None
+
+    def _run_plain_until(self, last_ns: int) -> None:
+        """Executes ticks in a Python loop, because a control law is not compiled.
+
+        The loop equals that of the compiled function `run_until`. Within each tick, the law is
+        called after the measurements (`sense_site`) and before the motion (`finish_site`).
+
+        Args:
+            last_ns: Time of the last tick, in ns after the epoch.
+        """
+        progress = self._progress
+        tables = self._tables
+        while True:
+            t_ns = int(progress["t_ns"].min())
+            if t_ns > last_ns or t_ns == NEVER_NS:
+                return
+            for i in np.flatnonzero(progress["t_ns"] == t_ns).tolist():
+                chain = self.arrays(i).chain
+                sense_site(
+                    i=i,
+                    progress=progress,
+                    next_samples=self._next_samples,
+                    sent=self._sent,
+                    feed=self._inputs.feed,
+                    arrays=tables,
+                    chain=chain,
+                )
+                law = self._laws.get(i)
+                if isinstance(law, PlainLaw):
+                    law.compute(int(progress[i]["tick"]), t_ns)
+                mode = finish_site(
+                    i=i,
+                    settled_rad=self._settled_rad,
+                    progress=progress,
+                    sent=self._sent,
+                    peaks=self._peaks,
+                    sums=self._sums,
+                    arrays=tables,
+                    chain=chain,
+                    laws=self._law_arrays,
+                )
+                if mode == Mode.DIVERGED:
+                    # The other ticks of this time are still executed.
+                    progress[i]["diverged_ns"] = t_ns
+                    last_ns = t_ns
+
+    def advance_to(self, until_s: float) -> None:
+        """Continues the run until it is as long as a run with a duration of `until_s` seconds.
+
+        Nothing happens if a site (arm controller) has diverged, that is, if its arm has left
+        its limits. Nothing happens either if the run is already that long.
+        """
+        if until_s <= self.ran_s or self.diverged_s is not None:
+            return
+        rates_hz = self._progress["rate_hz"].tolist()
+        self.plan([max(1, round(until_s * rate_hz)) for rate_hz in rates_hz])
+        self.step_to(round(until_s * NS_PER_S))
+        self.ran_s = until_s if self.diverged_s is None else self.diverged_s
+
+    @property
+    def ticks(self) -> list[int]:
+        """Number of ticks (control periods) that each site has executed."""
+        ticks: list[int] = self._progress["tick"].tolist()
+        return ticks
+
+    def plan(self, ticks: Sequence[int]) -> None:
+        """Sets how many ticks each site will execute in total, and allocates memory for them.
+
+        A tick is a period of a site's control loop. The memory for the largest values in
+        intervals of 50 ms (buckets), and for the actions of live operators, becomes longer. The
+        values in it are kept.
+
+        Args:
+            ticks: Total number of ticks of each site (arm controller), in the order of the
+                scenario. Ticks that have been executed already are included.
+        """
+        progress: Row
+        for progress, planned_ticks in zip(self._progress, ticks, strict=True):
+            progress.ticks = planned_ticks
+            has_more_ticks = progress.tick < planned_ticks
+            if has_more_ticks:
+                # After its last planned tick, a site has the next time `NEVER_NS`.
+                progress.t_ns = tick_ns(progress.tick, progress.rate_hz)
+
+        pairs = zip(ticks, self._progress["rate_hz"], strict=True)
+        longest_s = max(planned_ticks / rate_hz for planned_ticks, rate_hz in pairs)
+        bucket_count = math.ceil(longest_s * BUCKETS_PER_S) + 1
+        column_count = self._peaks.shape[2]
+        # -1 marks a bucket in which no tick has been executed.
+        peaks = np.full((len(ticks), bucket_count, column_count), -1.0)
+        old_bucket_count = self._peaks.shape[1]
+        peaks[:, :old_bucket_count] = self._peaks
+        self._peaks = peaks
+
+        if self._hands:
+            self._inputs = self._inputs.with_ticks(max(ticks))
+
+    @cached_property
+    def _state(self) -> RunState:
+        """State of the run, with which it can be copied to another run."""
+        tables = self._tables
+        arrays = [self._progress, self._next_samples, *self._sent, self._sums]
+        arrays += [array for array in tables if isinstance(array, np.ndarray)]
+        if tables.channel is not None:
+            arrays += tables.channel
+        if self._law_arrays is not None:
+            arrays += [self._law_arrays.rows, self._law_arrays.sent]
+        return RunState(arrays)
+
+    @property
+    def has_programs(self) -> bool:
+        """True if users' own programs act as operators, or compute the motion of an arm.
+
+        The run cannot be copied then, because the state of such programs is not part of its
+        state.
+        """
+        return bool(self._hands or self._plants)
+
+    @property
+    def programmed_sites(self) -> set[int]:
+        """Indices of the sites (arm controllers) whose operator or arm is a user's own program.
+
+        Such a program is called in Python in each control period, which is slower.
+        """
+        return {*self._hands, *self._plants}
+
+    def copy_state(self, other: "CompiledRun") -> None:
+        """Makes this simulated run continue from exactly the same state as another run.
+
+        Both runs must have the same scenario and the same planned control periods. The other
+        run does not change.
+        """
+        self.scale_difference(other, 0.0)
+
+    def scale_difference(self, other: "CompiledRun", factor: float) -> None:
+        """Multiplies the difference between the states of this run and another run by a factor.
+
+        Every floating-point number x of the state becomes x_other + factor (x - x_other), see
+        `RunState.scale_difference`. This is not possible if operators or arms are users'
+        programs, because the state of such programs is not known.
+
+        Args:
+            other: The other run. It must have the same scenario, and be at the same time.
+            factor: Number by which the difference is multiplied.
+        """
+        assert not self.has_programs
+        self._update_links()
+        other._update_links()
+        self._state.scale_difference(other._state, factor)
+        self._changes = deque(other._changes)
+        self._popped_ticks = list(other._popped_ticks)
+        for i, law in self._laws.items():
+            if isinstance(law, PlainLaw):
+                memory = np.array(law.memory)
+                other_memory = np.array(other._laws[i].memory)
+                mixed = other_memory + factor * (memory - other_memory)
+                law.restore(mixed.tolist())
+
+    def arrays(self, i: int) -> SiteArrays:
+        """Returns the state of one simulated arm and its controller (site), as NumPy arrays.
+
+        It is the state before the next tick, a period of the control loop. The arrays belong to
+        the simulation, so the caller must not change them.
+
+        Args:
+            i: Index of the site in the order of the scenario.
+
+        Returns:
+            Views of the arrays, without copies.
+        """
+        self._update_links()
+        if i not in self._selected:
+            self._selected[i] = self._tables.select(i, self.layouts[i])
+        return self._selected[i]
+
+    def displace(self, field: str, offsets: Array) -> None:
+        """Adds offsets to one field of the state of all sites, for example to the joint angles.
+
+        Repeated runs with a small disturbance are disturbed in this way.
+
+        Args:
+            field: Name of the field, for example "q" for the joint angles or "qd" for the
+                velocities.
+            offsets: Numbers to add, one row per site (arm controller), shape (N, n). The unit
+                is that of the field.
+        """
+        self._tables.site[field][:, 0, : offsets.shape[1]] += offsets
+
+    def measure_distance(self, other: "CompiledRun", field: str) -> float:
+        """Returns how far the state of this simulation is from that of another, in one field.
+
+        Args:
+            other: The other run of the same scenario.
+            field: Name of the field, for example "qd" for the joint velocities.
+
+        Returns:
+            The largest absolute difference over all sites (arm controllers) and joints, in the
+            unit of the field.
+        """
+        difference = self._tables.site[field] - other._tables.site[field]
+        return float(np.abs(difference).max())
+
+    def run_and_sample(self, until_s: float) -> tuple[Array, Array]:
+        """Continues the simulation, and returns the states at 100 times of its last quarter.
+
+        Args:
+            until_s: Time at which the run ends, in s.
+
+        Returns:
+            The joint angles q in rad, shape (100, N, n), and the estimated parameters
+            theta_hat, shape (100, N, P). N is the number of sites (arm controllers), n that of
+            joints, and P that of parameters.
+        """
+        q = []
+        theta_hat = []
+        for t_s in np.linspace(0.75 * until_s, until_s, 100):
+            self.advance_to(float(t_s))
+            q.append(self.q)
+            theta_hat.append(self.theta_hat)
+        return np.array(q), np.array(theta_hat)
+
+    @property
+    def diverged_s(self) -> float | None:
+        """Time at which the first arm left its safety limits, in s. None if no arm did."""
+        ends_ns = [int(end_ns) for end_ns in self._progress["diverged_ns"] if end_ns >= 0]
+        return min(ends_ns) / NS_PER_S if ends_ns else None
+
+    @property
+    def settled_s(self) -> float | None:
+        """Time from which the synchronisation errors of all sites stay small, in s.
+
+        The error e of a site (arm controller) is the difference between its joint angles and
+        their reference. It counts as small if |e| of every joint is below `settled_rad`. None
+        if the limit is exceeded in the last tick (control period).
+        """
+        last_site = int(np.argmax(self._progress["unsettled_ns"]))
+        progress: Row = self._progress[last_site]
+        if progress.unsettled_ns < 0:
+            return 0.0
+        if progress.unsettled_ns == tick_ns(progress.tick - 1, progress.rate_hz):
+            return None
+        return float(progress.unsettled_ns) / NS_PER_S
+
+    @property
+    def buckets(self) -> tuple[Array, ...]:
+        """Course of the run in intervals of 50 ms, with one array for each site.
+
+        Each array has the shape (intervals, 3 n), where n is the number of joints. A row
+        contains the largest synchronisation error |e| of each joint in rad, the largest speed
+        |qd| of each joint in rad/s, and the last angle q of each joint in rad. An interval
+        without a tick (control period) of the site (arm controller) contains -1. The last
+        interval may be incomplete.
+        """
+        buckets = []
+        for peaks, progress in zip(self._peaks, self._progress, strict=True):
+            last_tick = int(progress["tick"]) - 1
+            count = last_tick * BUCKETS_PER_S // int(progress["rate_hz"]) + 1
+            buckets.append(peaks[:count])
+        return tuple(buckets)
+
+    @property
+    def maxima(self) -> tuple[Array, ...]:
+        """Largest error and largest speed of each arm, in every interval of 50 ms.
+
+        There is one array per arm, of the shape (intervals, 2). The columns are the largest
+        synchronisation error |e| of any joint in rad, and the largest joint speed |qd| in
+        rad/s.
+        """
+        return tuple(map(max_over_joints, self.buckets))
+
+    @property
+    def totals(self) -> RunTotals:
+        """Numbers that summarise the simulated run so far, such as the largest mean error.
+
+        They also contain the control effort, and the forces and work of walls and dampers. See
+        `RunTotals` for the definitions.
+        """
+        sums = self._sums
+        ticks = self._progress["tick"].astype(np.float64)
+        joints = self._tables.site["joints"][:, 0]
+        mean_effort = np.mean(sums["effort"] / (joints * ticks))
+        mean_errors = sums["errors"] / ticks[:, None]
+
+        force_peak_n = None
+        if self._has_wall:
+            force_peak_n = float(sums["force_peak_n"].max())
+        walls_j = None
+        if (sums["first_environment"] >= 0).any():
+            walls_j = float(sums["environment_j"].sum())
+        return RunTotals(
+            rms_error_rad=float(np.sqrt(mean_errors).max()),
+            effort_nm=float(np.sqrt(mean_effort)),
+            force_peak_n=force_peak_n,
+            walls_j=walls_j,
+        )
+
+    @property
+    def q(self) -> Array:
+        """Joint angles of all arms after the last control period, in rad, shape (N, n).
+
+        N is the number of sites (one per arm), and n is the number of joints of each arm.
+        """
+        return np.array(self._tables.site["q"][:, 0])
+
+    @property
+    def theta_hat(self) -> Array:
+        """Arm parameters that adaptive control laws have estimated so far, shape (N, P).
+
+        N is the number of sites (one per arm), and P is the number of parameters.
+        """
+        return np.array(self._tables.site["theta_hat"][:, 0])
+
+    @property
+    def memories(self) -> list[Array]:
+        """Internal state of each control law that a user has written, after the last tick.
+
+        A tick is one period of the control loop. There is one array per site (simulated process
+        that runs one arm). The array of a site with a built-in law is empty.
+        """
+        memories = []
+        for i in range(len(self._progress)):
+            law = self._laws.get(i)
+            memories.append(np.array([] if law is None else law.memory, dtype=np.float64))
+        return memories
+
+    @property
+    def tau_x(self) -> list[Array]:
+        """External torque on each arm in the last control period, in N m, not of the motors.
+
+        The list has one array of the shape (n,) per site, for n joints. Operators and
+        environments exert the torque.
+        """
+        pairs = zip(self.records, self.layouts, strict=True)
+        return [row[layout.columns()["tau_x"]] for row, layout in pairs]
+
+    def pop_records(self) -> list[tuple[IntArray, Array]]:
+        """Returns the records that each site (arm controller) has produced since the last call.
+
+        A record is the stored result of one tick (control period). Only a limited number of
+        recent records is stored (see `keep` of the constructor); older ones are lost.
+
+        Returns:
+            For each site, the nominal times of the records in ns, shape (K,), and the records,
+            shape (K, floats). The columns of the records are those of `Layout.columns`. K is 0
+            if there are no new records.
+        """
+        records = []
+        pages = self._sent.t_ns.shape[1]
+        for i, progress in enumerate(self._progress):
+            stop = int(progress["tick"])
+            first = max(self._popped_ticks[i], stop - pages)
+            positions = np.arange(first, stop) % pages
+            t_ns = self._sent.t_ns[i, positions]
+            rows = self._sent.rows[i, positions, : self.layouts[i].floats]
+            records.append((t_ns, rows))
+            self._popped_ticks[i] = stop
+        return records
+
+    @property
+    def is_finished(self) -> bool:
+        """True if the run has the whole duration of its scenario, or if an arm has diverged."""
+        return self.ran_s >= self.duration_s or self.diverged_s is not None
+
+    def find_batch_end(self) -> float:
+        """Returns the time up to which the run may go on before its records are read, in s.
+
+        In this time no site (arm controller) produces more records than the run stores, see
+        `keep` of the constructor. The time is at most the duration of the scenario.
+        """
+        fastest_hz = int(self._progress["rate_hz"].max())
+        return min(self.ran_s + (self._keep - 1) / fastest_hz, self.duration_s)
+
+    def iterate_batches(self) -> Iterator[list[tuple[IntArray, Array]]]:
+        """Simulates the scenario to its end, and yields all records batch by batch.
+
+        A long run thus needs memory for the latest `keep` records of each site (arm controller)
+        only. `keep` must be at least 2.
+
+        Yields:
+            The records since the previous batch, in the form of `pop_records`.
+        """
+        while not self.is_finished:
+            self.advance_to(self.find_batch_end())
+            yield self.pop_records()
+
+    @property
+    def records(self) -> Array:
+        """Results of the last control period (tick) of each site, one row per site.
+
+        A site is the controller of one arm. For the columns see `Layout.columns`.
+        """
+        return np.array([self._last_row(i) for i in range(len(self._progress))])
+
+    def _last_row(self, i: int) -> Array:
+        """Returns the last record of a site."""
+        pages = self._sent.t_ns.shape[1]
+        last_tick = int(self._progress[i]["tick"]) - 1
+        row: Array = self._sent.rows[i, last_tick % pages]
+        return row

@@ -1,0 +1,133 @@
+"""Stores everything that a simulated run receives from outside: arrivals, changes and hands.
+
+A run that repeats a log receives what the log recorded. A new run receives nothing, except for
+the actions of programs that move an arm.
+"""
+
+from collections.abc import Collection, Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from .fused_run import ReplayedInputs
+from .site_setup import SiteSetup
+from .ticks import CoreChange
+from .vectors import Array
+
+_TARGET_COLUMN = 3
+"""First column of the target in an action. It follows grip, number and source."""
+
+
+class RunInputs(NamedTuple):
+    """Everything that a recorded run received from outside, so that it can be repeated.
+
+    N is the number of sites (processes that run one arm), and P the largest number of peers
+    (other sites) from which a site receives samples (sent states).
+
+    Attributes:
+        feed: Ticks (control periods) in which samples of other sites arrived, and actions of
+            live operators (persons or programs that move an arm during the run).
+        changes: Changes of links or sites during the run, in the order of time. Each entry
+            contains the tick before which the site applies the change, the index of the site,
+            and the change.
+        late_ns: Largest time from the stamp of a sample to its arrival, in ns. The loop needs
+            it to decide how long samples are stored.
+    """
+
+    feed: ReplayedInputs
+    changes: Sequence[tuple[int, int, CoreChange]] = ()
+    late_ns: int = 0
+
+    @classmethod
+    def prompt(cls, sites: int) -> "RunInputs":
+        """Returns the inputs of a run that receives nothing from outside.
+
+        In such a run, every sample arrives promptly, in the first tick after it was sent. No
+        setting changes, and no live operator moves an arm. The delays that the setup states for
+        the links are still applied, by the receivers.
+
+        Args:
+            sites: Number of sites.
+        """
+        most_peers = max(sites - 1, 1)
+        # Arrays for 0 ticks tell the compiled loop that nothing was recorded, see
+        # `ReplayedInputs`.
+        feed = ReplayedInputs(
+            first=np.zeros((sites, most_peers, 0), np.int64),
+            samples=np.zeros(0, np.int64),
+            hands=np.zeros((sites, 0, 1)),
+            hand_indices=np.full(sites, -1),  # -1: the site has no live operator
+        )
+        return cls(feed)
+
+    def with_hands(
+        self, setups: Sequence[SiteSetup], sites: Collection[int], ticks: int
+    ) -> "RunInputs":
+        """Returns these inputs with memory for the actions of live operators.
+
+        Args:
+            setups: Setups of all sites.
+            sites: Indices of the sites with a live operator.
+            ticks: Number of ticks for which there is memory.
+        """
+        if not sites:
+            return self
+        hand_indices = np.full(len(setups), -1)  # -1: the site has no live operator
+        for i in sites:
+            hand_indices[i] = setups[i].live_actor
+        most_coordinates = max(_count_coordinates(setups[i].layout.hand) for i in sites)
+        # Columns: grip, target, and target one second later, see `write_actions`.
+        actions = np.zeros((len(setups), ticks, 1 + 2 * most_coordinates))
+        feed = self.feed._replace(hands=actions, hand_indices=hand_indices)
+        return self._replace(feed=feed)
+
+    def with_ticks(self, ticks: int) -> "RunInputs":
+        """Returns these inputs with memory for more actions of live operators.
+
+        Args:
+            ticks: Number of ticks for which there is memory, not less than before.
+        """
+        sites, old_ticks, columns = self.feed.hands.shape
+        actions = np.zeros((sites, ticks, columns))
+        actions[:, :old_ticks] = self.feed.hands
+        return self._replace(feed=self.feed._replace(hands=actions))
+
+    def write_actions(self, i: int, first_tick: int, actions: Array) -> None:
+        """Converts the actions of an operator to the form that the compiled loop reads.
+
+        A live operator is a person or program that moves the arm of a site. It prescribes m
+        target coordinates. The two forms of an action have these columns:
+
+        - Action of the operator (`HandInForce`): firmness of the grip; number of the operator's
+          message; source of the message; target (m columns); velocity of the target (m
+          columns).
+        - Action in the feed (`ReplayedInputs.hands`): firmness of the grip; target (M columns);
+          the position that the target would reach after one second, the sum of target and
+          velocity (M columns). M is the largest m of all sites. The columns beyond m stay zero.
+
+        Args:
+            i: Index of the site.
+            first_tick: Tick of the first action.
+            actions: Actions of the operator, one row per tick, shape (ticks, 3 + 2 m).
+        """
+        coordinates = _count_coordinates(actions.shape[1])
+        most_coordinates = (self.feed.hands.shape[2] - 1) // 2
+        grip = actions[:, 0]
+        target = actions[:, _TARGET_COLUMN : _TARGET_COLUMN + coordinates]
+        velocity = actions[:, _TARGET_COLUMN + coordinates :]
+
+        rows = self.feed.hands[i, first_tick : first_tick + len(actions)]
+        rows[:, 0] = grip
+        rows[:, 1 : 1 + coordinates] = target
+        second_part = 1 + most_coordinates
+        rows[:, second_part : second_part + coordinates] = target + velocity
+
+
+def _count_coordinates(numbers: int) -> int:
+    """Returns how many coordinates a person or program may command to move an arm.
+
+    Args:
+        numbers: Count of the numbers of an action: grip, number and source, followed by the
+            target and the velocity of each coordinate, see `HandInForce`.
+    """
+    return (numbers - _TARGET_COLUMN) // 2
