@@ -57,7 +57,6 @@ __all__ = [
     # Operators and environments
     "FAILED_HAND",
     "POLICY",
-    "ActorBase",
     "DeviceSettings",
     "HandPlayer",
     "HandSite",
@@ -116,7 +115,6 @@ if TYPE_CHECKING:
     from .key_checks import check_finite, is_distribution, is_number
     from .laws import BUILT_IN, LAWS
     from .link_presets import GRID_LOSSES_PERCENT, GRID_ROUND_TRIPS_MS
-    from .operators import ActorBase
     from .operators.kernel_operators import (
         DeviceSettings,
         JointSpring,
@@ -176,7 +174,6 @@ else:
             "key_checks": "check_finite is_distribution is_number",
             "laws": "BUILT_IN LAWS",
             "link_presets": "GRID_LOSSES_PERCENT GRID_ROUND_TRIPS_MS",
-            "operators": "ActorBase",
             "operators.kernel_operators": (
                 "DeviceSettings JointSpring LiveHand Multisine ViscousEnvironment Wall"
             ),
