@@ -1,5 +1,7 @@
-"""Figures of this program on this machine, as ratios within one run where ratios are what matters.
+"""Measures the speed, latency and memory of this program on this machine.
+
+Where possible, the results are ratios of two measurements of the same run.
 
 python -m benchmarks            all of them
-python -m benchmarks tick sim   some
+python -m benchmarks tick virtual   only these
 """

@@ -1,4 +1,4 @@
-"""Runs the benchmarks that are named, or all."""
+"""Runs the benchmarks that are named on the command line, or all of them."""
 
 import sys
 
@@ -64,7 +64,7 @@ LONG = {
     "live": live.run,
     "page": page.run,
 }
-"""Only when they are named."""
+"""Benchmarks that run only if they are named."""
 
 
 def main() -> None:

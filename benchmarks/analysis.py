@@ -1,8 +1,9 @@
-"""What the analysis of a minute costs: metrics, certificate and report of three sites at 1 kHz, on one core.
+"""Measures the cost of analysing a minute of three sites at 1 kHz: metrics, certificate and report, on one core.
 
-A process of its own, pinned to one core, does all of it one after the other, and nothing is done beforehand.
-Time is that of the processor. The report is its figures, page and summary; what `trilat report` executes
-again beside it, on a second core, and the twin without hands are simulations, and are given apart.
+A separate process, pinned to one core, executes all parts one after the other, without any
+preparation. Times are processor times. The report consists of figures, page and summary. The
+simulations that `trilat report` executes on a second core, and the twin without hands, are
+reported separately.
 """
 
 import os
@@ -18,7 +19,7 @@ from .sessions import paper
 
 SECONDS = 60
 VIRTUAL = ("windup", "jitter")
-"""Beside `paper`, which is recorded live."""
+"""Scenarios that are analysed in addition to `paper`, which is recorded live."""
 BAR_S = 10.0
 _ALONE = """
 import os, sys, time
@@ -31,7 +32,7 @@ def lap(what):
     print(f"{what}={now - last:.3f}")
     last = now
 from trilat_net.presentation.page import write_report
-from trilat_net.analysis.certificate.stability_certificate import certify
+from trilat_net.analysis.certificate.stability_certificate import certify_log
 from trilat_net import open_log, verify
 from trilat_net.execution.virtual_comparison import simulate_without_operators
 from trilat_net.analysis.metrics.log_metrics import compute_log_metrics
@@ -40,9 +41,9 @@ log = open_log(sys.argv[1])
 lap("opening")
 compute_log_metrics(log).to_dict()
 lap("metrics")
-certify(log)
+certify_log(log)
 lap("certificate")
-write_report(log, Path(sys.argv[2]), certificate=certify(log))
+write_report(log, Path(sys.argv[2]), certificate=certify_log(log))
 lap("report")
 simulate_without_operators(log)
 lap("twin")
@@ -67,12 +68,12 @@ def run() -> list[str]:
 
 
 def measured(name: str, path: Path, folder: Path) -> list[str]:
-    """Returns the shares of a log's analysis.
+    """Returns lines with the cost of each part of a log's analysis.
 
     Args:
-        name: what the lines call it.
-        path: the log.
-        folder: where the report goes.
+        name: Name of the log in the lines.
+        path: Path of the log.
+        folder: Folder of the report.
     """
     command = [sys.executable, "-c", _ALONE, path, folder]
     done = subprocess.run(command, capture_output=True, text=True, check=True, env=os.environ)

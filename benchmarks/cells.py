@@ -1,4 +1,4 @@
-"""Whole cells of a sweep, which are simulated and judged: processor time of a cell, and of its parts."""
+"""Measures the processor time of complete cells of a sweep, and of their parts: simulation and judgement."""
 
 import statistics
 import time

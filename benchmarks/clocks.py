@@ -1,4 +1,4 @@
-"""Measured delays against the truth, a minute long: real processes on clocks seconds apart that drift."""
+"""Compares measured delays with the true delays for a minute, between processes whose clocks differ and drift."""
 
 import numpy as np
 

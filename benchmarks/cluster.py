@@ -1,6 +1,7 @@
-"""A sweep on a Dask cluster of two workers on loopback, by loky, and by two processes without any pool.
+"""Compares a sweep on a Dask cluster of two workers on loopback with loky, and with two processes without a pool.
 
-The three take turns, and each runs alone: a cluster that idles beside the others costs them some per cent.
+The three methods take turns, and each runs alone, because an idle cluster slows down the others
+by a few per cent.
 """
 
 import json
@@ -23,12 +24,12 @@ WORKERS = 2
 CELLS = 2000
 REPEATS = 3
 WARMED = 40
-"""Cells before the clock runs: processes start and load the compiled core."""
+"""Number of cells before the measurement, in which processes start and load the compiled core."""
 SETTINGS = {
     "DASK_DISTRIBUTED__WORKER__PROFILE__ENABLED": "False",
     "DASK_DISTRIBUTED__ADMIN__TICK__INTERVAL": "1s",
 }
-"""As docs/studies/sweep.md recommends."""
+"""Settings of Dask that docs/studies/sweep.md recommends."""
 OVER = f"control.Kd=2:{2 + 0.001 * (CELLS - 1):g}:0.001"
 
 
@@ -79,7 +80,7 @@ def cluster_cells_per_s(tasks: list[CellItem]) -> float:
 
 
 def plain_cells_per_s(tasks: list[CellItem]) -> float:
-    """Every process has its share of the cells from the start."""
+    """Returns the speed of processes that receive all of their cells at the start."""
     with worker_pool(WORKERS) as executor:
         for share in (tasks[:WARMED], tasks):
             began = time.perf_counter()

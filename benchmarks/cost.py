@@ -1,9 +1,10 @@
-"""Processor time of a live session: to its first tick; then by process and thread, with a page and a bridge.
+"""Measures the processor time of a live session up to its first tick, and then by process and thread.
 
-It is user and system time, which other programs on the machine change less than any latency. With the
-environment variable `TRILAT_BEFORE`, the folder of another version of the program, sessions of `trilat demo`
-take turns between the two: processor time of sites and recorder, and how late the loops woke up over
-cyclictest.
+The second session has a page and a bridge to ROS 2. Processor time is user and system time,
+which other programs on the machine influence less than latencies. If the environment variable
+`TRILAT_BEFORE` names the folder of another version of the program, sessions of `trilat demo`
+alternate between the two versions. Their processor times of sites and recorder are compared,
+and the lateness of their loops relative to cyclictest.
 """
 
 import os
@@ -33,14 +34,14 @@ from .stopwatch import cpu_s
 
 DURATION_S, WINDOW_S, PAIRS, STARTS = 20, 14, 7, 5
 AHEAD_S = 0.5
-"""Between the announcement of a session and its first tick."""
+"""Time between the announcement of a session and its first tick."""
 COST_RATIO, LATENESS_RATIO, START_S = 0.6, 3.0, 3.0
 PROCESSES = "run/processes"
-"""Where a session's processes print, from the folder in which it runs."""
+"""Folder of the output of a session's processes, relative to the folder in which the session runs."""
 MS_PER_TICK = 1000.0 / os.sysconf("SC_CLK_TCK")
 
 Usage = Counter[str]
-"""By thread, its number left out: processor time, ms; under `<thread> switches`: voluntary switches."""
+"""Processor time by thread without its number, in ms; and voluntary context switches, by `<thread> switches`."""
 
 
 def run() -> list[str]:
@@ -68,7 +69,7 @@ def run() -> list[str]:
 
 
 def _measure_start() -> tuple[float, float]:
-    """Returns the time until the first tick of `trilat demo paper`, s: of processors, and of the clock."""
+    """Returns the processor time and the wall-clock time until the first tick of `trilat demo paper`, in s."""
     since = time.perf_counter()
     with _demo() as demo:
         time.sleep(AHEAD_S)
@@ -80,8 +81,9 @@ def _measure_start() -> tuple[float, float]:
 def _measure_paper(root: str) -> tuple[float, float]:
     """Runs `trilat demo paper` with the program in a folder.
 
-    Returns the processor time of a site and its share of the recorder, ms a second, and the worst site's p99
-    of lateness over that of what woke beside it at the same priority.
+    Returns the processor time of a site and of its share of the recorder, ms per second; and
+    the worst site's p99 of lateness, divided by that of the program that woke up beside it at
+    the same priority.
     """
     with mock.patch.dict(PLAIN, PYTHONPATH=root), _demo() as demo:
         time.sleep(AHEAD_S)
@@ -110,7 +112,7 @@ def _measure_paper(root: str) -> tuple[float, float]:
 
 @contextmanager
 def _demo() -> Iterator[Process]:
-    """A session of `paper` on this machine, which has just been announced; it is ended."""
+    """Yields a session of `paper` on this machine that has just been announced, and ends it afterwards."""
     with tempfile.TemporaryDirectory() as folder:
         demo = Stage(Path(folder)).start(
             "demo", "demo", "paper", "--duration", str(DURATION_S), "--out", "run"
@@ -130,7 +132,7 @@ def _demo() -> Iterator[Process]:
 
 @contextmanager
 def _with_bridge(folder: Path) -> Iterator[dict[str, int]]:
-    """A session of `play` with a page that a client watches, and a bridge to ROS 2: ids of its processes."""
+    """Runs a session of `play` with a watched page and a bridge to ROS 2, and yields the ids of its processes."""
     (router,) = find_free_endpoints(1)
     stage = Stage(folder)
     with live_session(folder / "run") as (address, page), closing(SocketClient(address).socket):
@@ -168,7 +170,7 @@ def _show(usage: Mapping[str, Usage]) -> None:
 
 
 def _watch(pids: Mapping[str, int], meanwhile: Callable[[], object]) -> dict[str, Usage]:
-    """Returns what the threads of processes use meanwhile, per second."""
+    """Returns the use of processors by the threads of processes during a call, per second."""
     begun, before = time.monotonic(), {name: _read_threads(pid) for name, pid in pids.items()}
     meanwhile()
     passed_s = time.monotonic() - begun
@@ -184,10 +186,10 @@ def _watch(pids: Mapping[str, int], meanwhile: Callable[[], object]) -> dict[str
 
 
 def _read_threads(pid: int) -> dict[int, tuple[str, float, float]]:
-    """Returns a process's threads: name, processor time so far, ms, and voluntary switches."""
+    """Returns a process's threads: name, processor time so far in ms, and number of voluntary context switches."""
     threads = {}
     for folder in Path(f"/proc/{pid}/task").iterdir():
-        with suppress(FileNotFoundError, ProcessLookupError):  # it has just ended
+        with suppress(FileNotFoundError, ProcessLookupError):  # the thread has just ended
             fields = (folder / "stat").read_text("ascii").rpartition(")")[2].split()
             comm = re.sub(r"-?\d+$", "", (folder / "comm").read_text("utf-8").strip())
             status = (folder / "status").read_text("utf-8")

@@ -1,4 +1,4 @@
-"""A recorder killed twenty times at random moments; and a disk that is full, against one that is not."""
+"""Kills a recorder twenty times at random moments, and compares sessions with a full disk and with free space."""
 
 import random
 import tempfile
@@ -8,7 +8,7 @@ from statistics import median
 from tests.live.killing import SITES, kill_recorder
 from tests.live.processes import Session, Stage
 from tests.live.small_disks import NoSmallDisk, small_disk
-from trilat_net.execution.verification import verify
+from trilat_net.execution.verification import verify_log
 from trilat_net.net import topics
 from trilat_net.net.messages import LinkStats
 from trilat_net.net.wire import decode
@@ -34,7 +34,7 @@ def _kills() -> list[str]:
                 stage.clear()
             lost_ms.append(done.lost_ms)
             kept += done.kept == done.flushed and done.recovery.lossless
-            passed += verify(done.log).agreed
+            passed += verify_log(done.log).agreed
     return [
         f"recorder killed {KILLS} times, three sites at 1 kHz; records lost, ms (bar: <= 150):",
         "  " + " ".join(f"{value:.0f}" for value in sorted(lost_ms)),
@@ -62,7 +62,7 @@ def _full_disks() -> list[str]:
 
 
 def _on_disk(mib: int) -> tuple[int, int, int]:
-    """Returns what the sites say at the end: samples missing, ticks begun late, samples late."""
+    """Returns the sites' final counts of missing samples, ticks that began late, and late samples."""
     with tempfile.TemporaryDirectory() as folder:
         stage = Stage(Path(folder))
         place = Path(folder) / "disk"

@@ -1,4 +1,4 @@
-"""Ten minutes of three sites and a recorder: what is in the file, what the processes hold and take."""
+"""Runs three sites and a recorder for ten minutes, and measures missing records, memory and processor time."""
 
 import os
 import time
@@ -41,7 +41,7 @@ def run() -> list[str]:
 
 
 def _samples(pids: dict[str, int]) -> Iterator[list[float]]:
-    """Yields, once a second: the time, s; of every process what it holds, MiB, and has taken, s."""
+    """Yields, once a second, the time in s, and for every process its memory in MiB and its processor time so far in s."""
     begun = time.monotonic()
     while (t_s := time.monotonic() - begun) < DURATION_S - 2.0:
         yield [

@@ -1,4 +1,4 @@
-"""Environments that advance side by side against one environment: ratio of processor times, interleaved."""
+"""Compares the processor times of environments that advance side by side and of one environment, in turn."""
 
 import statistics
 import time
@@ -11,7 +11,7 @@ from trilat_studies.gym_environment import Judgement, ReachTask, Scene, make_env
 ENVS = 64
 ROUNDS = 7
 STEPS = 150
-"""Half of an episode: both forms begin the next episodes after every second round."""
+"""Number of steps of half an episode: both forms begin the next episodes after every second round."""
 BENT = {f"sites.{name}.q0_rad": [0.4, 1.2] for name in ("m1", "m2", "s")}
 VARY = {"link.delay_ms": (0.0, 300.0)}
 GAINS = np.random.default_rng(1).normal(0.0, 0.05, (8, 2))
@@ -26,7 +26,7 @@ class OwnTask(ReachTask):
 
 
 class Case(NamedTuple):
-    """An environment, and the actions that it gets."""
+    """An environment, and the source of its actions."""
 
     label: str
     settings: Mapping[str, Any]
@@ -36,12 +36,12 @@ class Case(NamedTuple):
 
 
 def draw(_: Any, drawn: Any) -> Any:
-    """Actions that were drawn before."""
+    """Returns actions that were drawn in advance."""
     return drawn
 
 
 def decide(observation: Any, _: Any) -> Any:
-    """A linear policy, of one observation or of many."""
+    """Returns the actions of a linear policy for one observation or for many."""
     parts = [observation[name] for name in ("q", "qd", "goal", "target")]
     return np.tanh(np.concatenate(parts, axis=-1) @ GAINS)
 
@@ -63,7 +63,7 @@ def run() -> list[str]:
 
 
 def _compare(case: Case) -> str:
-    """Times both forms in turn."""
+    """Measures both forms alternately."""
     settings = {"duration_s": 6.0, "vary": VARY, "user": "m2", **case.settings}
     envs = make_env("paper", BENT, num_envs=ENVS, autoreset_mode="SameStep", **settings)
     env = make_env("paper", BENT, **settings)

@@ -1,7 +1,8 @@
-"""One scenario by the fused kernel, by the per-tick driver and by SciPy; then many, on all cores.
+"""Compares the speed of the fused kernel, the per-tick driver and SciPy in one scenario; then runs many on all cores.
 
-SciPy solves the same delay-differential equations by DOP853 and the method of steps, written for the tests
-from the paper alone; its rate is NumPy over all sites at once.
+SciPy solves the same delay-differential equations with DOP853 and the method of steps. This
+code was written for the tests from the paper alone. Its right-hand side computes all sites at
+once with NumPy.
 """
 
 import dataclasses
@@ -22,7 +23,7 @@ from trilat_net.workers import count_cores, worker_pool
 from .stopwatch import best_s
 
 CELLS = 400
-"""Enough for some seconds on every core."""
+"""Number of cells, enough for some seconds on every core."""
 ASKED = 10_000
 
 
@@ -53,7 +54,7 @@ def run() -> list[str]:
 
 
 def _in_environment() -> list[str]:
-    """Times users of `paper`: in Python, as an environment trains them, and compiled, as its own are."""
+    """Measures `paper` with users in Python, as in a training environment, and with its compiled users."""
     env = make_env("paper", user="m2", duration_s=1e3)
     env.reset(seed=1)
     steps, action = 500, 0.2 * env.action_space.high
@@ -73,7 +74,7 @@ def _in_environment() -> list[str]:
 
 
 def _with_plugged_laws(real_s: float, adaptive_s: float) -> list[str]:
-    """Times laws that are plugged in: one that uses all that a law may see, an example, and the built-in."""
+    """Measures plugged-in laws: a law that reads every available input, an example, and the built-in laws."""
     built_in = [name for name, kind in LAWS.items() if hasattr(kind.kind, "torque")]
     lines = ["laws that are plugged in, by their names, in one run:"]
     for law in ("tests.plugged_laws:CompiledLine", "examples.reaction_law:Reaction", *built_in):
@@ -96,7 +97,7 @@ def _with_plugged_laws(real_s: float, adaptive_s: float) -> list[str]:
 
 
 def _both_drivers(scenario: Scenario, runs: int) -> tuple[list[str], FusedRun, float]:
-    """What both drivers take for a scenario; its fused run, and the time of the best of so many."""
+    """Returns lines about both drivers, the fused run of a scenario, and the shortest time of several runs."""
     real_s = scenario.duration_s
 
     def fused() -> FusedRun:
@@ -124,7 +125,7 @@ def _both_drivers(scenario: Scenario, runs: int) -> tuple[list[str], FusedRun, f
 
 
 def _on_all_cores(real_s: float) -> list[str]:
-    """Judges many cells, each with gains of its own, in as many processes as there are cores."""
+    """Judges many cells with different gains, with one process per core."""
     texts = [
         load_scenario("free", {"duration_s": real_s, "control.Kd": 2.0 + 2.0 * n / CELLS}).text
         for n in range(CELLS)

@@ -1,4 +1,4 @@
-"""A live hand: from `move` to the first tick that names it, a device, a killed program, and a flood."""
+"""Measures a live hand: its delay, the rate of a device, the end of a killed program, and a flood of messages."""
 
 import random
 import signal
@@ -13,7 +13,7 @@ import numpy as np
 import trilat_net
 from tests.live.processes import HOLDER, PAPER, Session, Stage, connection_options
 from tests.sites.devices import HaplyService
-from trilat_net.execution.verification import verify
+from trilat_net.execution.verification import verify_log
 from trilat_net.log.log_reader import Log, open_log
 from trilat_net.net import topics
 from trilat_net.net.connection import Connection
@@ -25,7 +25,7 @@ DEVICE_STATES = 5000
 
 
 def run() -> list[str]:
-    """Returns the figures of one session of `play`, three sites at 1 kHz and a recorder."""
+    """Returns the results of one session of `play`, three sites at 1 kHz and a recorder."""
     with tempfile.TemporaryDirectory() as folder:
         stage, alone_per_s = Stage(Path(folder)), _ask_alone()
         try:
@@ -48,12 +48,12 @@ def run() -> list[str]:
 
 
 def _epoch_ns(log: Log, site: str) -> int:
-    """Returns the epoch on the monotonic clock of a site, which is that of this machine."""
+    """Returns the epoch on the monotonic clock of a site, which is this machine's clock."""
     return next(e.epoch_mono_ns for e in log.events if e.kind == "setup" and e.member == site)
 
 
 def _move(session: Session) -> list[tuple[int, int]]:
-    """Moves a hand at random times; returns the number of each message and when it was asked for, ns."""
+    """Moves a hand at random times; returns the number of each message and the time of the request, in ns."""
     moved = []
     with trilat_net.hand(
         "t", "m1", connect=session.endpoints, source="benchmark", timeout_s=60.0
@@ -67,7 +67,7 @@ def _move(session: Session) -> list[tuple[int, int]]:
 
 
 def _ask_alone() -> float:
-    """Returns how many states a second such a device gives where nothing else runs."""
+    """Returns the number of states per second from a Haply device on an otherwise idle machine."""
     with HaplyService() as service, trilat_net.HaplyInverse3(service.address) as device:
         begun_s = time.monotonic()
         for _ in range(DEVICE_STATES):
@@ -77,7 +77,7 @@ def _ask_alone() -> float:
 
 
 def _lead(session: Session) -> str:
-    """Leads m1 by a service that speaks as Haply's; returns its rate, and what the program told."""
+    """Leads m1 with a service that has Haply's protocol; returns its rate, and the output of the program."""
     with HaplyService() as service:
         words = (
             "hand",
@@ -113,7 +113,7 @@ def _describe_moves(log: Log, moved: list[tuple[int, int]]) -> list[str]:
 
 
 def _kill(session: Session) -> int:
-    """Kills a program that holds m2; returns when, ns."""
+    """Kills a program that holds m2, and returns the time, in ns."""
     words = [sys.executable, "-c", HOLDER, "m2", *session.endpoints]
     holder = subprocess.Popen(words, stdout=subprocess.PIPE, cwd=Path(__file__).parents[1])
     assert holder.stdout is not None
@@ -138,7 +138,7 @@ def _describe_kill(log: Log, killed_ns: int) -> list[str]:
 
 
 def _flood(session: Session) -> tuple[int, int, int]:
-    """Sends garbage to the hand of s as fast as it goes; returns begin and end, ns, and how many."""
+    """Sends garbage to the hand of s as fast as possible; returns begin and end, in ns, and the number of messages."""
     connection = Connection.of_member(None, session.endpoints, None, None, [], None)
     bus = ZenohBus([], connection.connect or ())
     time.sleep(2.0)
@@ -165,7 +165,7 @@ def _describe_flood(log: Log, flooded: tuple[int, int, int]) -> list[str]:
     before = (part.t_ns < begun_ns - epoch_ns - 2_000_000_000) & (part.t_s > 2.0)
     p99 = [float(np.percentile(part.late_us[rows], 99)) for rows in (during, before)]
     refused = {k: v for k, v in log.link_stats("s")[-1].dropped.items() if k.startswith("hand")}
-    found, missing = verify(log), sum(map(log.missing, log.sites))
+    found, missing = verify_log(log), sum(map(log.missing, log.sites))
     return [
         f"flood of {sent / (ended_ns - begun_ns) * 1e9:.0f} messages/s for {FLOOD_S:g} s at s: p99 lateness "
         f"{p99[0]:.0f} us, before {p99[1]:.0f} us; refused {refused}",

@@ -1,4 +1,4 @@
-"""Runs side by side in lanes against the same runs one after the other: ratio of processor times, interleaved."""
+"""Compares the processor times of runs side by side in lanes and of the same runs one after the other, in turn."""
 
 import statistics
 import time
@@ -67,7 +67,7 @@ def run() -> list[str]:
 
 
 def _compare(case: Case, width: int) -> str:
-    """Times the runs of one scenario both ways, in turn."""
+    """Measures the runs of one scenario alternately with both methods."""
     cells = [
         load_scenario(case.name, {"duration_s": 20.0, **case.settings, case.key: float(number)})
         for number in np.linspace(case.least, case.largest, width)
@@ -91,7 +91,7 @@ def _compare(case: Case, width: int) -> str:
 
 
 def _compare_twins() -> list[str]:
-    """Times the twins of a certificate, and the certificate, both ways in turn."""
+    """Measures the twins of a certificate, and the certificate, alternately with both methods."""
     log = tn.simulate("paper", duration_s=20)
     pushes = twins.Push.choose(log.scenario)
     least_runs = twin_lanes.LEAST_RUNS
@@ -125,7 +125,7 @@ def _compare_twins() -> list[str]:
 
 
 def _processor_s(call: Callable[[], object]) -> float:
-    """Returns the processor time of a call, s."""
+    """Returns the processor time of a call, in s."""
     begun = time.process_time()
     call()
     return time.process_time() - begun

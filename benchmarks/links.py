@@ -1,7 +1,8 @@
-"""What a link costs: a tick of a site with five peers against one with a single peer, a sample from each.
+"""Measures the cost of a link, from ticks of a site with five peers and of a site with a single peer.
 
-The difference, over four, is one link in one tick: its arrival taken in, its channel's draws, the sample
-brought into use, its part of the reference and of the record.
+A sample of every peer arrives in each tick. A quarter of the difference is the cost of one link
+in one tick: the arrival, the random numbers of the channel, the use of the sample, and its
+parts of the reference and the record.
 """
 
 import gc
@@ -46,7 +47,7 @@ MODELS: dict[str, dict[str, Any]] = {
 
 
 def _step(link: dict[str, Any], peers: int) -> Callable[[], None]:
-    """Returns a call that steps a site by a tick in which every peer's newest sample comes."""
+    """Returns a function that steps a site by a tick in which the newest sample of every peer arrives."""
     names = [f"p{n}" for n in range(peers + 1)]
     share = 1.0 / peers
     scenario = load_scenario(
@@ -73,11 +74,11 @@ def _step(link: dict[str, Any], peers: int) -> Callable[[], None]:
 
 
 def per_sample_us(link: dict[str, Any]) -> np.ndarray:
-    """Returns what one more link costs per sample, us, once per round."""
+    """Returns the additional cost of one more link per sample, in us, for each round."""
     few, many = _step(link, 1), _step(link, 1 + MORE)
     costs = []
     gc.disable()
-    for _ in range(ROUNDS):  # side by side, so that a machine that slows down slows both
+    for _ in range(ROUNDS):  # side by side, so that a slower machine affects both
         both = [np.median(each_us(step, CALLS)) for step in (few, many)]
         costs.append((both[1] - both[0]) / MORE)
     gc.enable()
@@ -85,7 +86,7 @@ def per_sample_us(link: dict[str, Any]) -> np.ndarray:
 
 
 def run() -> list[str]:
-    """Returns a line per model."""
+    """Returns a line per model of a link."""
     lines = [
         "one more link with one sample per tick, in Site.step from Python (bar: p50 <= 5 us):"
     ]

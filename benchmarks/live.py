@@ -1,10 +1,11 @@
-"""A live session of `paper`, five times: how long its ticks are busy, and how late, beside cyclictest.
+"""Measures how long the ticks of a live session of `paper` are busy, and how late they are, compared with cyclictest.
 
-cyclictest (Debian: rt-tests) wakes once a millisecond at the sites' priority while they run. Where it is not
-installed, a thread of this process does, which takes what Python takes to wake up.
+Five sessions run. Meanwhile, cyclictest (Debian: rt-tests) wakes up once a millisecond at the priority of the sites.
+If it is not installed, a thread of this process does so, with the additional delay of Python.
 
-A tick is busy from its waking until the loop sleeps again, all of it. That the sites keep one grid is read
-from their stamps: how long after its tick, and the site's turn in it, each sample was sent.
+A tick is busy from the wake-up of the loop until the loop sleeps again. The stamps of the
+samples show whether the sites keep one grid: they tell how long after its tick, and the site's
+turn in it, each sample was sent.
 """
 
 import os
@@ -56,7 +57,7 @@ def run() -> list[str]:
 
 
 def _run(waker: str) -> tuple[Log, float]:
-    """Runs one session; returns its log, which is whole, and the p99 lateness of what woke beside it, us."""
+    """Runs one session; returns its complete log, and the p99 lateness of the program that woke up beside it, in us."""
     with paper(DURATION_S) as session:
         session.all()
         session.begun()
@@ -72,7 +73,7 @@ def _run(waker: str) -> tuple[Log, float]:
 
 
 def _sent_after_us(log: Log, site: str) -> np.ndarray:
-    """Returns how long after its turns in its ticks a site sent its samples, by its clock, us."""
+    """Returns the times from a site's turn in its ticks to the sending of its samples, by its clock, in us."""
     turn_ns = find_turn_ns(SITES.index(site), len(SITES), log[site].rate_hz)
     return np.array(
         [(state.sent_ns - state.t_ns - turn_ns) / 1000 for state in log[site].states]
@@ -80,7 +81,7 @@ def _sent_after_us(log: Log, site: str) -> np.ndarray:
 
 
 def cyclictest_us(priority: int, duration_s: int) -> float:
-    """Returns the 99th percentile of cyclictest's latencies, us."""
+    """Returns the 99th percentile of cyclictest's latencies, in us."""
     every_ms = ["cyclictest", "-q", "-m", "-i", "1000", "-h", "10000", "-D", str(duration_s)]
     policy = ["-p", str(priority)] if priority else ["--policy=other"]
     text = subprocess.run(
@@ -94,7 +95,7 @@ def cyclictest_us(priority: int, duration_s: int) -> float:
 
 
 def thread_us(priority: int, duration_s: int) -> float:
-    """Returns the same of a thread that sleeps until each millisecond."""
+    """Returns the 99th percentile of the latencies of a thread that sleeps until each millisecond, in us."""
     late_ns: list[int] = []
 
     def wake() -> None:

@@ -1,7 +1,8 @@
-"""A sweep of a million cells: its memory, and its rate from the first cells to the last.
+"""Measures the memory of a sweep of a million cells, and its rate from the first cells to the last.
 
-The judge is replaced by one that answers at once, because a million runs take a day. What is measured
-is what the sweep adds to them: the plan of each cell, the journal, the table and the summary.
+The judge is replaced with one that answers at once, because a million runs take a day. The
+measurement covers the overhead of the sweep: the plan of each cell, the journal, the table and
+the summary.
 """
 
 import itertools
@@ -83,7 +84,7 @@ def run() -> list[str]:
 
 
 def _read_mb(name: str) -> float:
-    """Returns the memory of this process, MB."""
+    """Returns the memory of this process, in MB."""
     for line in Path("/proc/self/status").read_text().splitlines():
         if line.startswith(f"{name}:"):
             return float(line.split()[1]) / 1000.0

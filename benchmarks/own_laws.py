@@ -1,7 +1,7 @@
-"""A map of 20 x 20 cells under a law of one's own, compiled and in plain Python, beside the built-in law.
+"""Compares a map of 20 x 20 cells under a user's law, compiled and in plain Python, with the built-in law.
 
-All three compute P+d. Cells take turns, and what counts is the processor's time of each, so that other work
-on the machine bears on all alike.
+All three laws compute P+d. Their cells alternate, and processor times are compared, so that
+other work on the machine affects all of them equally.
 """
 
 import time
@@ -13,12 +13,12 @@ from trilat_net.workers import count_cores, worker_pool
 
 CELLS = 400
 PLAIN = 8
-"""So many cells of the plain law are run, and counted for all."""
+"""Number of cells of the plain law that are run. The time for all cells is extrapolated."""
 DURATION_S = 20.0
 
 
 def _judge(law: str, text: str) -> tuple[str, float, str]:
-    """Returns the law, how long its cell took the processor, s, and its verdict."""
+    """Returns the law, the processor time of its cell, in s, and the verdict."""
     begun = time.process_time()
     verdict = str(classify_cell(text, 0.0).verdict)
     return law, time.process_time() - begun, verdict

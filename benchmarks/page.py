@@ -1,7 +1,8 @@
-"""The page of `trilat live`: from a pointer to the arm, what it costs the loops, and what its server takes.
+"""Measures the page of `trilat live`: delay from pointer to arm, effect on the loops, and load of the server.
 
-Chromium draws on the machine that it measures; without a graphics card that is most of the load. So the loops
-are compared with two socket clients that take every frame and draw nothing, and without any, in turns.
+Chromium draws on the measured machine, which is most of the load without a graphics card.
+Therefore, the loops are measured alternately with two socket clients that receive every frame
+but draw nothing, and without any client.
 """
 
 import json
@@ -58,7 +59,7 @@ def run() -> list[str]:
 
 @contextmanager
 def live_session(folder: Path, *options: str) -> Iterator[tuple[str, int]]:
-    """A session of `play` with a page: its address and its process; its log is whole at the end."""
+    """Runs a session of `play` with a page; yields the page's address and the process, and checks the log at the end."""
     options = ("--no-browser", "--force", "--out", str(folder), *options)
     command = [sys.executable, "-m", "trilat_net", "live", "play", *options]
     process = subprocess.Popen(
@@ -80,7 +81,7 @@ def live_session(folder: Path, *options: str) -> Iterator[tuple[str, int]]:
 
 
 class SocketClient(threading.Thread):
-    """A page that draws nothing: it takes every frame and says so."""
+    """A page that draws nothing: it receives every frame and confirms it."""
 
     def __init__(self, address: str) -> None:
         super().__init__(daemon=True)
@@ -89,7 +90,7 @@ class SocketClient(threading.Thread):
         self.start()
 
     def run(self) -> None:
-        """Takes frames until the session or the test closes it."""
+        """Receives frames until the session or the test closes the connection."""
         with suppress(ConnectionClosed):
             for text in self.socket:
                 message = json.loads(text)
@@ -99,7 +100,7 @@ class SocketClient(threading.Thread):
 
 
 def measure_once(pages: int) -> tuple[float, float]:
-    """p99 of how late the loops woke up, us, and the server's share of a core, percent."""
+    """Returns the p99 of the loops' lateness, in us, and the server's share of a core, in per cent."""
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name) / "run"
         with live_session(folder) as (address, pid):
@@ -121,7 +122,7 @@ def measure_once(pages: int) -> tuple[float, float]:
 
 
 def measure_load() -> tuple[float, float, float]:
-    """Lateness with two pages and with none, us, and the server's share with two, percent: medians."""
+    """Returns medians: lateness with two pages and without pages, in us, and the server's share with two pages, in per cent."""
     pairs = [(measure_once(2), measure_once(0)) for _ in range(PAIRS)]
     print(
         "p99 with two pages and with none, us:",
@@ -133,7 +134,7 @@ def measure_load() -> tuple[float, float, float]:
 
 
 class TargetWatch(threading.Thread):
-    """Notes when an arm's hand gets another target: chromium answers later than the arm moves."""
+    """Records the time at which an arm's hand gets a new target, because chromium answers after the arm has moved."""
 
     def __init__(self, onlooker: Hand) -> None:
         super().__init__(daemon=True)
@@ -141,7 +142,7 @@ class TargetWatch(threading.Thread):
         self.changed_s: list[float] = []
 
     def run(self) -> None:
-        """Looks at the newest record, until it is told to end."""
+        """Reads the newest record repeatedly until the watch ends."""
         last = None
         while not self.ended.wait(0.0005):
             hand = self._onlooker.in_force
@@ -151,9 +152,10 @@ class TargetWatch(threading.Thread):
 
 
 def measure_pointer() -> "np.ndarray[tuple[int, int], np.dtype[np.float64]]":
-    """To a record whose hand goes elsewhere, ms: from a pointer's move in chromium, and from its order on.
+    """Returns the delays from a pointer's move, and from Playwright's order, to a record with a new target, in ms.
 
-    Chromium stamps a move when it reaches it; Playwright and its pipe are no part of a user's way.
+    Chromium stamps a move when the move reaches it. The delay of Playwright and its pipe does
+    not exist for a user.
     """
     with (
         tempfile.TemporaryDirectory() as name,
@@ -183,7 +185,7 @@ def measure_pointer() -> "np.ndarray[tuple[int, int], np.dtype[np.float64]]":
 
 
 def move_once(page: Page, watch: TargetWatch, x: float, y: float) -> tuple[float, float]:
-    """Moves the pointer by a little and waits until the arm's hand has followed, at most 2 s; see above."""
+    """Moves the pointer slightly, and waits at most 2 s until the arm's hand has followed; see `measure_pointer`."""
     time.sleep(0.3)
     seen, began_s = len(watch.changed_s), time.time()
     page.mouse.move(x, y)

@@ -1,4 +1,4 @@
-"""Every preset as a live session over Zenoh, ten seconds each, against virtual time."""
+"""Compares ten seconds of every preset as a live session over Zenoh with virtual time."""
 
 import shutil
 import tempfile
@@ -7,7 +7,7 @@ from pathlib import Path
 from rich.console import Console
 
 from trilat_net.app.demo_session import run_demo
-from trilat_net.execution.verification import verify
+from trilat_net.execution.verification import verify_log
 from trilat_net.execution.virtual_comparison import compare_with_virtual
 from trilat_net.log.log_reader import open_log
 from trilat_net.scenario import Scenario, load_scenario
@@ -33,7 +33,7 @@ def _session(scenario: Scenario, folder: Path) -> str:
     if outcome.problems or not outcome.log.exists():
         return "; ".join(outcome.problems)
     log = open_log(outcome.log)
-    again, twins = verify(log), compare_with_virtual(log)
+    again, twins = verify_log(log), compare_with_virtual(log)
     want = sum(map(scenario.ticks, scenario.names))
     return (
         f"verify {again.identical}/{want}, fed {twins.fed.identical}/{want}, "

@@ -1,4 +1,4 @@
-"""What opening a minute of three sites at 1 kHz takes, in time and memory, against the `mcap` package."""
+"""Measures the time and memory to open a minute of three sites at 1 kHz, compared with the `mcap` package."""
 
 import subprocess
 import sys
@@ -36,10 +36,10 @@ def run() -> list[str]:
 
 
 def measured(path: Path) -> list[str]:
-    """Returns the figures of a log of three sites m1, m2 and s.
+    """Returns the results for a log of three sites m1, m2 and s.
 
     Args:
-        path: the log.
+        path: Path of the log.
     """
     log = open_log(path)
     records = sum(len(log[name]) for name in log.sites)
@@ -80,14 +80,14 @@ def every_array(log: Log) -> None:
 
 
 def iterated(path: Path) -> None:
-    """Reads every message with the `mcap` package, in file order, and decodes none."""
+    """Reads every message with the `mcap` package, in file order, without decoding."""
     with path.open("rb") as stream:
         for _ in make_reader(stream).iter_messages(log_time_order=False):
             pass
 
 
 def alone(path: Path) -> int:
-    """Returns by how many KiB a process has grown at most that opened a log and looked at one joint."""
+    """Returns the largest growth, in KiB, of a process that opens a log and reads one joint."""
     done = subprocess.run(
         [sys.executable, "-c", _ALONE, path], capture_output=True, text=True, check=True
     )

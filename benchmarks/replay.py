@@ -1,7 +1,7 @@
-"""A replay of nine sites at 1 kHz to a subscriber in another process: how late, and what is lost.
+"""Measures the lateness and the losses of a replay of nine sites at 1 kHz to a subscriber in another process.
 
-The subscriber stands in for a recorder, so that the replay waits for it; it decodes nothing and counts the
-numbers that are missing.
+The subscriber poses as a recorder, so that the replay waits for it. It decodes nothing, and
+counts the missing numbers of messages.
 """
 
 import json
@@ -49,7 +49,7 @@ class _Tick(msgspec.Struct):
 
 
 def subscribe(endpoint: str) -> None:
-    """Takes all records, and prints how many came and how many are missing or out of order."""
+    """Receives all records, and prints how many arrived, are missing or are out of order."""
     bus: Bus = ZenohBus([], [endpoint])
     came: dict[str, list[int]] = {}
     tick = msgspec.msgpack.Decoder(_Tick).decode
@@ -98,7 +98,7 @@ def _info(boot: int) -> Info:
 
 
 def _play(path: Path, *options: str) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Returns what the replay says of itself, and what its subscriber got."""
+    """Returns the summary of the replay, and the counts of its subscriber."""
     (endpoint,) = find_free_endpoints(1)
     subscriber = subprocess.Popen(
         [sys.executable, "-m", "benchmarks.replay", endpoint], stdout=subprocess.PIPE, text=True

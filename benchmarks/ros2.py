@@ -1,4 +1,4 @@
-"""What a bridge to ROS 2 costs the loops: sessions with it, every topic heard at full rate, and without."""
+"""Measures the effect of a bridge to ROS 2 on the loops, with subscribers of all topics at full rate."""
 
 import json
 import time
@@ -29,7 +29,7 @@ def run() -> list[str]:
 
 
 def measure(*, bridged: bool) -> tuple[float, float, float]:
-    """Lateness p99 of the worst site, us; messages a second that a listener heard; load of the bridge, %."""
+    """Returns the p99 lateness of the worst site, in us; a listener's messages per second; and the load of the bridge, in %."""
     (router,) = find_free_endpoints(1)
     with paper(RUN_S) as session:
         session.all()
@@ -52,7 +52,7 @@ def measure(*, bridged: bool) -> tuple[float, float, float]:
 
 
 def listen(router: str, pid: int, lasts_s: float = 6.0) -> tuple[float, float]:
-    """Hears every topic for some time: how many messages a second, and the bridge's load meanwhile, %."""
+    """Listens to every topic for some time; returns the messages per second, and the load of the bridge, in %."""
     settings = {
         "mode": "client",
         "connect": {"endpoints": [router]},

@@ -1,4 +1,4 @@
-"""A session of real processes in a folder that is gone afterwards."""
+"""Runs a session of real processes in a temporary folder."""
 
 import tempfile
 from collections.abc import Iterator
@@ -12,7 +12,7 @@ SITES = ("m1", "m2", "s")
 
 @contextmanager
 def paper(duration_s: int) -> Iterator[Session]:
-    """Yields a session of `paper` whose processes are still to be started; ends what is left of them."""
+    """Yields a session of `paper` whose processes have not been started yet, and ends all remaining processes."""
     with tempfile.TemporaryDirectory() as folder:
         stage = Stage(Path(folder))
         try:

@@ -1,6 +1,6 @@
-"""A recorder that stands still for three seconds: is all of it in the file, and do the sites feel it?
+"""Stops a recorder for three seconds, and checks that the log is complete and that the sites are not affected.
 
-Pairs of runs, one with the stall and one without, in turns, so that the machine's moods are in both.
+Runs with and without the stall alternate, so that changes of the machine affect both.
 """
 
 import signal
@@ -34,7 +34,7 @@ def run() -> list[str]:
 
 
 def _run(stalled: bool) -> Log:
-    """One run; every record must be in its file."""
+    """Returns the log of one run, in which no record may be missing."""
     with paper(DURATION_S) as session:
         session.all()
         session.begun()

@@ -1,8 +1,9 @@
-"""Stops of a session on this machine: what `trilat stop` takes, and how soon a press on a page stops arms.
+"""Measures stops of a session: the cost of `trilat stop`, and the delay from a press on a page to stopped arms.
 
-A press is stamped by chromium where it reaches the page (`timeOrigin` + `timeStamp`), a tick by its place on
-the grid and how late it was, from the Unix time of the epoch in the log. All are clocks of one kernel; the
-page's is compared with this program's before every press, and how far the two may be apart is reported.
+Chromium stamps a press when it reaches the page (`timeOrigin` + `timeStamp`). The time of a
+tick is computed from its nominal time, its lateness, and the Unix time of the epoch in the log.
+All clocks belong to one kernel. Before every press, the clock of the page is compared with this
+program's clock, and the largest possible difference is reported.
 """
 
 import os
@@ -32,7 +33,7 @@ from .page import live_session
 STOPS, CPU_S = 20, 0.25
 PRESSES, P50_MS, P95_MS = 20, 60.0, 150.0
 RATE = ("--set", "rate_hz=250")
-"""Drawing takes what a machine of two cores has."""
+"""Settings of the session: a low tick rate, because drawing takes most of a machine with two cores."""
 PHONE = {"viewport": {"width": 390, "height": 844}, "has_touch": True, "is_mobile": True}
 WAYS: dict[str, tuple[dict[str, Any], Callable[[Page], None]]] = {
     "button on a user's page": (
@@ -50,7 +51,7 @@ trilat.pressed = performance.timeOrigin + event.timeStamp; }, true)"""
 
 
 def run() -> list[str]:
-    """Returns the figures of stops of sessions of `play`, three sites and a recorder."""
+    """Returns the results of stops of sessions of `play`, three sites and a recorder."""
     with tempfile.TemporaryDirectory() as folder, mock.patch.dict(PLAIN, XDG_STATE_HOME=folder):
         stage = Stage(Path(folder))
         try:
@@ -69,7 +70,7 @@ def run() -> list[str]:
 
 
 def _stop_once() -> tuple[float, float]:
-    """Processor time of a stop, with all its threads, and its duration, s."""
+    """Returns the processor time of a stop with all of its threads, and its duration, in s."""
     began_s = time.monotonic()
     command = [sys.executable, "-m", "trilat_net", "stop", "--session", "t"]
     stop = subprocess.Popen(command, env=PLAIN, stdout=subprocess.PIPE)
@@ -94,7 +95,7 @@ def _press(page: Page) -> None:
 
 
 def _describe_presses() -> list[str]:
-    """Returns, for each way to press, how soon the last arm stopped."""
+    """Returns, for each kind of press, a line about the delay until the last arm stopped."""
     presses: dict[str, list[float]] = {}
     apart_ms: list[float] = []
     with tempfile.TemporaryDirectory() as name:
@@ -127,7 +128,7 @@ def _describe_presses() -> list[str]:
 def _press_often(
     browser: Browser, address: str, way: str, apart_ms: list[float]
 ) -> list[float]:
-    """Presses, lets the arms follow again, and so on; returns when, Unix time, ms."""
+    """Presses and lets the arms follow again, repeatedly; returns the Unix times of the presses, in ms."""
     options, press = WAYS[way]
     page = browser.new_page(**options)
     page.goto(with_query(address, "as=m1"))
@@ -148,7 +149,7 @@ def _press_often(
 
 
 def _find_offset_ms(page: Page) -> float:
-    """Returns how far the page's clock may be from this program's: the least bound of some looks."""
+    """Returns the largest possible difference between the clocks of page and program, from several readings, in ms."""
     bounds = []
     for _ in range(10):
         before_s = time.time()
@@ -160,7 +161,7 @@ def _find_offset_ms(page: Page) -> float:
 
 
 def _find_stop_ms(log: Log, pressed_ms: float) -> list[float]:
-    """Returns how long after a press the first stopped tick of each arm was made, ms."""
+    """Returns the delay from a press to the first stopped tick of each arm, in ms."""
     epoch_ms = int(log.session["epoch_unix_ns"]) / 1e6
     found = []
     for site in log.sites:

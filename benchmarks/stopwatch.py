@@ -1,4 +1,4 @@
-"""Times calls one by one, so that a percentile means one call; and the processor time of a process."""
+"""Measures the durations of single calls, and the processor time of a process."""
 
 import os
 import time
@@ -11,7 +11,7 @@ CALLS = 20_000
 
 
 def each_us(call: Callable[[], object], calls: int = CALLS) -> np.ndarray:
-    """Returns how long each call took, us, shape (calls,), the clock's own cost taken off."""
+    """Returns the duration of each call without the cost of the clock, in us, shape (calls,)."""
     clock = time.perf_counter_ns
     times = np.empty(calls)
     for n in range(calls):
@@ -26,7 +26,7 @@ def each_us(call: Callable[[], object], calls: int = CALLS) -> np.ndarray:
 
 
 def best_s(call: Callable[[], object], rounds: int = 5) -> float:
-    """Returns the shortest of some rounds, s."""
+    """Returns the shortest duration of a call in several rounds, in s."""
     clock = time.perf_counter
     times = []
     for _ in range(rounds):
@@ -37,6 +37,6 @@ def best_s(call: Callable[[], object], rounds: int = 5) -> float:
 
 
 def cpu_s(pid: int) -> float:
-    """Returns the processor time of one process without its children, s."""
+    """Returns the processor time of one process without its children, in s."""
     fields = Path(f"/proc/{pid}/stat").read_text(encoding="ascii").rpartition(")")[2].split()
     return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")

@@ -1,4 +1,4 @@
-"""One site tick called from Python, from two samples that came in to the own one, and its parts."""
+"""Measures one site tick called from Python, from two arrived samples to the site's own sample, and its parts."""
 
 import gc
 
@@ -20,7 +20,7 @@ DELAY_NS = 300_000
 
 
 class TickParts:
-    """A site and what came in from its peers, to be stepped again and again."""
+    """A site and the samples that have arrived from its peers, which are stepped again and again."""
 
     def __init__(self) -> None:
         self.site = site = Site(load_scenario("paper").setup("m1"))
@@ -41,19 +41,19 @@ class TickParts:
         self.output = self.step()
 
     def decode(self) -> list[PeerSample]:
-        """Returns what the peers sent."""
+        """Returns the decoded samples of the peers."""
         return [
             decode(payload, PeerSample, layout=self.site.layout) for payload in self.payloads
         ]
 
     def take(self, samples: list[PeerSample]) -> list[Arrival]:
-        """Returns samples as the site takes them in."""
+        """Returns samples as arrivals, the input of the site."""
         pairs = zip(self.timing.monitors, samples, strict=True)
         delays = [meter.receive(sample, AT_NS) for meter, sample in pairs]
         return [Arrival(j, s.tick, s.q, s.qd, delays[j] // 1000) for j, s in enumerate(samples)]
 
     def stamp(self) -> None:
-        """Does what a tick does with times."""
+        """Computes the times that a tick needs."""
         k = next(self.counter)
         self.timing.deadline_ns(k)
         self.take(self.samples)
@@ -67,7 +67,7 @@ class TickParts:
         return self.site.step(TickInput(next(self.counter), self.came))
 
     def whole(self) -> bytes:
-        """Does all that a tick does up to its sample."""
+        """Executes a whole tick, up to its encoded sample."""
         k = next(self.counter)
         self.timing.deadline_ns(k)
         taken = self.take(self.decode())
@@ -78,7 +78,7 @@ class TickParts:
         return encode_sample("m1", 7, done, sent_ns, echoed)
 
     def leaf(self) -> None:
-        """Does what is compiled of a tick."""
+        """Executes the compiled part of a tick."""
         k = next(self.counter)
         site_tick(k, 1_000_000 * k, 2, *self.site._tick_arrays)
 

@@ -1,8 +1,8 @@
-"""What TLS with keys costs a sample on its way: one process to another on loopback, against plain TCP.
+"""Measures the cost of TLS with keys for a sample between two processes on loopback, compared with plain TCP.
 
-Both links stand all the time; they carry samples in turns of a tenth of a second, so that what else the
-machine does touches both. The way is from the stamp in the sample to its arrival in the receiver's thread of
-the bus.
+Both links are open all the time, and carry samples alternately for a tenth of a second, so that
+other work on the machine affects both. The delay is measured from the stamp in the sample to
+its arrival in the receiver's bus thread.
 """
 
 import struct
@@ -28,7 +28,7 @@ _KEY = topics.key("x", "m1", topics.SAMPLE)
 
 
 def send(folder: str, *places: str) -> None:
-    """Sends samples over both links in turns; the program of the other process."""
+    """Sends samples alternately over both links. This is the program of the other process."""
     clock = SystemClock()
     settings = [None, read_member_keys(Path(folder) / "m1").settings]
     with ExitStack() as stack:
@@ -37,7 +37,7 @@ def send(folder: str, *places: str) -> None:
             for place, own in zip(places, settings, strict=True)
         ]
         publish = [bus.publisher(_KEY) for bus in buses]
-        # links and subscriptions are there by then
+        # links and subscriptions exist by then
         clock.sleep_until(clock.monotonic_ns() + 2 * 10**9)
         due_ns = clock.monotonic_ns()
         for n in range(2 * ROUNDS * SAMPLES):
@@ -49,7 +49,7 @@ def send(folder: str, *places: str) -> None:
 
 
 def measure_us() -> "list[np.ndarray[tuple[int, int], np.dtype[np.float64]]]":
-    """Returns the ways of all samples over plain TCP and over TLS, us, shape (ROUNDS, SAMPLES - SKIPPED)."""
+    """Returns the delays of all samples over plain TCP and over TLS, in us, shape (ROUNDS, SAMPLES - SKIPPED)."""
     clock = SystemClock()
     with tempfile.TemporaryDirectory() as name, ExitStack() as stack:
         folder = Path(name) / "keys"

@@ -1,6 +1,7 @@
-"""Verifying a log by compiled code against reading and executing its records one by one.
+"""Compares verifying a log by compiled code with reading and executing its records one by one.
 
-Both ways are timed in turn in one process. The ratio is that of processor times.
+Both methods are measured alternately in one process. The result is the ratio of their processor
+times.
 """
 
 import statistics
@@ -33,12 +34,12 @@ def run() -> list[str]:
 
 
 def _compare(name: str, path: Path) -> str:
-    """Times both ways for one log, in turn."""
-    records = verification.verify(open_log(path)).identical  # compiles
+    """Measures both methods alternately for one log."""
+    records = verification.verify_log(open_log(path)).identical  # compiles
     pairs = []
     for _ in range(ROUNDS):
         fast_s = min(
-            _processor_s(lambda: verification.verify(open_log(path))) for _ in range(3)
+            _processor_s(lambda: verification.verify_log(open_log(path))) for _ in range(3)
         )
         pairs.append((fast_s, _processor_s(lambda: verify_singly(path))))
     ratio = statistics.median(single_s / fast_s for fast_s, single_s in pairs)
@@ -56,11 +57,11 @@ def verify_singly(path: Path) -> verification.VerifyResult:
         mock.patch.object(mcap_reader, "_BLOCK_BYTES", 1 << 40),
         mock.patch.object(IndexedRecords, "of_payloads", return_value=None),
     ):
-        return verification.verify(open_log(path))
+        return verification.verify_log(open_log(path))
 
 
 def _processor_s(call: Callable[[], object]) -> float:
-    """Returns the processor time of a call, s."""
+    """Returns the processor time of a call, in s."""
     begun = time.process_time()
     call()
     return time.process_time() - begun

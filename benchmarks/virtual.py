@@ -1,9 +1,9 @@
-"""`trilat sim paper` with its full log against real time and where its time goes; then verify."""
+"""Measures the speed of `trilat sim paper` with its full log, its parts, and then the speed of verify."""
 
 import io
 
 from trilat_net.execution import virtual
-from trilat_net.execution.verification import verify
+from trilat_net.execution.verification import verify_log
 from trilat_net.log.log_reader import open_log
 from trilat_net.log.log_writer import LogWriter
 from trilat_net.log.provenance import collect_provenance
@@ -38,7 +38,7 @@ def run() -> list[str]:
 
 
 def time_writing(scenario: Scenario) -> tuple[float, float]:
-    """Returns what encoding all records of a run takes, and writing them, s."""
+    """Returns the times to encode and to write all records of a run, in s."""
     steps = list(virtual.execute_virtual(scenario))
 
     def encode() -> list[tuple[str, bytes, int, int]]:
@@ -67,7 +67,7 @@ def time_writing(scenario: Scenario) -> tuple[float, float]:
 
 
 def time_checking(scenario: Scenario) -> tuple[float, float]:
-    """Returns what reading a log takes, and verifying it, s."""
+    """Returns the times to read and to verify a log, in s."""
     stream = io.BytesIO()
     virtual.write_virtual_log(scenario, stream)
 
@@ -75,10 +75,10 @@ def time_checking(scenario: Scenario) -> tuple[float, float]:
         stream.seek(0)
         log = open_log(stream)
         for name in log.sites:
-            log[name].states  # noqa: B018 - reading is what is timed
+            log[name].states  # noqa: B018 - the reading is measured
 
     def check() -> None:
         stream.seek(0)
-        verify(open_log(stream))
+        verify_log(open_log(stream))
 
     return best_s(read), best_s(check)

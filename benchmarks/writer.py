@@ -1,4 +1,4 @@
-"""Messages a second into `LogWriter.add` and into `mcap.Writer`, and what an hour's index takes in memory."""
+"""Measures messages per second of `LogWriter.add` and `mcap.Writer`, and the memory of an hour's index."""
 
 import io
 from collections.abc import Callable
@@ -20,7 +20,7 @@ from .stopwatch import best_s
 
 PAYLOAD_BYTES = 480
 FLUSH_EVERY = 300
-"""Records of three sites at 1 kHz in 100 ms."""
+"""Number of records of three sites at 1 kHz in 100 ms."""
 CHANNELS, CHUNKS_PER_MIN = 12, 600
 Message = tuple[str, bytes, int, int]
 """Key, payload, time, number."""
@@ -42,7 +42,7 @@ def run() -> list[str]:
 
 
 def _messages(duration_s: float) -> list[Message]:
-    """Records of the paper's experiment, with as many arrivals as make them long enough."""
+    """Returns records of the paper's experiment, with enough arrivals to give them a realistic size."""
     scenario = load_scenario("paper", {"duration_s": duration_s})
     messages = []
     for site, arrivals, output in virtual.execute_virtual(scenario):
@@ -84,7 +84,7 @@ def _theirs(messages: list[Message]) -> bytes:
 
 
 class _Nowhere:
-    """Takes everything and keeps nothing."""
+    """A file that discards everything that is written to it."""
 
     def __init__(self) -> None:
         self._size = 0
@@ -114,7 +114,7 @@ _WRITERS: dict[str, Callable[[], Any]] = {
 
 
 def _growth(make: Callable[[], Any]) -> float:
-    """Returns by how much the process grows a minute, MiB."""
+    """Returns the growth of the process per minute, MiB."""
     file = make()
     schema = file.register_schema("S", "jsonschema", b"{}")
     channels = [file.register_channel(f"/{n}", "msgpack", schema, {}) for n in range(CHANNELS)]

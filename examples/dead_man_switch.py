@@ -38,8 +38,8 @@ def hold(
 
     Args:
         switch: the dead-man switch of an arm.
-        read: waits for one period, and returns the keys that arrived. Empty if there are none,
-            and None at the end of the input.
+        read: waits for one period, and returns the keys that arrived. Empty if there are no
+            keys, and `None` at the end of the input.
         now_s: returns the present time, in s.
         gap_s: time without keys after which the switch is released, in s.
     """
@@ -54,7 +54,7 @@ def hold(
 
 
 def read_input() -> bytes | None:
-    """Returns the keys that arrive within one period. None at the end of the input."""
+    """Returns the keys that arrive within one period, or `None` at the end of the input."""
     readable, _, _ = select.select([sys.stdin], [], [], PERIOD_S)
     if not readable:
         return b""
@@ -63,7 +63,7 @@ def read_input() -> bytes | None:
 
 @contextmanager
 def single_keys() -> Iterator[None]:
-    """Makes the terminal report each key at once and show none, until the end of the block."""
+    """Makes the terminal report each key without showing it, until the end of the block."""
     if not sys.stdin.isatty():
         yield
         return

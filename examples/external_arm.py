@@ -57,7 +57,7 @@ class Robot(tn.SimulatedArm):
         for thirty periods, a light arm would swing and diverge.
 
         Args:
-            tau: torque of each joint, N m. None: the brakes hold the robot.
+            tau: torque of each joint, N m. If `None`, the brakes hold the robot.
         """
         if tau is None:
             self.qd[:] = 0.0

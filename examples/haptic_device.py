@@ -38,7 +38,7 @@ class Device:
 
         Args:
             force_n: force on the user's hand, x and y, N.
-            period_s: length of the period, s.
+            period_s: length of the period, in s.
         """
         for i, (arm_force, push) in enumerate(zip(force_n, PUSH_N, strict=True)):
             friction = self.FRICTION_N_S_M * self._speed[i]

@@ -24,10 +24,10 @@ import trilat_net as tn
 PERIOD_S = 0.016
 RAMP_S = 1.0
 SPARE_S = 0.5
-"""Time after a ramp until its effect has reached all sites, s."""
+"""Time after a ramp until its effect has reached all sites, in s."""
 RADIUS_M = 0.10
 TURN_S = 3.0
-"""Time for one turn around the circle, s."""
+"""Time for one turn around the circle, in s."""
 
 
 def circle(start: Sequence[float], t_s: float, radius_m: float) -> tuple[float, float]:
@@ -42,7 +42,7 @@ class References:
 
     Attributes:
         steps: for each site, the time (s) and the size (rad) of every step.
-        now_s: time of the newest record, s.
+        now_s: time of the newest record, in s.
     """
 
     def __init__(self) -> None:
@@ -62,7 +62,7 @@ class References:
             self._last[record.site] = record.tick, q_des
 
     def largest(self, site: str, spans: Sequence[tuple[float, float]]) -> float:
-        """Returns the largest step of a site's reference during some spans of time, rad."""
+        """Returns the largest step of a site's reference during some spans of time, in rad."""
         largest = 0.0
         for t_s, step in self.steps[site]:
             if any(start_s <= t_s <= end_s for start_s, end_s in spans):
@@ -114,10 +114,10 @@ def lead(
     Args:
         session: the running session.
         program: the operator of m2.
-        person: the operator of m1. None if a real person moves m1.
-        seconds: duration, s.
-        now_s: returns the present time, s.
-        wait_s: waits for a time, s.
+        person: the operator of m1. `None` if a real person moves m1.
+        seconds: duration, in s.
+        now_s: returns the present time, in s.
+        wait_s: waits for a time, in s.
 
     Returns:
         The references of all sites, and the spans of time in which the lead changed.

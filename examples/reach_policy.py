@@ -26,7 +26,7 @@ def place(q: np.ndarray, qd: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Returns position (m) and velocity (m/s) of a planar arm's end effector.
 
     Args:
-        q: the two joint angles, rad.
+        q: the two joint angles, in rad.
         qd: the two joint velocities, rad/s.
     """
     position = np.zeros(2)
@@ -54,7 +54,7 @@ def decide(
         weights: weights of the four vectors, see the module's docstring.
         goal_m: goal of the slave's end effector, m.
         pose: position of the policy's own end effector, m.
-        slave_q: joint angles of the slave in the newest sample, rad.
+        slave_q: joint angles of the slave in the newest sample, in rad.
         slave_qd: joint velocities of the slave in that sample, rad/s.
     """
     slave_m, slave_velocity = place(slave_q, slave_qd)

@@ -2,9 +2,10 @@
 
 A program leads master m1 to a place around its start, waits there, and judges by the distance
 whether it arrived. With `--alone`, lead m1 yourself with the mouse on the page: an episode then
-succeeds if m1 ends near the place that the terminal names. A second hand leads master m2 where
-m1 is, as `lerobot-record` does, because a policy at m2 will hold it too: a log in which nobody
-holds m2 has forces of zero there, for which LeRobot cannot find a scale. Run two terminals:
+succeeds if m1 ends near the place that the terminal names. A second hand moves master m2 to the
+position of m1, as `lerobot-record` does, because a policy will also hold m2. In a log in which
+nobody holds m2, its forces are zero, and LeRobot cannot find a scale for them. Run two
+terminals:
 
     trilat demo play --duration 60 -o reach-log
     python examples/record_episodes.py play
@@ -24,9 +25,9 @@ from typing import Any
 import trilat_net as tn
 
 RADIUS_M = 0.15
-"""Distance of the places from the start, m."""
+"""Distance of the places from the start, in m."""
 NEAR_M = 0.03
-"""Largest distance at which an episode has succeeded, m."""
+"""Largest distance at which an episode has succeeded, in m."""
 MOVING_SHARE = 0.6
 """Share of an episode in which the program moves. It waits in the rest."""
 PERIOD_S = 0.02
@@ -84,10 +85,10 @@ def record(
         follower: the operator of m2, which goes where m1 is.
         leads: False if a person moves m1.
         episodes: number of episodes. The end of the session ends them earlier.
-        seconds: duration of an episode, s.
+        seconds: duration of an episode, in s.
         draw: source of the random places.
-        now_s: returns the present time, s.
-        wait_s: waits for a time, s.
+        now_s: returns the present time, in s.
+        wait_s: waits for a time, in s.
     """
     results: list[bool] = []
     x_m, y_m = hand.pose

@@ -26,7 +26,7 @@ from train_over_delay import FIRM, NETWORKS, STUDIES, interval, train
 import trilat_net as tn
 
 TAKEN_S = 2.0
-"""Time at which the person gets the lead, s."""
+"""Time at which the person gets the lead, in s."""
 RAMP_S = 2.0
 LASTS_S = 10.0
 NEAR_M = 0.05
@@ -39,7 +39,7 @@ def run(weights: np.ndarray, seed: int, ramp_s: float | None) -> dict[str, float
     Args:
         weights: weights of the policy.
         seed: seed of the goal and of the network.
-        ramp_s: duration of the change of the lead, s. None: the policy keeps the lead.
+        ramp_s: duration of the change of the lead, in s. If `None`, the policy keeps the lead.
     """
     random = np.random.default_rng(seed)
     base = STUDIES["reach"].scenario

@@ -87,7 +87,7 @@ class Study(NamedTuple):
 
     Attributes:
         scenario: keys of the scenario in which the task is done.
-        make_task: returns a new task. None selects the task of the environment, reaching.
+        make_task: returns a new task. If `None`, the task is that of the environment, reaching.
         rounds: number of rounds of the evolution strategy.
         pairs: number of pairs of opposite perturbations per round.
         rate: step size of the first round; it falls to zero linearly.
@@ -244,7 +244,7 @@ def report(found: list[dict[str, Any]], measure: str) -> dict[str, tuple[float, 
         measure: meaning of the cost.
 
     Returns:
-        The mean and its interval, mm, by combination.
+        The mean and its interval, in mm, by combination.
     """
     columns = {
         name: np.array([result["costs"][name] for result in found])

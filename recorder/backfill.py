@@ -1,9 +1,10 @@
-"""Requests messages that were lost on the network from their sender, which keeps recent ones.
+"""Requests messages that were lost on the network again from their sender.
 
 The process of each arm (the site) publishes numbered messages, and the recorder writes them to
 a log. A gap in the numbers shows that a message was lost. If the last messages are lost, there
-is no gap. Therefore, if nothing arrives from a site for a while, the recorder requests its
-newest messages (a probe). No function waits: the present time is an argument.
+is no gap. Therefore, if nothing arrives from a site for a while, the recorder requests the
+newest messages of that site (a probe). The functions do not wait. They receive the present time
+as an argument.
 
 Invariant:
     - At most one request to a site is open at a time.
@@ -36,7 +37,7 @@ GRACE_NS = 50_000_000
 SILENT_NS = 1_000_000_000
 """Time without messages after which the newest messages of a site are requested, in ns.
 
-For slow sites it is three tick periods.
+For slow sites, three tick periods are used instead.
 """
 ANSWER_NS = (300_000_000, 3_000_000_000)
 """Shortest and longest timeout of a request, in ns. It doubles after each request without a
@@ -130,7 +131,8 @@ class GapRepair:
     def progress_ns(self) -> int:
         """Time at which the last missing message arrived, on the monotonic clock, in ns.
 
-        If it lies long ago, the site probably has no more missing messages.
+        If this time lies far in the past, the site probably has none of the missing messages
+        any more.
         """
         return self._progress_ns
 
@@ -156,7 +158,7 @@ class GapRepair:
             The messages of the replies. Nothing if no reply has arrived.
         """
         if now_ns - self._polled_ns > SILENT_NS:
-            # This process was suspended. The site is not to blame that nothing arrived.
+            # Nothing could arrive while this process was suspended, so the site was not silent.
             self._progress_ns = now_ns
         self._polled_ns = now_ns
 
@@ -170,13 +172,14 @@ class GapRepair:
         if self._reception.final_ticks is not None:
             if self._ended_ns is None:
                 self._ended_ns = now_ns
-            # After its end, the site sends what it still has, until nothing more comes.
+            # After the end of the site, messages are requested from its buffer until no more
+            # arrive.
             waited_since_ns = max(self._ended_ns, self._progress_ns)
             if now_ns - waited_since_ns > GIVE_UP_NS:
                 self._reception.give_up()
 
     def _probe_if_silent(self, now_ns: int) -> None:
-        """Requests the newest messages of a running site from which nothing arrives.
+        """Requests the newest messages of a running site whose messages have stopped arriving.
 
         If its last messages were lost, no later number shows a gap, so the recorder has to ask.
         The silence is counted from the last message or the last probe. A slow site may take
@@ -258,9 +261,9 @@ class GapRepair:
     def _extend_over_gaps(account: Account, last_missing: int, limit: int) -> int:
         """Returns the last number of a request that also covers the gaps that follow closely.
 
-        On a busy machine single messages are lost, many in a second. If each of these gaps had
-        its own request, the recorder would fall further behind than the site's buffer reaches.
-        The messages between the gaps come once more and are ignored.
+        On a busy machine, many single messages may be lost in a second. If each of these gaps
+        had its own request, the recorder would fall further behind than the site's buffer
+        reaches. The messages between the gaps arrive a second time and are ignored.
 
         Args:
             account: Account of the channel.
@@ -361,7 +364,7 @@ class GapRepair:
     def _accept_reply(
         self, backfill: Backfill, request: BackfillRequest, now_ns: int
     ) -> Iterator[RepairedMessage]:
-        """Evaluates a reply that contains messages which were lost before.
+        """Evaluates a reply that contains messages that were lost before.
 
         The messages that are new are yielded. A reply that fills no gap is counted, because the
         recorder gives up after several of them. Finally the next request is scheduled.
@@ -415,7 +418,7 @@ class GapRepair:
     def _count_vain_request(self, channel: str) -> None:
         """Counts a request that filled no gap, and gives up after `MAX_VAIN_REQUESTS` of them.
 
-        All messages that are missing in the channel then count as missing for good.
+        All messages that are missing in the channel then count as permanently missing.
 
         Args:
             channel: Channel of the missing messages.

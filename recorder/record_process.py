@@ -9,7 +9,8 @@ Invariant:
     - No message is lost that has arrived, or that a site still has in its buffer.
     - Messages get the time of their arrival and wait in one bounded queue. One thread writes
       them.
-    - The file is flushed about every 65 ms, and completed whenever the process ends in order.
+    - The file is flushed about every 65 ms, and completed whenever the process ends without a
+      crash.
     - The first signal, such as Ctrl-C, ends the recorder after it has received the messages
       that the sites still have. The second signal ends it at once.
 """
@@ -41,7 +42,7 @@ from .session_recording import RecorderReport, Recording
 from .site_reception import InboundQueue
 
 NICE = -5
-"""Nice value that is requested, so that a busy machine does not delay the recorder for seconds.
+"""Requested nice value, so that a busy machine does not delay the recorder for seconds.
 
 Sites have a higher priority, because their ticks are due within a millisecond.
 """
@@ -55,11 +56,11 @@ in s. Sites keep their messages for that long.
 """
 END_NS = _END_S * 1_000_000_000
 LONGEST_END_NS = 60_000_000_000
-"""Longest time after a signal to get the messages that sites still have, in ns."""
+"""Longest time after a signal in which the sites' remaining messages are requested, in ns."""
 FLUSH_NS = 65_000_000
 """Period with which the messages are written and flushed, in ns.
 
-A crash loses at most this time.
+A crash loses at most the messages of this time.
 
 A longer period costs less computing time.
 """
@@ -142,7 +143,7 @@ class Recorder:
         All processes of a session, the recorder included, first agree on a common start time.
 
         Args:
-            timeout_s: Longest time to wait, in s. None means no limit.
+            timeout_s: Longest time to wait, in s. If None, there is no limit.
 
         Returns:
             The common start time of the session, and the boot number of each member, which
@@ -260,7 +261,7 @@ class Recorder:
     def _announce_start(self, recording: Recording, epoch: Epoch, path: Path) -> None:
         """Announces on the network that the recorder runs.
 
-        A late one requests earlier messages.
+        A recorder that joins late also requests earlier messages.
 
         The other processes of the session wait for this announcement, from which they know that
         their messages are recorded.
@@ -277,7 +278,7 @@ class Recorder:
         joins_late = epoch.boots.get(info.member) != info.boot
         if joins_late:
             elapsed_s = (now_ns - epoch.mono_ns) / 1e9
-            text = f"joins the session, which runs since {elapsed_s:.1f} s"
+            text = f"joins the session, which has been running for {elapsed_s:.1f} s"
             recording.assume_gone()
             self._receive_presence(recording)
             recording.join_late(now_ns)
@@ -287,7 +288,7 @@ class Recorder:
             self._say(f"recorder: {clock_text}")
 
     def _receive_presence(self, recording: Recording) -> None:
-        """Tells the recording which processes have joined the session's network or left it.
+        """Informs the recording which processes have joined the session's network or left it.
 
         Zenoh, the network library, reports both. From these reports the recording decides which
         sites (processes that control an arm) it still has to wait for before it closes the log.
@@ -299,7 +300,7 @@ class Recorder:
     def _run(self, recording: Recording, report: RecorderReport) -> None:
         """Writes received messages to the log at regular intervals until the session is over.
 
-        The loop also ends if the recorder itself is told to end, for example by Ctrl-C.
+        The loop also ends if the recorder itself is asked to end, for example by Ctrl-C.
 
         Args:
             recording: The recording, whose log is written.
@@ -315,7 +316,7 @@ class Recorder:
                     f"{_END_S} s; Ctrl-C a second time ends it at once"
                 )
             if ending_since_ns is not None:
-                # Wait for missing messages as long as some of them arrive, but not for ever.
+                # Wait for missing messages as long as some of them arrive, but not forever.
                 waited_ns = now_ns - ending_since_ns
                 without_arrival_ns = now_ns - max(ending_since_ns, recording.repaired_ns)
                 has_waited = without_arrival_ns > END_NS or waited_ns > LONGEST_END_NS
@@ -375,8 +376,8 @@ def record_session(
         read_scenario: Function that reads the text of the session's scenario.
         collect_provenance: Function that returns the facts about this program that the log
             contains. It is called once the recorder is connected.
-        join_timeout_s: Longest time to wait until the session begins, in s. None means no
-            limit.
+        join_timeout_s: Longest time to wait until the session begins, in s. If None, there is
+            no limit.
         clock: Clock of the recorder.
         say: Function that prints a line for the user.
         afterwards: Function that processes the finished log, unless the session was
@@ -423,7 +424,7 @@ def record_session(
             say=say,
             is_ending=interrupt.is_requested,
         )
-        process.freeze_gc()  # a pause of the collector would delay the next flush
+        process.freeze_gc()  # a pause for garbage collection would delay the next flush
         process.raise_priority(NICE)
         epoch = recorder.join(join_timeout_s)
         if epoch is None:

@@ -9,8 +9,8 @@ Invariant:
     - A message of the session is written once, byte for byte. Any other message is counted as
       dropped, with the reason.
     - The recorder publishes the event "stored" about a site when it has every message of the
-      site that it can get. A site that has ended waits for this event, but only for a limited
-      time.
+      site that can still be obtained. A site that has ended waits for this event, but only for
+      a limited time.
     - Statistics are published and recorded once a second, with a bounded size. All times are
       measured by the monotonic clock. If the wall clock is set, only the statistics show it.
 """
@@ -211,7 +211,7 @@ class Recording:
         """Time at which the latest missing message of any site arrived, in ns.
 
         It is a time of the monotonic clock. A recorder that ends stops waiting for missing
-        messages if it lies too long ago.
+        messages if this time lies too far in the past.
         """
         return max(repair.progress_ns for repair in self._repairs.values())
 
@@ -227,7 +227,7 @@ class Recording:
             now_ns: Present time on the monotonic clock, in ns.
         """
         since_epoch_ns = now_ns - self.epoch.mono_ns
-        # By this time, the reception judges whether a message is from the future.
+        # The reception uses this time to judge whether a message is from the future.
         self._sites[name].since_ns = since_epoch_ns
         gone_since_ns = self._update_gone_since_ns(name, now_ns)
         # If a message arrived after the site was reported as gone, the site can still reply.
@@ -273,7 +273,8 @@ class Recording:
 
         Args:
             queue: Queue of the received messages.
-            until_ns: Messages that arrived later stay in the queue. None writes all messages.
+            until_ns: Messages that arrived later stay in the queue. If None, all messages are
+                written.
         """
         for message in queue.drain(until_ns):
             try:
@@ -315,8 +316,8 @@ class Recording:
                 self._channels[key] = (site, channel)
                 self.accounts[key] = site.accounts[channel]
 
-            # What was known about the presence of the previous start no longer applies. The new
-            # start may have disappeared already, before it was recorded.
+            # The notes about the presence of the previous start no longer apply. The new start
+            # may have disappeared already, before it was recorded.
             self._stored_sites.discard(name)
             self._noticed_gone_ns.pop(name, None)
             has_new_start_vanished = (name, str(boot)) in self._vanished_starts
@@ -411,8 +412,8 @@ class Recording:
     def _write_site_message(self, key: str, payload: bytes, mono_ns: int) -> None:
         """Writes an event or statistics of a site, unless they were written before.
 
-        The log states two times of a message: that of sending, in ns since the epoch (the start
-        of the session), and that of arrival, as Unix time.
+        The log states two times of a message: the sending time, in ns since the epoch (the
+        start of the session), and the arrival time, as Unix time.
 
         Args:
             key: Key under which the message arrived. It names the site and the channel.
@@ -427,7 +428,7 @@ class Recording:
             raise WireError("stranger", f"a message arrived under the unknown key {key}")
 
         recorded_site, channel = self._channels[key]
-        # By this time, the reception judges whether the message is from the future.
+        # The reception uses this time to judge whether the message is from the future.
         recorded_site.since_ns = arrived_since_epoch_ns
         # If the message is the first one of the site's next start, `site` is a new object.
         site, message = self._read(key, payload)
@@ -475,7 +476,7 @@ class Recording:
         of the recorder.
 
         Args:
-            key: Key of the message, that of the events or of the statistics of recorders.
+            key: Key of the message: the key of recorders' events or of their statistics.
             payload: The message.
             mono_ns: Time of the arrival on the monotonic clock, in ns.
 
@@ -487,7 +488,8 @@ class Recording:
         event: Event | None = None
         if key.endswith(topics.STATS):
             boot = decode(payload, RecorderStats).boot
-            # Statistics contain no number. The next one in the account makes each of them new.
+            # Statistics contain no number. Each of them gets the next number of the account, so
+            # that none counts as a duplicate.
             number = account.expected
         else:
             event = decode(payload, Event)
@@ -500,7 +502,8 @@ class Recording:
 
         is_new = number >= 0 and account.receive(number, mono_ns)
         if is_new:
-            # The message was sent when it arrived, because sender and receiver are the same.
+            # The sending time equals the arrival time, because sender and receiver are the same
+            # process.
             sent_ns = since_epoch_ns
             log_time_ns = self.epoch.unix_ns + since_epoch_ns
             self._writer.add(key, payload, sent_ns, log_time_ns, number, event)
@@ -536,15 +539,15 @@ class Recording:
             self._gone_sites.add(token.member)
 
     def _update_gone_since_ns(self, site: str, now_ns: int) -> int | None:
-        """Notes when a site was first found gone, and returns since when it has been silent.
+        """Notes when a site was first found gone, and returns when the wait for it begins.
 
         The caller uses the result to decide how long it still waits for the site.
 
         When a connection is established again, the network may report the return of a site
         first, and its earlier disappearance afterwards. The report "gone" is then wrong, which
         only the messages of the site reveal: a message that arrives more than `_UNDER_WAY_NS`
-        after the report cannot have been in transit. In this case, the wait begins anew with
-        each message. As long as messages arrive, the site is thus never given up.
+        after the report cannot have been in transit. In this case, the wait restarts with each
+        message. As long as messages arrive, the site is thus never given up.
 
         Args:
             site: Name of the site.
@@ -565,7 +568,7 @@ class Recording:
         return last_message_ns
 
     def is_over(self, now_ns: int) -> bool:
-        """Finds out whether the recording can end, because no site can send any more messages.
+        """Determines whether the recording can end, because no site can send any more messages.
 
         The recorder then completes the log file and ends.
 
@@ -573,7 +576,8 @@ class Recording:
             now_ns: Present time on the monotonic clock, in ns.
 
         Returns:
-            True if for every site, either all messages are stored or the site is gone for good.
+            True if, for every site, either all messages are stored or the site is gone for
+            good.
         """
         # Every site is examined, because `_has_left` notes the time at which a site
         # disappeared.
@@ -581,7 +585,7 @@ class Recording:
         return all(have_left)
 
     def _has_left(self, site: str, now_ns: int) -> bool:
-        """Finds out whether the recorder need not wait for any more messages of a site.
+        """Returns True if the recorder need not wait for any more messages of a site.
 
         This is the case if all messages of the site are stored, or if the site has been absent
         from the network for so long that it is regarded as gone for good.
@@ -603,8 +607,8 @@ class Recording:
         reception = self._sites[site]
         has_ended = reception.final_ticks is not None
         if not has_ended:
-            # The connection may have been cut, so that the site may return. There is no reason
-            # to wait beyond `_end_ns`, because every site should have left by then.
+            # The connection may have been cut, so the site may return. There is no reason to
+            # wait beyond `_end_ns`, because every site should have left by then.
             until_session_end_ns = self._end_ns - absent_since_ns
             wait_ns = max(SETTLE_NS, min(AWAY_NS, until_session_end_ns))
         elif not reception.is_complete:
@@ -617,7 +621,7 @@ class Recording:
         return now_ns - absent_since_ns > wait_ns
 
     def is_up_to_date(self, ending_ns: int, now_ns: int) -> bool:
-        """Finds out whether the recorder has every message that the sites have sent so far.
+        """Determines whether the recorder has every message that the sites have sent by now.
 
         The recorder calls this method repeatedly after it was told to end while the session
         still runs. A site is a process that runs one arm. There are three cases for each site:
@@ -659,13 +663,13 @@ class Recording:
         self._writer.flush()
 
     def finish(self, queue: InboundQueue, *, rest: bool = True) -> None:
-        """Closes the log: writes the numbers of messages and the mark of a complete file.
+        """Closes the log: writes the message counts and the mark of a complete file.
 
         A log without this mark was cut off, for example by a power failure.
 
         Args:
             queue: Queue of the received messages.
-            rest: True to write the messages that still wait in the queue before.
+            rest: True to first write the messages that still wait in the queue.
         """
         if rest:
             self._drain(queue, None)
@@ -708,7 +712,7 @@ class Recording:
         lines = [self._summarize_site(site) for site in self._sites.values()]
         if self._overflowed:
             messages_text = count_nouns(self._overflowed, "message")
-            lines.append(f"recorder: {messages_text} turned away because the queue was full")
+            lines.append(f"recorder: {messages_text} dropped because the queue was full")
         for reason, count in self.dropped.items():
             lines.append(f"recorder: {count_nouns(count, 'message')} dropped: {reason}")
         return lines
@@ -738,7 +742,7 @@ class Recording:
             line += f", {site.skipped_ticks} skipped"
         absent_ticks = account.unpublished - site.skipped_ticks
         if absent_ticks:
-            line += f", {absent_ticks} not made while it was away"
+            line += f", {absent_ticks} not executed while it was away"
         return line
 
     def describe_problem(self) -> str | None:
@@ -772,7 +776,7 @@ _ALL_GAPS = 600
 class RecorderReport:
     """Publishes statistics of a recording once a second, such as its size and missing messages.
 
-    A person who watches the session sees there whether the log is complete and how large it is.
+    They show a person who watches the session whether the log is complete and how large it is.
 
     Args:
         bus: Network connection of the recorder.
@@ -803,7 +807,7 @@ class RecorderReport:
     def note_flush(self, duration_ns: int) -> None:
         """Notes how long the operating system took to accept the written messages.
 
-        A slow disk shows first in these times. The next statistics state the longest one.
+        A slow disk first shows up in these times. The next statistics state the longest one.
 
         Args:
             duration_ns: The time, in ns.
@@ -829,7 +833,7 @@ class RecorderReport:
         """Publishes the statistics of the recording now, and also writes them into the log.
 
         People see losses during the session, and readers of the log see them afterwards. The
-        longest duration of a flush is counted anew for the next statistics.
+        longest duration of a flush is reset for the next statistics.
         """
         payload = encode(self._make_stats())
         self._flush_max_ns = 0
@@ -839,8 +843,8 @@ class RecorderReport:
     def _make_stats(self) -> RecorderStats:
         """Returns the present statistics of the recording for people who watch the session.
 
-        They have, for each channel, the numbers of expected, received and missing messages, and
-        the ranges of the missing ones.
+        They contain, for each channel, the numbers of expected, received and missing messages,
+        and the ranges of the missing ones.
         """
         recording = self._recording
         now_ns = self._clock.monotonic_ns()

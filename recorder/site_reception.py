@@ -144,7 +144,7 @@ class InboundQueue:
 
         Args:
             until_ns: Messages that arrived after this time stay in the queue, in ns on the
-                monotonic clock. None removes all messages.
+                monotonic clock. If None, all messages are removed.
 
         Yields:
             The messages, the oldest one first.
@@ -396,7 +396,8 @@ class SiteReception:
             The encoded and the decoded record, for each record that was not received before.
 
         Raises:
-            WireError: A payload is not a valid record of this site. The previous ones count.
+            WireError: A payload is not a valid record of this site. The records before it have
+                been counted.
         """
         decode = self._decoders[topics.STATE]
         account = self.accounts[topics.STATE]
@@ -407,7 +408,7 @@ class SiteReception:
             record: State = decode(payload)
             tick = record.tick
             if tick >= possible_ticks or record.site != name or record.boot != boot:
-                # Finds out which condition the record violates, and raises the error.
+                # Determines which condition the record violates, and raises the error.
                 self._check(
                     channel=topics.STATE,
                     sender=record.site,
@@ -429,7 +430,7 @@ class SiteReception:
         """Largest number of ticks that the site can have executed by now.
 
         The time since its start is stretched by the tolerated drift and lead of its clock. A
-        message with a later tick is refused, because it would make all ticks before count as
+        message with a later tick is refused, because it would make all earlier ticks count as
         missing.
         """
         latest_ns = self.since_ns * (1.0 + _DRIFT) + _LEAD_NS
@@ -531,11 +532,12 @@ class SiteReception:
         self.accounts[channel].add_expected(min(count, largest))
 
     def count_previous_start(self, ticks: int) -> None:
-        """Notes how many control periods (ticks) a site executed at least before its restart.
+        """Notes a lower limit of the number of ticks that a site executed before its restart.
 
-        A site is the process that controls one arm. If it was killed, it could not state this
-        number, but other sites have received its samples (sent states). Without the number,
-        records lost at the end of the previous start would not be counted as missing.
+        A tick is one control period of a site, the process that controls one arm. A site that
+        was killed could not state the number, but other sites have received its samples (sent
+        states). Without the number, records lost at the end of the previous start would not be
+        counted as missing.
 
         Args:
             ticks: Number of ticks that another site reports.
@@ -544,7 +546,7 @@ class SiteReception:
             gap.note_published(number_message(channel, ticks, self._rate_hz))
 
     def _count_implied(self, content: State | LinkStats | Event) -> None:
-        """Finds out from a message which other messages of the sender exist.
+        """Derives from a message which other messages of its sender exist.
 
         A message that exists and did not arrive is counted as missing. A record states which
         ticks were skipped. Statistics show that all records up to their tick exist. The events
@@ -589,8 +591,8 @@ class SiteReception:
 
         A site that was started again continues at a later tick. The messages of the ticks in
         between count as unpublished instead of missing. If the previous start ended properly,
-        it has stated how many ticks it executed, and its messages up to there still count as
-        missing. If it was killed, that number is unknown and counts as 0. Reports of other
+        it has stated how many ticks it executed, and its messages up to that tick still count
+        as missing. If it was killed, that number is unknown and counts as 0. Reports of other
         sites may correct this, see `count_previous_start`.
 
         Args:

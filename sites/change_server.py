@@ -14,7 +14,7 @@ Invariant:
       cannot change any more.
     - An order to stop an arm is executed at once. The orders "enable" and "reset" are never
       executed in the same tick as another order, so that they cannot undo a stop. They wait for
-      the next tick, and the requests behind them wait as well.
+      the next tick, as do the requests that arrived after them.
     - A change of weights is spread over at least `MIN_RAMP_S`, whatever the request states, so
       that the reference of the arm does not jump. The log contains the actual duration.
 """
@@ -162,9 +162,9 @@ class ChangeServer:
             next_tick: Number of the next tick, a period of the control loop.
 
         Returns:
-            The text of the reply, the tick from which on the request has an effect, and the
-            change that the computation of the tick applies. The change is None for marks and
-            for the end of the run.
+            The text of the reply, the first tick in which the request has an effect, and the
+            change to apply in that tick. The change is None for marks and for the end of the
+            run.
 
         Raises:
             ScenarioError: The site refuses the request.
@@ -176,7 +176,11 @@ class ChangeServer:
             return self._add_mark(next_tick, request.mark), next_tick, None
         if request.order:
             change = self._make_order_change(next_tick, request.order)
-            return f"{self._site}: {request.order} at tick {next_tick}", next_tick, change
+            return (
+                f"{self._site} executes {request.order} at tick {next_tick}",
+                next_tick,
+                change,
+            )
 
         # A change of a link or of weights, which takes effect later.
         start_ns = tick_ns(next_tick, self._rate_hz) + AHEAD_MS * 1_000_000
@@ -275,8 +279,8 @@ class ChangeServer:
         All arms of a session receive the same time, so that they stop together.
 
         Args:
-            next_tick: Number of the next tick, a period of the control loop. It is executed in
-                any case, so that the run ends after it at the earliest.
+            next_tick: Number of the next tick, a period of the control loop. This tick is
+                always executed, so the run cannot end before it.
             stop_s: Requested end, in s since the epoch, the common start of the session.
 
         Returns:
@@ -306,7 +310,7 @@ class ChangeServer:
 
         Args:
             request: The request.
-            first: First tick for which the change holds.
+            first: First tick in which the change is in effect.
 
         Raises:
             ScenarioError: The change is not valid, comes too late, or there have been too many

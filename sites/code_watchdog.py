@@ -1,15 +1,15 @@
 """Limits the computing time of a user's code: a control law, an operator or an arm model.
 
 The control loop of an arm calls such code, and slow code would make its ticks (periods) late.
-Each call may take 75 % (`SHARE`) of the period at which the code is called. If a call takes
-longer, the excess is added to the overtime. If it takes less, the overtime is reduced by the
-unused time. If the overtime exceeds `OVERTIME_LIMIT_NS`, the code is too slow, and the run ends
-with an error. One call counts for at most `HICCUP_NS`, so that a single slow call, for example
-during garbage collection, does not end the run.
+Each call may take 75 % (`SHARE`) of the time between two calls. If a call takes longer, the
+excess is added to the overtime. If it takes less, the overtime is reduced by the unused time.
+If the overtime exceeds `OVERTIME_LIMIT_NS`, the code is too slow, and the run ends with an
+error. One call counts for at most `HICCUP_NS`, so that a single slow call, for example during
+garbage collection, does not end the run.
 
 If the operating system has interrupted the thread during a call, the computing time of the
-thread counts instead of the elapsed time. The load of the machine by other programs is thus no
-reason to blame the code.
+thread counts instead of the elapsed time. Load that other programs cause is therefore not
+counted against the code.
 
 Code that does not return at all is interrupted by a signal, see `CodeWatchdog`.
 """
@@ -28,7 +28,7 @@ try:
     import resource
 
     _THREAD: int | None = getattr(resource, "RUSAGE_THREAD", None)
-except ImportError:  # not on this platform: elapsed time counts
+except ImportError:  # this platform lacks the module: elapsed time counts
     _THREAD = None
 
 T = TypeVar("T")
@@ -43,7 +43,7 @@ _CHECK_S = 1.0
 CHECKS = 3
 """Number of checks in a row that must see the same call before it is interrupted."""
 FIRST_CHECKS = 61
-"""The same number in the first tick, in which the code may still be compiled."""
+"""Number of checks in a row for the first tick, in which the code may still be compiled."""
 
 
 def _read_thread_usage() -> tuple[int, int]:
@@ -201,13 +201,13 @@ class WatchedCode:
         """Interrupts user code that does not return, such as a law with an endless loop.
 
         A timer signal calls this method every second (`_CHECK_S`) while the code runs. If
-        several checks in a row see the same call, an error is raised inside of the call,
-        because otherwise the arm would never receive another torque. A call is identified by
-        the number of finished calls before it. Checks that were missed while the process was
-        suspended do not count.
+        several checks in a row see the same call, an error is raised inside the call, because
+        otherwise the arm would never receive another torque. A call is identified by the number
+        of finished calls before it. Checks that were missed while the process was suspended do
+        not count.
 
         Raises:
-            Exception: The error that the constructor's argument `fail` has made.
+            Exception: The error that the constructor's argument `fail` has returned.
         """
         tick = self._running_tick
         is_running = tick >= 0

@@ -1,10 +1,10 @@
-"""Receives the measurements of a real arm and of its dead-man switch, and stops it if they end.
+"""Receives measurements of a real arm and its dead-man switch, and stops the arm without them.
 
 An arm is external (`plant = "external"` in the scenario) if it is a real arm, or a simulation
 in another program. Its driver sends the measured joint positions to the site, the process that
 computes the torque. A dead-man switch is a button that somebody must hold while the arm moves.
-`ExternalArm` and `DeadManSwitch` measure how long nothing has arrived from each, and derive
-orders for the site from it: to hold the position, to stop, or to continue.
+`ExternalArm` and `DeadManSwitch` measure how long each of the two has been silent, and derive
+orders for the site: to hold the position, to stop, or to continue.
 
 Invariant:
     - A received message cannot raise an error in the control loop. The queue of messages is
@@ -41,10 +41,10 @@ SWITCH_SILENCE_NS = 100_000_000
 STARTS_KEPT = 64
 """Number of switch programs whose state is stored.
 
-If there are more, one that does not hold the switch is forgotten.
+If there are more programs, one that does not hold the switch is removed.
 """
 _START_POSE_TOLERANCE_RAD = 0.01
-"""Distance of the arm from its `q0_rad` at the start up to which there is no warning, in rad.
+"""Largest distance of the arm from its `q0_rad` at the start without a warning, in rad.
 """
 POLL_NS = 5_000_000
 """Time between two polls while the site waits for its arm, in ns."""
@@ -100,7 +100,8 @@ class ExternalArm:
             f"trilat ros2 --session {session} --names FILE"
         )
 
-        # Start of the driver that is followed, and number of its newest measurement.
+        # Boot of the driver whose measurements are accepted, and number of its newest
+        # measurement.
         self._boot = -1
         self._n = -1
 
@@ -165,7 +166,7 @@ class ExternalArm:
         return SessionError(f"{text}; see {find_page('external-arm.md')}")
 
     def bind(self, q0_rad: Sequence[float]) -> str:
-        """Accepts measurements only from the present driver from now on. Checks the pose.
+        """Checks the arm's pose. From now on, only its present driver's measurements are used.
 
         The driver is the program that sends the joint angles of an arm outside of this program.
         The site that controls the arm calls this method at the start of the session.
@@ -238,7 +239,7 @@ class ExternalArm:
             is_known_already = previous_order != ""
             return "" if is_known_already else "arm_silent"
 
-        # Measurements arrive. After "arm_lost" the site need not be told: it stays in the mode
+        # Measurements arrive. After "arm_lost" no order is needed: the site stays in the mode
         # "fault" until a user resets it.
         self._reported_order = ""
         return "arm_back" if previous_order == "arm_silent" else ""
@@ -247,9 +248,9 @@ class ExternalArm:
         """Checks one measurement, and stores it or counts the reason why it is dropped.
 
         A measurement names its site, the boot of the driver (a random number that identifies
-        the start of its process), and its own number n, which the driver increases by one. It
-        is dropped if it is of another site or driver, is not newer than the stored one, or is
-        implausible, which means that the arm cannot have moved so far.
+        the start of its process), and a sequence number n, which the driver increases by one.
+        The measurement is dropped if it belongs to another site or driver, is not newer than
+        the stored one, or is implausible because the arm cannot have moved so far.
 
         Args:
             payload: The encoded measurement.
@@ -296,8 +297,8 @@ class ExternalArm:
     def _is_plausible(self, q: Sequence[float], elapsed_s: float) -> bool:
         """Returns True if each joint can have moved to its angle since the last measurement.
 
-        A larger movement would exceed the speed limits of the arm, so that the sensor or the
-        driver must be faulty.
+        A larger movement would exceed the speed limits of the arm, so the sensor or the driver
+        must be faulty.
 
         Args:
             q: Joint angles in rad.
@@ -387,8 +388,8 @@ class DeadManSwitch:
     def held(self) -> bool:
         """True if the dead-man switch is held, so that the arm may move.
 
-        At least one program must report that a person holds the switch, and no program that
-        reports so may have been silent for longer than `SWITCH_SILENCE_NS`.
+        At least one program must report that a person holds the switch, and no program that has
+        reported this may have been silent for longer than `SWITCH_SILENCE_NS`.
         """
         holders = self._list_holders()
         return bool(holders) and not any(map(self._is_silent, holders))
@@ -405,7 +406,7 @@ class DeadManSwitch:
         self._release([holder for holder in self._list_holders() if self._is_silent(holder)])
 
     def pop_order(self, mode: Mode, reason: LifeReason) -> SiteOrder:
-        """Returns what the arm must do because of its dead-man switch: stop, or move again.
+        """Returns the order that follows from the dead-man switch: to stop, or to move again.
 
         A dead-man switch is a button that a person holds while the arm may move. While the
         switch is released, every call returns the order to stop, until the arm has stopped for
@@ -434,7 +435,7 @@ class DeadManSwitch:
         """Marks the dead-man switch of the arm as released, so that the arm stops.
 
         Programs that still hold the switch must release it and press it again. In this way,
-        nobody restarts an arm by accident that somebody else has stopped.
+        nobody can accidentally restart an arm that somebody else has stopped.
 
         Args:
             released: The programs that have released it or are silent. If there are none,
@@ -454,7 +455,8 @@ class DeadManSwitch:
         Several programs may report about the switch of one arm. If one of them releases it, the
         switch is released, and the others must release it and press it again before they count
         as holding it. A report names its site, the boot of the program (a random number that
-        identifies the start of its process), and its own number n, which the program increases.
+        identifies the start of its process), and a sequence number n, which the program
+        increases.
 
         Args:
             payload: The encoded report.

@@ -1,4 +1,4 @@
-"""Runs a user's own operator, a Python class that decides how to move an arm, in a process.
+"""Runs a user's operator class, which decides how to move an arm, in a separate process.
 
 The method `act` of the class receives a view, which is the present state of the arm and of the
 others, and returns a target or a force. The process of the arm sends views over the network at
@@ -90,11 +90,12 @@ class HandProcess(SiteClient):
         self._views = bus.inbox(topics.key(session, hand_site.name, topics.VIEW), _VIEWS_KEPT)
         self._announced_ns = 0
         self._waiting_views = deque[HandViewMessage]()
-        # A view must be answered within the delay with which decisions act.
+        # A view must be answered before its decision is due, `delay_s` after the tick of the
+        # view.
         self._max_waiting = max(1, int(hand_site.delay_s * hand_site.rate_hz))
 
     def serve(self) -> None:
-        """Lets the user's operator class decide how to move the arm, and sends the decision.
+        """Calls the user's operator class with a view of the arm, and sends the decision.
 
         The site of the arm regularly sends a view, which describes its present state. The
         oldest waiting view that is not too old is used. If no view is waiting, nothing is
@@ -154,7 +155,7 @@ class HandProcess(SiteClient):
 
         Args:
             view_tick: Tick of the view.
-            goal: The target or force. None releases the arm.
+            goal: The target or force. None to release the arm.
         """
         goal_field = "force" if self._pushes else "target"
         fields = {goal_field: goal or [], "grip": goal is not None}
@@ -246,7 +247,7 @@ def run_hand(
     with HandProcess(
         hand_site=hand_site, program=program, bus=bus, clock=clock, session=session
     ) as hand:
-        say(f"{name}: its hand {hand_site.program} is there")
+        say(f"{name}: its hand {hand_site.program} is ready")
         while not (stopped() or hand.over):
             hand.serve()
             if not hand.answered and clock.monotonic_ns() > give_up_ns:

@@ -58,7 +58,7 @@ def _read_messages(
         inbox: Queue of the messages.
         site: Name of the site to which the messages must be addressed.
         dropped: Number of dropped messages by reason. The counts are increased in place.
-        source: Only accepted sender. None accepts all senders.
+        source: Only accepted sender. If None, all senders are accepted.
     """
     for _ in range(MESSAGES_KEPT):
         timed_payload = inbox.poll()
@@ -116,7 +116,7 @@ class HandServer:
             site.q if hand.mode == "joint" else arm.end_effector(site.q)
         )
         self._memory = HandMemory()
-        self._free_state = empty_hand_vector(self._rules.size)  # if nobody moves the arm
+        self._free_state = empty_hand_vector(self._rules.size)  # used if nobody moves the arm
         self._names: dict[int, str] = {}  # names of the senders, by their boots
         self.news: list[tuple[int, str]] = []
 
@@ -279,7 +279,7 @@ class RemoteHand(HandPlayer):
     ) -> bool:
         """Waits until the process of the user's operator class announces itself.
 
-        A session must not start before, because nobody could move the arm.
+        A session must not start before this, because nobody could move the arm.
 
         Args:
             stopped: Function that returns True to end the wait.
@@ -315,7 +315,8 @@ class RemoteHand(HandPlayer):
         """Schedules a decision of the user's class, to take effect at its planned tick.
 
         A decision that arrives after this tick is counted as late, and takes effect at once.
-        Decisions about views that were not sent, and all after a failure, are ignored.
+        Decisions about views that were never sent are ignored, as are all decisions after a
+        failure.
 
         Args:
             present_tick: Present tick.

@@ -47,7 +47,7 @@ class LinePrinter:
             self._lines.put_nowait(text)
 
     def _print_lines(self) -> None:
-        """Prints lines as they come, in the thread of the printer, until None tells it to end.
+        """Prints the queued lines in the printer's thread, until the queue returns None.
 
         Errors of the output, for example a closed pipe, do not end the session.
         """

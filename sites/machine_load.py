@@ -15,12 +15,12 @@ from trilat_net.net import Clock
 MEASURED_NS = 200_000_000
 """Time over which the load is measured, in ns."""
 BUSY_SHARE = 0.8
-"""Fraction of busy time above which there is a warning.
+"""Fraction of busy time above which a warning is printed.
 
 A recorder has no priority, and may then receive too little computing time.
 """
 _STATISTICS = Path("/proc/stat")
-"""File in which Linux reports how much time the processors have spent on what."""
+"""File in which Linux reports the time that the processors have spent on each kind of work."""
 _IDLE_COLUMNS = slice(3, 5)  # idle, and waiting for a disk
 _TIME_COLUMNS = slice(0, 8)  # without guests, whose time the column "user" includes
 

@@ -1,9 +1,9 @@
 """Admits arms that join or rejoin a running session, and notices arms that stay away.
 
 Each arm is controlled by a process of its own, its site. If such a process has crashed and is
-started again, the other sites must know from which tick on they use its messages. The modules
-`peer_monitor` and `peer_admission` share this work: the first notices processes, the second
-changes whose samples the control loop uses.
+started again, the other sites must know the first tick from which to use its messages. The
+modules `peer_monitor` and `peer_admission` share this work: the first notices processes, the
+second changes whose samples the control loop uses.
 
 Invariant:
     - From the tick that an admitted peer has announced, samples of its new process are
@@ -23,7 +23,7 @@ from .site_parts import SiteParts
 
 
 class PeerAdmission:
-    """Decides in a running session from which tick on samples of a restarted peer are used.
+    """Decides, in a running session, from which tick the samples of a restarted peer are used.
 
     The process of a peer may crash and be started again. Samples of its old process that are
     still in transit must then not be mixed with those of the new one.
@@ -38,7 +38,7 @@ class PeerAdmission:
         inbox: Samples of the peers.
 
     Attributes:
-        has_given_up: True if a peer has been away for longer than the user tolerates.
+        has_given_up: True if a peer has been away for longer than the user permits.
     """
 
     def __init__(
@@ -91,8 +91,8 @@ class PeerAdmission:
     def _is_peer_away_too_long(self, t_ns: int) -> bool:
         """Returns True if another arm's process left longer ago than the user permits.
 
-        The run then ends. The limit is the option `leave_timeout_s`. Without it, a process may
-        stay away for ever.
+        The run then ends. The limit is the option `leave_timeout_s`. Without this option, a
+        process may stay away forever.
 
         Args:
             t_ns: Present time, ns since the epoch.

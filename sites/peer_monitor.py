@@ -28,7 +28,7 @@ RETURN_NS = 1_000_000_000
 After a reconnection, samples may arrive before the new liveliness token.
 """
 _INBOX_CAPACITY = 256
-"""Number of events of a member that wait at most."""
+"""Largest number of events of a member that wait to be read."""
 
 
 class PeerMonitor:
@@ -172,7 +172,7 @@ class PeerMonitor:
             self.departed.pop(member, None)
         elif not alive and (is_member_process or is_recorder):
             publisher.publish("lost", f"{member} is gone", about=member, t_ns=t_ns)
-            # Only if the scenario lets sites come back, the session goes on without this one.
+            # The session continues without this site only if the scenario lets sites come back.
             if self._admits and is_site:
                 sentence = f"{member} has been gone since t = {t_ns * 1e-9:.1f} s"
                 self.departed[member] = (t_ns, sentence)

@@ -39,7 +39,7 @@ def prepare(cpu: int | None, sites: int = 1) -> dict[str, str]:
     does not permit are left out.
 
     Args:
-        cpu: Processor to which the process is bound. None permits all processors.
+        cpu: Processor to which the process is bound. If None, all processors are permitted.
         sites: Number of sites of the session on this machine. If there are too many, the
             scheduling stays normal.
 
@@ -80,12 +80,12 @@ def prepare(cpu: int | None, sites: int = 1) -> dict[str, str]:
 
 
 def _set_affinity(cpu: int | None) -> str:
-    """Binds the process to one processor, so that the system does not move it between several.
+    """Binds the process to one processor, so that the system does not move it to another one.
 
     Moving a process takes time and empties its cache, which makes control periods late.
 
     Args:
-        cpu: Number of the processor. None changes nothing.
+        cpu: Number of the processor. If None, nothing is changed.
 
     Returns:
         The processors that the process may use, as a text for the log: "cpu 3" or "cpu 0,1".

@@ -33,7 +33,7 @@ RECORDS_KEPT = 120_000
 """Largest number of stored records: a minute at tick rates up to 2 kHz, less at higher rates.
 """
 _RECORD_BYTES = 640
-"""Mean size of a record of a two-joint arm up to which a minute of records fits, in bytes."""
+"""Mean size of a record of a two-joint arm for which the memory is planned, in bytes."""
 _FLOAT_BYTES = 9
 """Size of an encoded floating-point number, in bytes."""
 _STATISTICS_BYTES = 4_096
@@ -188,8 +188,8 @@ class RetransmitBuffer:
     def start_at(self, tick: int) -> None:
         """Sets the first tick of a site that joins a running session.
 
-        The numbers of its records and statistics then begin at the numbers of this tick. The
-        method must be called before any message is stored.
+        Its records and statistics are then numbered from this tick. The method must be called
+        before any message is stored.
 
         Args:
             tick: Number of the first tick, a period of the control loop.
@@ -216,7 +216,8 @@ class RetransmitBuffer:
         next_statistics_number, published_statistics = skipped_numbers(
             topics.LINK, next_tick, skipped_ticks, self._site.rate_hz
         )
-        # As the numbers begin at 0, this is how many statistics the skipped ticks lack.
+        # Statistics are numbered from 0, so this difference is their number in the skipped
+        # ticks.
         unpublished_statistics = max(0, next_statistics_number - published_statistics)
         self.channels[topics.LINK].skip(unpublished_statistics)
 
@@ -235,7 +236,7 @@ class RetransmitBuffer:
         return True
 
     def _find_messages(self, wanted: BackfillRequest) -> tuple[int, list[bytes], int]:
-        """Finds the stored messages that a recorder has missed and requests again.
+        """Finds the stored messages that a recorder has missed and now requests.
 
         Args:
             wanted: The request, with the channel and the numbers of the missing messages.

@@ -1,9 +1,9 @@
 """Runs the control loop of one arm, from the start of the session to its last tick.
 
 `RunningSite` is the object that the loop in `site_loop` calls in every tick (period of the
-loop), and ten times a second for work that is not urgent. Three other objects do what is no
-part of a tick: `SiteNews` reports events, `PeerAdmission` admits other arms, and `SiteEnd`
-leaves the session.
+loop), and ten times a second for work that is not urgent. Three other objects do the work that
+is not part of a tick: `SiteNews` reports events, `PeerAdmission` admits other arms, and
+`SiteEnd` leaves the session.
 
 Invariant:
     - The work that is not urgent has a fixed order: replies to queries, clocks, members, news.
@@ -47,9 +47,9 @@ class RunningSite:
     ticks in which something changed, and `run_housekeeping` ten times a second.
 
     If at least a quarter of the period is left after a block of records was published, the loop
-    also calls `use_slack`, which answers one query of a recorder for lost messages. It returns
-    True if it has answered one. The loop then calls it again after the next tick, because more
-    queries may wait.
+    also calls `use_slack`, which answers one query of a recorder for lost messages. If
+    `use_slack` has answered a query and returns True, the loop calls it again after the next
+    tick, because more queries may wait.
 
     Args:
         parts: Parts of the site.
@@ -162,7 +162,7 @@ class RunningSite:
             epoch_ns=epoch.mono_ns,
             rate_hz=parts.site.rate_hz,
             peers=peer_clocks,
-            leader=scenario.names[0],  # all sites follow the tick schedule of this one
+            leader=scenario.names[0],  # all sites follow the tick schedule of this site
             turn_ns=find_turn_ns(turn, len(self._local_sites), highest_rate_hz),
         )
 
@@ -212,9 +212,9 @@ class RunningSite:
     def _publish_setup(self) -> None:
         """Publishes the real-time settings and the clock offsets, and prints them for the user.
 
-        A site that joins a running session also publishes the event `join`. From here on, an
-        external arm accepts measurements only from its present driver. If the arm is not where
-        the scenario says that it starts, a warning is published.
+        A site that joins a running session also publishes the event `join`. From here on,
+        measurements of an external arm are accepted only from its present driver. If the arm is
+        not at the start pose of the scenario, a warning is published.
         """
         parts = self._parts
         user_lines = self._clock_texts

@@ -55,7 +55,7 @@ class RunOutcome(NamedTuple):
     def ticks(self) -> int:
         """Number of control periods (ticks) up to the last executed one.
 
-        0 if none was executed.
+        The number is 0 if no tick was executed.
         """
         return 0 if self.output is None else self.output.tick + 1
 
@@ -63,7 +63,7 @@ class RunOutcome(NamedTuple):
     def t_ns(self) -> int:
         """Nominal time of the last control period (tick), in ns since the start of the session.
 
-        It is -1 if no tick was executed.
+        The time is -1 if no tick was executed.
         """
         return -1 if self.output is None else self.output.t_ns
 
@@ -71,7 +71,7 @@ class RunOutcome(NamedTuple):
 def _summarise_loop(ticks: int, parts: SiteParts) -> str:
     """Returns a sentence about the executed ticks and the dropped messages of an arm's process.
 
-    The user sees there whether the control loop was punctual and whether the network lost
+    It tells the user whether the control loop was punctual and whether the network lost
     messages. A tick is one period of the control loop.
 
     Args:
@@ -90,7 +90,7 @@ def _summarise_loop(ticks: int, parts: SiteParts) -> str:
     counts = []
     for reason, count in stats.dropped.items():
         counts.append(f"{count} {reason}")
-        # Samples carry no word about skipped ticks, so that a receiver sees only their gap.
+        # Samples do not mention skipped ticks, so a receiver only sees a gap.
         if reason == "missing" and skipping:
             counts[-1] += f" (lost, or ticks that {' or '.join(skipping)} skipped)"
 
@@ -166,9 +166,9 @@ class SiteEnd:
     def _publish_end(self) -> None:
         """Publishes why and when the run of this arm ended.
 
-        A failure has an event of its own, and so have delays of the user's code. The last
-        event, `end`, says how many ticks (control periods) were executed and why the run ended
-        early.
+        A failure is published as a separate event, and so are delays of the user's code. The
+        last event, `end`, says how many ticks (control periods) were executed and why the run
+        ended early.
         """
         parts = self._parts
         output = self._outcome.output
@@ -191,8 +191,8 @@ class SiteEnd:
             monitor.peer.name for monitor in self._link_monitors if monitor.is_unacknowledged
         ]
         if unreached_peers:
-            cause += f"; {', '.join(unreached_peers)} did not hear it at the end"
-        text = f"{parts.name} made {count_nouns(self._outcome.ticks, 'tick')}{cause}"
+            cause += f"; {', '.join(unreached_peers)} did not confirm its last samples"
+        text = f"{parts.name} executed {count_nouns(self._outcome.ticks, 'tick')}{cause}"
         self._publish_end_event("end", text, about=about)
 
     @property
@@ -212,7 +212,7 @@ class SiteEnd:
         Returns:
             member: Name of the member that ended the run. Empty if the run was completed, or
                 was ended by a request to all sites.
-            cause: Text that names the cause, to be appended to the sentence "m1 made 500
+            cause: Text that names the cause, to be appended to the sentence "m1 executed 500
                 ticks". Empty if the run was completed.
         """
         parts = self._parts
@@ -223,7 +223,7 @@ class SiteEnd:
         if monitor.ended_by:  # another member ended it, or has replaced this site
             return monitor.ended_member, f": {monitor.ended_by}"
         if parts.changes.stopped:  # users requested that all sites end at the same tick
-            return "", ", as many as it was asked for"
+            return "", ", up to the requested end"
 
         scenario_ticks = parts.scenario.ticks(parts.name)
         if self._outcome.ticks == scenario_ticks:
@@ -278,8 +278,8 @@ class SiteEnd:
 
             since_query_ns = clock.monotonic_ns() - queried_ns
             is_gone = not monitor.recorders and since_query_ns > _QUERIED_NS
-            # A recorder that has gone, but still lacks messages, may come back: then the limit
-            # stays as it is.
+            # A recorder that has gone but still lacks messages may come back. The limit then
+            # stays unchanged.
             if is_gone and monitor.stored:
                 give_up_ns = min(give_up_ns, clock.monotonic_ns() + LEAVE_TIMEOUT_NS)
             if monitor.read_stored(self._outcome.ticks) and monitor.all_stored:

@@ -270,7 +270,7 @@ class PeerInbox:
         """
         link = self._links[index]
         newest = self._newest[index]
-        # Comparisons with NaN are False, so that NaN counts as not within a limit.
+        # Comparisons with NaN are False, so NaN counts as outside of every limit.
         for speed, speed_limit in zip(sample.qd, link.speed_limit, strict=True):
             is_within_limit = abs(speed) <= speed_limit
             if not is_within_limit:
@@ -291,9 +291,9 @@ class PeerInbox:
 
 
 _BLOCKS_PER_S = 100
-"""Recorders receive the records of 10 ms in one block."""
+"""Number of blocks per second: recorders receive the records of 10 ms in one block."""
 _WAKES_PER_S = 200
-"""Peers on the same machine receive the samples of 5 ms together, if they need none sooner."""
+"""Peers on one machine receive the samples of 5 ms together, unless they need them sooner."""
 _MIN_HELD_DELAY_US = 100_000
 """Smallest delay of a link whose samples may be sent late without an effect, in us."""
 
@@ -423,8 +423,8 @@ class StateBlock:
     def _send_waiting_samples(self, send: Callable[[TickRecord], tuple[Any, ...]]) -> None:
         """Sends the waiting states of this arm (samples) to the other arms.
 
-        The records of the same control periods become complete by this, because a record states
-        when its sample was sent. They move to the next block for the recorders.
+        This completes the records of the same control periods, because a record states when its
+        sample was sent. The records move to the next block for the recorders.
 
         Args:
             send: Function that sends the sample of a record, see `send_samples`.
@@ -437,8 +437,8 @@ class StateBlock:
     def flush(self, send: Callable[[TickRecord], tuple[Any, ...]]) -> None:
         """Sends the waiting results of control periods over the network.
 
-        The other arms first receive their samples, the parts that their control laws need,
-        because they wait for these. The recorders then receive the complete records.
+        The other arms receive their samples (the parts that their control laws need) first,
+        because they are waiting for them. The recorders then receive the complete records.
 
         Args:
             send: Function that sends the sample of a record, see `send_samples`.

@@ -134,7 +134,8 @@ class SiteNews:
         if rule.action is not StaleAction.GLIDE:
             return
 
-        # Some arms go on without a lost peer. They have an alarm as they return to the others.
+        # Some arms continue without a lost peer. For them, an alarm is raised when they return
+        # to the others.
         lost_peers: Sequence[str] = ()
         if rule.degrades and mode is Mode.RETURN:
             lost_peers = parts.site.layout.list_lost_peers(output.mem, parts.site.peers)
@@ -160,7 +161,7 @@ class SiteNews:
             output: Record of the newest tick.
         """
         parts = self._parts
-        if parts.hand is not None:  # who has started or ended to move the arm
+        if parts.hand is not None:  # who has started or stopped moving the arm
             for _, text in parts.hand.news:
                 # `say` prints the name of the site itself.
                 _, _, text_without_site = text.partition(": ")
@@ -201,7 +202,7 @@ class SiteNews:
         if self._skipped:
             ticks = " ".join(self._skipped)
             self._skipped = []
-            text = f"{self._parts.name} did not make ticks {ticks}"
+            text = f"{self._parts.name} skipped ticks {ticks}"
             self._publisher.publish(
                 "overrun", text, t_ns=output.t_ns, ticks=output.tick + 1, command=ticks
             )

@@ -58,7 +58,7 @@ from .site_loop import StateBlock, make_sample_readers, may_hold_samples
 
 @dataclass(frozen=True, slots=True)
 class SiteOptions:
-    """Options of the user about how an arm's process joins a session and waits for others.
+    """The user's options for how an arm's process joins a session and waits for others.
 
     Such a process is called a site. The options come from the command line of `trilat site`.
 
@@ -67,7 +67,8 @@ class SiteOptions:
         connection: Endpoints of the site, and keys.
         join_timeout_s: Longest wait for the start of the session, in s.
         needs_recorder: True if the session starts only when a recorder is present.
-        cpu: Processor to which the control loop is bound. None permits all processors.
+        cpu: Processor to which the control loop is bound. If None, all processors are
+            permitted.
         stay_s: Longest time for which the site stays after the run until the recorder has left,
             in s.
         clock_offset_s: Offset that is added to the clock of the site, to emulate another
@@ -75,7 +76,7 @@ class SiteOptions:
         clock_drift_ppm: Drift that is added to the clock of the site, in parts per million.
         without: Sites that the session does not wait for. They may join the running session.
         leave_timeout_s: How long the site continues after a peer has left and not returned, in
-            s. None continues until the end of the run.
+            s. If None, it continues until the end of the run.
     """
 
     session: str
@@ -283,8 +284,8 @@ class SiteParts:
     def _connect_outside_arm(self) -> None:
         """Connects the site to the driver of an external arm, and to its dead-man switch.
 
-        `arm` and `switch` stay None for an arm that the site simulates, or that has no such
-        switch.
+        `arm` stays None if the site simulates the arm. `switch` stays None if the arm has no
+        dead-man switch.
         """
         name = self.name
         read_clock = self.clock.monotonic_ns
@@ -320,7 +321,7 @@ class SiteParts:
         publish = self.bus.publisher(self._key(channel))
 
         def store_and_publish(payloads: list[bytes]) -> None:
-            """Stores messages for sending them again, and publishes them in larger blocks.
+            """Stores messages for requests to send them again, and publishes them in blocks.
 
             Args:
                 payloads: The encoded messages.
@@ -335,10 +336,9 @@ class SiteParts:
     def pop_changes(self, tick: int) -> list[CoreChange]:
         """Returns the changes of settings or mode that the site applies in the next tick.
 
-        Some changes were requested by users. Others follow from an external arm, a robot or
-        simulator outside of this program. They report that ticks (periods of the control loop)
-        were skipped, that the arm has become silent, or that its dead-man switch was released
-        or is held again.
+        Some changes were requested by users. Others come from an external arm, a robot or
+        simulator outside of this program: ticks (periods of the control loop) were skipped, the
+        arm has become silent, or its dead-man switch was released or is held again.
 
         Args:
             tick: Number of the tick.
@@ -347,11 +347,11 @@ class SiteParts:
         if self.arm is None:
             return changes
 
-        # The first tick has skipped none, also if it is the late first tick of a site that
-        # joins a running session.
+        # No tick is skipped before the first one, even if that is the late first tick of a site
+        # that joins a running session.
         is_first_tick = self._next_tick < 0
         skipped = 0 if is_first_tick else tick - self._next_tick
-        self._next_tick = tick + 1  # the tick that follows if none is skipped
+        self._next_tick = tick + 1  # the next tick if no tick is skipped
         if skipped:
             self.buffer.skip(tick - skipped, tick)
             changes.append(self._make_order_change(tick, "overrun", skipped))
@@ -364,7 +364,7 @@ class SiteParts:
         return changes
 
     def _make_order_change(self, tick: int, order: SiteOrder, skipped: int = 0) -> CoreChange:
-        """Returns the change with which an order of the site itself takes effect in a tick.
+        """Returns the change by which an order of the site itself takes effect in a tick.
 
         Such orders follow from an external arm, for example "released" if its dead-man switch
         was released. As a change, the order is part of the record, so that the run can be
@@ -393,7 +393,7 @@ def warm_up(scenario: Scenario, name: str, clock: Clock | None = None) -> None:
     Args:
         scenario: The scenario, which describes the arms, their links and the run.
         name: Name of the site.
-        clock: Clock of this process. None creates one.
+        clock: Clock of this process. If None, a clock is created.
 
     Raises:
         LawFailed: The user's law fails although all arms are at rest at their start.

@@ -70,7 +70,8 @@ def run_site(
         RunFailed: The run diverged, the user's law failed, or the arm fell silent.
     """
     check_outside_arms(scenario)
-    # A site that rejoins a session needs its keys for less time: see `_join_session`.
+    # A site that rejoins a session needs its keys only until the end of the run, see
+    # `_join_session`.
     if not scenario.sites_may_return:
         options.connection.require_keys_until(scenario.duration_s)
     share_threads()
@@ -108,8 +109,8 @@ def run_site(
 def join_and_run(parts: SiteParts) -> int:
     """Joins a session, runs the control loop of the arm until its end, and leaves the session.
 
-    With an external arm, or with an operator program in another process, the first message from
-    there is awaited before.
+    If the arm is external or its operator runs in another process, the site first waits for a
+    message from the arm's driver or from that process.
 
     Args:
         parts: Parts of the site, such as its network connection and its arm.

@@ -284,7 +284,7 @@ WRONG: dict[str, tuple[Callable[[Path], object], str]] = {
         lambda _: tn.simulate("two_sites", {"control.Kd": None}),
         "control.Kd: expected",
     ),
-    "log": (lambda _: tn.open_log("nothing.mcap"), "^nothing.mcap: cannot be read"),
+    "log": (lambda _: tn.open_log("nothing.mcap"), "^nothing.mcap cannot be read"),
     "log is none": (
         lambda _: tn.verify(None),
         "a log must be given as a path or as a file opened for reading, not None",

@@ -104,7 +104,7 @@ def test_other_packages_add_names_without_replacing_any(
         tn.sweep()  # type: ignore[call-arg]
     installed(COMMANDS, sim=value, sweep=value, greet=value)
     assert "greet" in trilat("--help", cwd=tmp_path).succeeds()
-    trilat("greet", cwd=tmp_path).refuses("trilat greet is no command", "extension.command")
+    trilat("greet", cwd=tmp_path).refuses("trilat greet is not a command", "extension.command")
     assert "virtual time" in trilat("sim", "--help", cwd=tmp_path).succeeds()
     trilat("sweep", cwd=tmp_path).refuses("pip install trilat-studies")
 

@@ -267,12 +267,12 @@ def read_foreign_permissions(path: Path) -> int:
 
 
 def make_folder(folder: Path) -> Path:
-    """Makes a folder, with all parent folders that do not exist yet, and returns its path.
+    """Creates a folder, with all parent folders that do not exist yet, and returns its path.
 
     A folder that exists is left as it is.
 
     Raises:
-        UsageError: The folder cannot be made.
+        UsageError: The folder cannot be created.
         LogRefused: The disk is full.
     """
     try:
@@ -307,20 +307,20 @@ def refuse_link(path: Path) -> None:
 
 
 def make_subfolder(folder: Path) -> Path:
-    """Makes a folder inside an output folder unless it exists, and returns its path.
+    """Creates a folder inside an output folder unless it exists, and returns its path.
 
     Args:
         folder: Path of the folder.
 
     Raises:
-        UsageError: The path is a symbolic link, or the folder cannot be made.
+        UsageError: The path is a symbolic link, or the folder cannot be created.
     """
     refuse_link(folder)
     return make_folder(folder)
 
 
 def make_results_folder(folder: Path | None, name: str, *, force: bool | None) -> Path:
-    """Makes a folder for the results of a command, or uses an existing one.
+    """Creates a folder for the results of a command, or uses an existing folder.
 
     An existing folder must be empty, unless the user permits other files in it.
 
@@ -335,7 +335,7 @@ def make_results_folder(folder: Path | None, name: str, *, force: bool | None) -
         The folder.
 
     Raises:
-        UsageError: The folder contains files that are not permitted, or cannot be made.
+        UsageError: The folder contains files that are not permitted, or cannot be created.
     """
     if folder is None:
         return _make_next_folder(name)
@@ -351,9 +351,9 @@ def make_results_folder(folder: Path | None, name: str, *, force: bool | None) -
 
 
 def _make_next_folder(name: str) -> Path:
-    """Makes the next free folder `runs/NAME-N`, and returns it.
+    """Creates the next free folder `runs/NAME-N`, and returns its path.
 
-    No other process gets the same folder, because making an existing folder fails.
+    No other process gets the same folder, because creating an existing folder fails.
     """
     for n in itertools.count(1):
         folder = Path("runs") / f"{name}-{n:03d}"
@@ -364,7 +364,7 @@ def _make_next_folder(name: str) -> Path:
         except OSError as error:
             raise describe_write_error(folder, error) from None
         return folder
-    raise AssertionError("the loop over all numbers does not end")
+    raise AssertionError("unreachable, because the loop tries numbers until it returns")
 
 
 def refuse_existing(
@@ -448,8 +448,8 @@ def write_whole(
     """Writes a file in one step, so that readers never see an incomplete file.
 
     The data is written to a temporary file in the same folder, which then replaces the file. A
-    device or a pipe is written directly. A symbolic link is refused. A link that appears later
-    is replaced, and its target is not changed.
+    device or a pipe is written directly. A symbolic link is rejected. If a link appears later,
+    the link is replaced, and its target is not changed.
 
     Args:
         path: The file.
@@ -460,7 +460,7 @@ def write_whole(
         mode: Permissions of a new file, before the umask.
 
     Raises:
-        UsageError: The file exists, is a symbolic link, or cannot be made.
+        UsageError: The file exists, is a symbolic link, or cannot be created.
         LogRefused: The disk refused the data.
     """
     parts = [data] if isinstance(data, bytes | str) else data
@@ -517,7 +517,7 @@ def stage_output(path: Path, *, force: bool, manifest: str | None = None) -> Ite
         LogRefused: The disk refused the data.
     """
     refuse_existing(path, force=force, manifest=manifest)
-    remedy = "nothing is left of it. Make room, or take another disk"
+    remedy = "no partial file was left. Free some space, or use another disk"
     try:
         # The temporary folder is in the same folder, because a rename works only within a file
         # system.

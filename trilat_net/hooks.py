@@ -27,9 +27,9 @@ _loaders: dict[str, Callable[[], Any]] = {}
 def register_hooks(package: str, functions: Mapping[str, str]) -> None:
     """Registers functions of an upper package by name, so that lower packages can call them.
 
-    A lower package, such as the one for logs, must not import an upper one, such as the one for
-    ROS. It looks up the registered function instead (`find_hook`). The modules are imported
-    only then.
+    A lower package, such as `log`, must not import an upper package, such as the ROS package.
+    It looks up the registered function instead (`find_hook`). The modules are imported only
+    then.
 
     Args:
         package: Name of the package, `__name__` in its `__init__.py`.

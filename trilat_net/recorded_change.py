@@ -35,7 +35,7 @@ Users send "stop", "enable" and "reset". The site itself causes the others, for 
 class RecordedChange(
     msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True
 ):
-    """Change that was made during a run, as a log contains it, for example a new network delay.
+    """Change during a run as recorded in a log, for example a new network delay.
 
     It changes a network link, the weights with which an arm follows the others, or gives a
     command to one arm's process. Exactly one of `link`, `dominance` and `site` is not empty.

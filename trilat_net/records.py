@@ -92,9 +92,9 @@ class TickRecord(NamedTuple):
             negative.
         theta_hat: Estimate of the parameters.
         used: Tick of the sample in use, per peer in scenario order; -1 before the first.
-        rx_crc: CRC-32 of the arrivals of this tick, as the step received them. If an input was
-            changed, this checksum differs at the tick of the input. Each arrival is
-            little-endian (peer i64, tick i64, q f64s, qd f64s), followed by its tau_x if the
+        rx_crc: CRC-32 of the arrivals of this tick, as the step received them. If an input in
+            the log was modified, this checksum differs at the tick of the input. Each arrival
+            is little-endian (peer i64, tick i64, q f64s, qd f64s), followed by its tau_x if the
             law reflects force.
         cmd: Texts of the changes that this tick applied.
         mem: State of the site that no other field contains. It is empty in RUN and DIVERGED. In
@@ -164,7 +164,7 @@ class Layout(NamedTuple):
             angles.
         sent: Number of values that the control law sends to other arms in each period.
         hand: Number of values that describe the person or program who moves the arm during the
-            run, see `core.life.live_hand`. 0 if there is none.
+            run, see `core.life.live_hand`. 0 without a live hand.
         bodies: Number of values in the poses of other bodies in the scene, see
             `TickRecord.bodies`.
     """
@@ -232,7 +232,8 @@ class Layout(NamedTuple):
         `core.life.session_life`. The state of this rule is at the start of the field `mem` of
         the log:
 
-        - the values that every such arm stores, for example when each other arm was heard last,
+        - the values that every such arm stores, for example the last time of a sample from each
+          other arm,
         - in task space, the reference that brings the joints to rest (`rest_columns`),
         - if the arm may continue without a lost arm, one value per other arm: whether it is
           lost.

@@ -1,7 +1,7 @@
 """Lets loops end in an orderly way after Ctrl-C or another signal that requests the end.
 
 By default, Python raises an exception at an arbitrary line. A control loop or a recorder must
-not end there, but at the end of a step.
+not end at such a line, but at the end of a step.
 
 Invariant:
     - Ctrl-C or another ending signal does not end the program by itself. A loop polls for the
@@ -21,7 +21,7 @@ from typing import Any
 _HANG_UP = getattr(signal, "SIGHUP", getattr(signal, "SIGBREAK", None))
 _SIGNALS = (signal.SIGINT, signal.SIGTERM, _HANG_UP)
 ENDING_SIGNALS = tuple(number for number in _SIGNALS if number is not None)
-"""Signals that request the end of the program, such as that of Ctrl-C."""
+"""Signals that request the end of the program, such as the signal of Ctrl-C."""
 _SAME_REQUEST_S = 0.2
 """Signals within this time, in s, count as one request.
 
@@ -76,7 +76,7 @@ class Interrupt:
             outer.number = outer.number or self.number
 
     def _handle(self, number: int, _frame: FrameType | None) -> None:
-        """Records a signal that requests the end of the program, such as that of Ctrl-C.
+        """Records a signal that requests the end of the program, such as the signal of Ctrl-C.
 
         The first signal requests an orderly end. A second Ctrl-C requests the end at once, for
         a user who does not want to wait. Two signals in quick succession count as one request,
@@ -175,7 +175,7 @@ def end_process_at_signals() -> Callable[[], None]:
 def _exit_by_signal(number: int, _frame: FrameType | None) -> None:
     """Ends the process at once with the exit code that shells give to a signal, 128 + number.
 
-    It is the handler of signals during a compilation in the first process of a container.
+    This is the signal handler during a compilation in the first process of a container.
     """
     os._exit(128 + number)
 
@@ -231,7 +231,7 @@ def _may_interrupt(owner: object) -> bool:
 
 @contextmanager
 def hold_sigint() -> Iterator[None]:
-    """Delays Ctrl-C inside the `with` block, and hides it from processes started there.
+    """Delays Ctrl-C inside the `with` block, and hides it from processes started in the block.
 
     Blocking the signal hides it from the started processes, which inherit the signal mask. The
     mask alone does not delay Ctrl-C in this process: another thread may receive the signal, and

@@ -28,7 +28,8 @@ _PARENT_POLL_S = 0.5
 def count_cores() -> int:
     """Returns the number of processors that this process may use.
 
-    It may be smaller than the number of processors of the machine, for example in a container.
+    The number may be smaller than the number of processors of the machine, for example in a
+    container.
     """
     if hasattr(os, "sched_getaffinity"):
         return len(os.sched_getaffinity(0))
@@ -83,8 +84,8 @@ def _prepare_worker(parent: int, in_command: bool) -> None:
 def _exit_after(parent: int) -> None:
     """Ends this worker process as soon as its parent process has ended, however it ended.
 
-    The function waits in a thread. Without it, workers would go on computing after their parent
-    was killed.
+    The function waits in a thread. Without this thread, workers would continue computing after
+    their parent was killed.
 
     Args:
         parent: Process number of the parent.

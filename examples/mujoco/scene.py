@@ -120,7 +120,7 @@ def describe_arm(chain: Any, theta: np.ndarray, h_s: float) -> str:
     Args:
         chain: joints and frames of the arm.
         theta: inertial parameters of all links, shape (10 n,).
-        h_s: time step, s.
+        h_s: time step, in s.
     """
     gravity = " ".join(map(str, chain.gravity_m_s2))
     text = f"""<mujoco>

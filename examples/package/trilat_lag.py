@@ -27,7 +27,7 @@ def measure_lags(scenario: str, seeds: int = 1, duration_s: float | None = None)
     Args:
         scenario: Name of a shipped scenario, or path of a TOML file.
         seeds: Number of seeds.
-        duration_s: Duration of each run, in s. By default that of the scenario.
+        duration_s: Duration of each run, in s. Default: the scenario's duration.
     """
     lags_rad = []
     for seed in range(1, seeds + 1):
@@ -40,7 +40,9 @@ def measure_lags(scenario: str, seeds: int = 1, duration_s: float | None = None)
 def lag_command(
     scenario: ScenarioArgument,
     seeds: Annotated[int, value("--seeds", "N", "Number of seeds.")] = 1,
-    duration: Annotated[float | None, value("--duration", "S", "Duration of a run, s.")] = None,
+    duration: Annotated[
+        float | None, value("--duration", "S", "Duration of a run, in s.")
+    ] = None,
     as_json: JsonOption = False,
 ) -> None:
     """Measures how far the slave lags behind, seed by seed."""
@@ -55,7 +57,7 @@ def lag_command(
 
 
 def show_lags(files: Sequence[Path]) -> None:
-    """Prints how far each arm of a log was from the others at most, second by second.
+    """Prints the largest distance of each arm of a log from the others, second by second.
 
     Args:
         files: The log, or its parts.

@@ -6,12 +6,13 @@ hand" of the scenario). An observation consists of the newest states of the slav
 master, and of the position and force of the operator.
 
 `python -m lerobot_robot_trilat FOLDER` runs a trained policy in a session. `lerobot-rollout` of
-LeRobot 0.6.1 cannot: it leaves out torques, forces and `observation.environment_state`.
+LeRobot 0.6.1 cannot do this, because it leaves out torques, forces and
+`observation.environment_state`.
 
 Invariant:
     - The scenario limits the force and speed with which an action moves the arm.
     - The slave follows all of its users, weighted by their dominance factors.
-    - The keys of actions and observations depend on the scenario alone.
+    - The keys of actions and observations depend only on the scenario.
 """
 
 import argparse
@@ -31,7 +32,7 @@ _HAND_COMMANDS = {
     "joint": ("turn", "pos"),
     "force": ("push", "force"),
 }
-"""How a hand (operator) of each mode is commanded.
+"""Commands of a hand (operator) in each mode.
 
 The values are the method of `tn.hand`, and the suffix of the keys of a command.
 """
@@ -81,7 +82,7 @@ class TrilatRobot(Robot):
     def __init__(self, config: TrilatRobotConfig) -> None:
         super().__init__(config)
         self.config = config
-        self.cameras: dict[str, Any] = {}  # lerobot-record reads how many there are
+        self.cameras: dict[str, Any] = {}  # lerobot-record reads the number of cameras
         scenario = tn.load_scenario(config.scenario or config.session)
         mode = _find_hand_mode(scenario, config.site)
         self._command, quantity = _HAND_COMMANDS[mode]
@@ -91,7 +92,7 @@ class TrilatRobot(Robot):
         self._felt_keys = [f"{axis}.felt" for axis in axes]
         self._sites = (config.slave, config.site)
         self._joint_keys: list[str] = []
-        # Without repetitions, in case both names are the same.
+        # Without repetitions, because both names may be the same.
         for site in dict.fromkeys(self._sites):
             joint_names = scenario.arms[site].joint_names
             for joint_quantity in ("pos", "vel", "tau_x"):
@@ -106,7 +107,7 @@ class TrilatRobot(Robot):
     def observation_features(self) -> dict[str, type]:
         """Names and types of the numbers that LeRobot receives as an observation of the robot.
 
-        They are the states of both arms, and the position and force of the operator, the
+        The numbers are the states of both arms, and the position and force of the operator, the
         program that moves the master arm. A joint has its angle in rad, its velocity in rad/s
         and its external torque in N m. The operator has a position in m, and feels a force in
         N. In mode `joint` these are angles in rad and torques in N m.
@@ -134,7 +135,7 @@ class TrilatRobot(Robot):
 
     @property
     def is_calibrated(self) -> bool:
-        """True: calibration is never needed, because the scenario file describes the arms."""
+        """Always True: no calibration is needed, as the scenario file describes the arms."""
         return True
 
     def calibrate(self) -> None:
@@ -150,7 +151,7 @@ class TrilatRobot(Robot):
             calibrate: Not used, because there is nothing to calibrate.
 
         Raises:
-            DeviceAlreadyConnectedError: The robot is connected already.
+            DeviceAlreadyConnectedError: The robot is already connected.
             DeviceNotConnectedError: A site does not publish its state in time.
         """
         if self._hand is not None:
@@ -200,8 +201,8 @@ class TrilatRobot(Robot):
     def get_observation(self) -> dict[str, float]:
         """Returns the newest states of the slave and of the driven master, for the policy.
 
-        For each of both, these are angles, velocities and external torques of the joints. The
-        position of the operator follows, and the reaction to its force.
+        The state of an arm consists of the angles, velocities and external torques of its
+        joints. The position of the operator and the reaction to the operator's force follow.
 
         Returns:
             Numbers with the keys of `observation_features`.
@@ -218,7 +219,7 @@ class TrilatRobot(Robot):
         return dict(zip(self.observation_features, values, strict=True))
 
     def send_action(self, action: dict[str, Any]) -> dict[str, float]:
-        """Commands the operator that moves the master arm, as the policy decided.
+        """Sends the policy's decision to the operator that moves the master arm.
 
         The site enforces the limits of force and speed.
 
@@ -245,7 +246,7 @@ class TrilatRobot(Robot):
     def _require_running_hand(self) -> Any:
         """Returns the connection of the operator while the session runs.
 
-        After its end the newest record would be observed again and again.
+        After the end of the session, the newest record would be observed again and again.
 
         Raises:
             DeviceNotConnectedError: The robot is not connected, or the session has ended.
@@ -294,7 +295,7 @@ def _find_hand_mode(scenario: Any, site: str) -> str:
 def _list_hand_axes(scenario: Any, site: str, mode: str) -> list[str]:
     """Returns the names of the directions or joints in which a policy moves the arm.
 
-    They become the names of the robot's actions in LeRobot data sets.
+    The names of the robot's actions in LeRobot data sets are derived from these names.
 
     Args:
         scenario: The scenario of the session.
@@ -347,7 +348,7 @@ def run_policy(
     return count
 
 
-def load_policy(folder: str) -> Callable[[dict[str, list[float]]], list[float]]:
+def _load_policy(folder: str) -> Callable[[dict[str, list[float]]], list[float]]:
     """Loads a trained policy that `lerobot-train` has stored in a folder.
 
     Args:
@@ -371,11 +372,11 @@ def load_policy(folder: str) -> Callable[[dict[str, list[float]]], list[float]]:
     policy.reset()
 
     def decide(state: dict[str, list[float]]) -> list[float]:
-        """Returns the action of the trained policy for an observation, as plain numbers.
+        """Returns the action of the trained policy for an observation, as a list of numbers.
 
         Args:
-            state: Numbers of each feature of the observation. Features that the policy was not
-                trained with are left out.
+            state: Numbers of each feature of the observation. Features with which the policy
+                was not trained are left out.
         """
         tensors = {
             key: torch.tensor([numbers], dtype=torch.float32)
@@ -389,7 +390,7 @@ def load_policy(folder: str) -> Callable[[dict[str, list[float]]], list[float]]:
     return decide
 
 
-def main() -> None:
+def _main() -> None:
     """Runs a trained policy, which moves an arm of a running teleoperation session.
 
     This is the command `python -m lerobot_robot_trilat`.
@@ -399,13 +400,15 @@ def main() -> None:
     parser.add_argument("--site", default="m2", help="master that the policy drives")
     parser.add_argument("--slave", default="s", help="slave that the policy observes")
     parser.add_argument("--session", default="play", help="name of the session")
-    parser.add_argument("--scenario", default="", help="scenario, if its name is another one")
+    parser.add_argument(
+        "--scenario", default="", help="scenario; default: the name of the session"
+    )
     parser.add_argument("--connect", action="append", default=[], help="endpoint; repeatable")
     parser.add_argument("--keys", default="", help="folder of the operator's keys")
     parser.add_argument("--duration", type=float, default=30.0, help="duration, s")
     parser.add_argument("--fps", type=int, default=30, help="decisions per second")
     options = parser.parse_args()
-    decide = load_policy(options.folder)
+    decide = _load_policy(options.folder)
     config = TrilatRobotConfig(
         session=options.session,
         scenario=options.scenario,
@@ -424,4 +427,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    _main()

@@ -6,13 +6,13 @@ LeRobot move that arm, for example to the position of the policy's arm before th
 intervenes.
 
 Invariant:
-    - The slave follows both users, weighted by their dominance factors, also while the person
+    - The slave follows both users, weighted by their dominance factors, even while the person
       intervenes.
     - The person counts as intervening if the person's dominance factor is greater than that of
       the policy.
     - Feedback moves the arm only while torque is enabled and no other user holds the arm.
-    - Feedback acts through the spring and the limits of the arm's live hand, which is an
-      operator that the scenario allows.
+    - Feedback acts through the spring and the limits of the arm's live hand, an operator that
+      the scenario must allow.
 """
 
 from contextlib import ExitStack
@@ -30,7 +30,7 @@ _HAND_COMMANDS = {
     "joint": ("turn", "pos"),
     "force": ("push", "force"),
 }
-"""How a hand (operator) of each mode is commanded.
+"""Commands of a hand (operator) in each mode.
 
 The values are the method of `tn.hand`, and the suffix of the keys of a command.
 """
@@ -98,7 +98,7 @@ class TrilatTeleoperator(Teleoperator):
     def action_features(self) -> dict[str, type]:
         """Keys of an action: the position of the arm in m, or angles in rad in mode `joint`.
 
-        They are also the position keys of the robot `TrilatRobot`.
+        These keys are also the position keys of the robot `TrilatRobot`.
         """
         return dict.fromkeys(self._position_keys, float)
 
@@ -122,7 +122,7 @@ class TrilatTeleoperator(Teleoperator):
 
     @property
     def is_calibrated(self) -> bool:
-        """True: calibration is never needed, because the scenario file describes the arm."""
+        """Always True: no calibration is needed, as the scenario file describes the arm."""
         return True
 
     def calibrate(self) -> None:
@@ -140,7 +140,7 @@ class TrilatTeleoperator(Teleoperator):
             calibrate: Not used, because there is nothing to calibrate.
 
         Raises:
-            DeviceAlreadyConnectedError: The teleoperator is connected already.
+            DeviceAlreadyConnectedError: The teleoperator is already connected.
         """
         if self._hand is not None:
             raise DeviceAlreadyConnectedError(f"{self} is already connected.")
@@ -165,7 +165,7 @@ class TrilatTeleoperator(Teleoperator):
             self._stack = stack.pop_all()
 
     def get_action(self) -> dict[str, float]:
-        """Returns where the person has moved the arm, as an action for the robot.
+        """Returns the present position of the person's arm, as an action for the robot.
 
         Returns:
             The newest position, with the keys of `action_features`.
@@ -186,7 +186,7 @@ class TrilatTeleoperator(Teleoperator):
         return dict(zip(felt_keys, felt_forces, strict=True))
 
     def send_feedback(self, feedback: dict[str, Any]) -> None:
-        """Moves the person's arm as the policy says, if torque is enabled.
+        """Moves the person's arm according to the policy, if torque is enabled.
 
         The person feels this as a pull or a push.
 
@@ -279,7 +279,7 @@ def _find_hand_mode(scenario: Any, site: str) -> str:
 def _list_hand_axes(scenario: Any, site: str, mode: str) -> list[str]:
     """Returns the names of the directions or joints in which a person moves the arm.
 
-    They become the names of the actions in LeRobot data sets.
+    The names of the actions in LeRobot data sets are derived from these names.
 
     Args:
         scenario: The scenario of the session.

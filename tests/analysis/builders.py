@@ -19,7 +19,7 @@ from trilat_net.analysis.certificate.energy_balance import (
     compute_energy_balance,
     compute_site_energies,
 )
-from trilat_net.analysis.certificate.stability_certificate import certify
+from trilat_net.analysis.certificate.stability_certificate import certify_log
 from trilat_net.core.step.ticks import LinkCounts
 from trilat_net.execution import virtual
 from trilat_net.execution.virtual_network import RecordedNetwork
@@ -376,7 +376,7 @@ class AnalysedRun:
 
     @cached_property
     def certificate(self) -> Certificate:
-        return certify(self.log)
+        return certify_log(self.log)
 
 
 _runs: dict[str, AnalysedRun] = {}

@@ -78,7 +78,7 @@ def make_swing(rate_per_s: float, amplitude: float = 0.1) -> Callable[[float], f
             lambda _: 0.2,
             make_swing(-0.8),
             EndBehaviour.CONVERGED,
-            "at rest, with errors that stay",
+            "at rest, with remaining errors",
         ),
         (
             lambda _: 0.1,

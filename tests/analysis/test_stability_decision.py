@@ -205,7 +205,7 @@ def test_a_slow_numerical_decay_stays_open(
         )
         slow = decide(end=lasting, twins=pushes, roots=roots)
         assert slow.stability is (Stability.OPEN if share <= 1.0 else Stability.NOT_STABLE)
-        assert ("too slow to be told from" in "".join(slow.reasons)) == (share <= 1.0)
+        assert ("too slow to be distinguished from" in "".join(slow.reasons)) == (share <= 1.0)
         agreeing = EnvelopeFit(EnvelopeTrend.HARDLY, 1.2 * rate_per_s, True)
         decaying = lasting._replace(error=agreeing, speed=agreeing)
         assert decide(end=decaying, twins=pushes, roots=roots).stability is Stability.OPEN

@@ -160,7 +160,7 @@ def test_twins_separate_linear_and_nonlinear_motion() -> None:
     assert twin_report.linear.smallest == 1e-8
     assert 1e-4 <= twin_report.linear.largest <= 0.1
     assert (
-        f"; a push of {10 * twin_report.linear.largest:g} goes another way: x "
+        f"; a push of {10 * twin_report.linear.largest:g} develops differently: x "
         in twin_report.headline()
     )
     assert len(twin_report.to_frame()) == 9

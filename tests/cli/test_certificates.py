@@ -78,7 +78,7 @@ def test_closed_groups_are_named_in_text_and_json(tmp_path: Path) -> None:
     ended = trilat("certify", "run.mcap", cwd=tmp_path)
     assert ended.code == 1
     assert (
-        "V cannot be judged: {a, b} and {c, d} follow nobody outside: beta is not unique"
+        "V cannot be judged: {a, b} and {c, d} follow no site outside their group: beta is not unique"
         in ended.out
     )
     facts = json.loads(trilat("certify", "--json", "run.mcap", cwd=tmp_path).out)

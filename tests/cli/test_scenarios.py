@@ -127,4 +127,4 @@ def test_show_prints_the_scenario_of_a_log(tmp_path: Path) -> None:
     ended = trilat("scenario", "show", "run.mcap", cwd=tmp_path)
     assert ended.succeeds() == text
     changed = trilat("scenario", "show", "run.mcap", "--seed", "3", cwd=tmp_path)
-    changed.refuses("printed as it is", "mine.toml")
+    changed.refuses("cannot be changed", "mine.toml")

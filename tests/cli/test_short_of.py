@@ -66,7 +66,9 @@ def test_keys_refused_by_disk_leave_no_file(tmp_path: Path) -> None:
     done = run_limited(resource.RLIMIT_FSIZE, 100, "keys", "new", "k", "m1", cwd=tmp_path)
     assert done.returncode == 5
     (line,) = done.stderr.splitlines()
-    assert line.startswith("error: k cannot be written: File too large; nothing is left of it")
+    assert line.startswith(
+        "error: k cannot be written: File too large; no partial file was left"
+    )
     assert list(tmp_path.iterdir()) == []
 
 

@@ -23,7 +23,7 @@ from tests.execution.builders import make_trajectories, sample_records
 from tests.log.builders import open_bytes, simulate_bytes
 from tests.unit_arm import H50, make_spring_hand, make_unit_scenario
 from trilat_net.analysis.judge import list_law_proofs
-from trilat_net.execution.verification import verify
+from trilat_net.execution.verification import verify_log
 from trilat_net.scenario.describe import describe_law_conditions
 
 TANKS: dict[str, Any] = {"law": "tanks", "level_J": 0.125, "fill_nm_s_rad_J": 40.0}
@@ -82,7 +82,7 @@ def test_a_tank_sends_at_most_its_energy() -> None:
     lines = describe_law_conditions(
         make_energy_pair({**TANKS, "packet_1_s": 2000.0}, clamped=False, duration_s=1.0)
     )
-    assert "does not hold: a tank sends 2 of its energy a tick" in lines[0]
+    assert "does not hold: a tank sends 2 times its energy per tick" in lines[0]
 
 
 SEEDS = [
@@ -136,7 +136,7 @@ def test_compiled_and_stepped_runs_agree_and_verify(law: str) -> None:
         for field in ("q", "qd", "tau", "tau_x", "ch"):
             assert last[n, columns[field]].tolist() == getattr(site, field)[-1].tolist()
     scenario = make_energy_pair(LAWS[law], clamped=True, duration_s=0.3, link=MOBILE)
-    verdict = verify(open_bytes(simulate_bytes(scenario)))
+    verdict = verify_log(open_bytes(simulate_bytes(scenario)))
     assert verdict.passed
     assert verdict.identical == verdict.records == 600
 

@@ -9,7 +9,7 @@ from tests.control_laws.law_settings import LAWS
 from tests.core.guarded_runs import RATE_NM_S, find_largest_step, make_ordered_log
 from tests.execution.builders import make_trajectories, sample_records
 from trilat_net.core.plug.compiled_law import is_compiled
-from trilat_net.execution.verification import verify
+from trilat_net.execution.verification import verify_log
 from trilat_net.scenario import Scenario, load_scenario
 from trilat_net.scenario.describe import describe_scenario
 from trilat_net.scenario.laws import LAWS as ALL_LAWS
@@ -111,7 +111,7 @@ def test_torque_rates_stay_limited_in_every_event(law: str) -> None:
     for site in log.sites:
         assert find_largest_step(log, site) <= RATE_NM_S * 1e-3 * (1.0 + 1e-9), site
         assert np.isfinite(log[site].tau).all()
-    assert verify(log).differing == 0
+    assert verify_log(log).differing == 0
 
 
 CALM = [

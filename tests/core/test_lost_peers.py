@@ -17,7 +17,7 @@ from trilat_net.analysis.dominance_history import list_losses, trace_dominance
 from trilat_net.core.links.lost_peers import BACK_NS
 from trilat_net.core.step.ticks import LifeReason
 from trilat_net.errors import ScenarioError
-from trilat_net.execution.verification import verify
+from trilat_net.execution.verification import verify_log
 from trilat_net.execution.virtual_comparison import compare_with_virtual
 from trilat_net.log.log_reader import Log
 from trilat_net.scenario import Scenario, load_scenario
@@ -81,7 +81,7 @@ def test_losing_a_master_never_jumps_the_reference() -> None:
 @pytest.mark.long
 def test_degraded_runs_verify_and_close_their_energies() -> None:
     log = make_master_lost_log()
-    assert verify(log).identical == 18_000
+    assert verify_log(log).identical == 18_000
     assert compare_with_virtual(log).fed.identical == 18_000
     plan = make_cut_scenario("m1->s", "m1->m2")
     ticks = make_trajectories(plan)

@@ -20,7 +20,7 @@ from trilat_net.core.life.session_life import update_session_life
 from trilat_net.core.step.site_setup import StaleAction
 from trilat_net.core.step.ticks import Mode, tick_ns
 from trilat_net.core.step.vectors import Array, Row
-from trilat_net.execution.verification import verify
+from trilat_net.execution.verification import verify_log
 from trilat_net.log.log_reader import Log
 from trilat_net.scenario import parse_scenario
 
@@ -190,7 +190,7 @@ def test_arms_hold_joints_and_follow_again() -> None:
         assert np.abs(part.qd[4000:4040]).max() <= 0.01, site
     before = np.abs(log["s"].qd[1900:2000]).max()
     assert before > 0.05
-    assert verify(log).identical == 15_000
+    assert verify_log(log).identical == 15_000
 
 
 @pytest.mark.long
@@ -261,7 +261,7 @@ def test_energies_close_over_a_task_space_hold() -> None:
     first = int(np.flatnonzero(modes == "hold")[0])
     assert set(modes[first : first + 1400]) == {"hold"}
     assert measure_torque_error(energy.motion).max() <= 1e-9
-    assert verify(log).differing == 0
+    assert verify_log(log).differing == 0
 
 
 @pytest.mark.long
@@ -276,4 +276,4 @@ def test_equal_arms_stop_and_return_smoothly() -> None:
     for site in log.sites:
         assert find_largest_step(log, site) <= 0.5 * (1.0 + 1e-9)
         assert set(log[site].mode[-200:]) == {"run"}
-    assert verify(log).identical == 18_000
+    assert verify_log(log).identical == 18_000

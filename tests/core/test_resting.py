@@ -30,7 +30,7 @@ from trilat_net.core.step.site_step import Site
 from trilat_net.core.step.ticks import CoreChange, LifeOrder, Mode, TickInput
 from trilat_net.core.step.vectors import Array
 from trilat_net.execution.resumption import read_output
-from trilat_net.execution.verification import verify
+from trilat_net.execution.verification import verify_log
 from trilat_net.log.log_reader import Log
 from trilat_net.scenario import Scenario, load_scenario
 from trilat_net.scenario.laws import LAWS
@@ -150,7 +150,7 @@ def test_arms_with_failed_laws_are_held() -> None:
         np.abs(part.tau[-1] - gravity_of(log.scenario.arms["s"].theta, part.q[-1:])).max()
         <= 1e-3
     )
-    assert verify(log).identical == 8000
+    assert verify_log(log).identical == 8000
 
 
 @given(

@@ -26,7 +26,7 @@ from trilat_net.core.life.safeguards import BLEND_S
 from trilat_net.core.plug.user_law import LawContext, LawInput
 from trilat_net.core.step.ticks import LifeReason
 from trilat_net.errors import ScenarioError
-from trilat_net.execution.verification import verify
+from trilat_net.execution.verification import verify_log
 from trilat_net.execution.virtual_comparison import compare_with_virtual
 from trilat_net.execution.what_if import rerun
 from trilat_net.log.log_reader import Log
@@ -36,7 +36,7 @@ from trilat_net.scenario import load_scenario
 @pytest.mark.long
 def test_logs_with_orders_verify_in_every_way() -> None:
     log = make_stopped_log()
-    assert verify(log).identical == 12_000
+    assert verify_log(log).identical == 12_000
     assert compare_with_virtual(log).fed.identical == 12_000
     again = rerun(log, ["s"])
     assert again.sites["s"].identical == 6000
@@ -46,7 +46,7 @@ def test_stopped_sites_go_on_learning() -> None:
     log = make_stopped_log(adaptive_text(), 3000)
     theta_hat = log["s"].theta_hat
     assert np.ptp(theta_hat[2000:3000], axis=0).max() > 1e-3
-    assert verify(log).identical == 12_000
+    assert verify_log(log).identical == 12_000
     assert log["s"].mode[-1] == "run"
 
 
@@ -73,7 +73,7 @@ def test_a_passed_limit_is_a_lasting_fault(
     assert any(
         re.search("s is in FAULT from .*: a joint is", event.text) for event in log.events
     )
-    assert verify(log).differing == 0
+    assert verify_log(log).differing == 0
     assert len(log["s"]) == 6000
 
 
@@ -93,7 +93,7 @@ def test_rate_limits_keep_reference_jumps_out() -> None:
     steps = np.abs(np.diff(held["s"].q_des, axis=0))
     assert steps.max() <= 6.0e-3 * (1.0 + 1e-9)
     assert np.abs(held["s"].qd_des).max() == 6.0
-    assert verify(held).identical == 2000
+    assert verify_log(held).identical == 2000
 
 
 @pytest.mark.parametrize(
@@ -146,7 +146,7 @@ def test_missed_ticks_are_held_or_a_fault(missed: int, mode: str) -> None:
     assert part.skipped == missed
     assert log.missing("s") == 0
     assert log.expected_ticks("s") == 4000 - missed
-    verdict = verify(log)
+    verdict = verify_log(log)
     assert verdict.identical == 8000 - missed
     assert verdict.passed
     assert not verdict.gaps
@@ -175,7 +175,7 @@ def test_stops_and_returns_add_no_steps() -> None:
         (log["s"].mode[1:] == "return") & (log["s"].mode[:-1] == "stopped")
     )
     assert (log["s"].tau[jump + 1] == log["s"].tau[jump]).all()
-    assert verify(log).identical == 16_000
+    assert verify_log(log).identical == 16_000
     balance = compute_energy_balance(compute_site_energies(log))
     assert np.abs(balance.residual).max() <= 1e-3 * balance.scale
 
@@ -228,7 +228,7 @@ def test_own_laws_yield_to_gravity_while_holding() -> None:
     wanted = (1.0 - share) * part.tau[2699] + share * law[2700:2900]
     assert np.abs(part.tau[2700:2900] - wanted).max() <= 1e-9
     assert np.abs(part.tau[0]).max() <= 1.0  # it waits from 0 s on, and its rate is limited
-    assert verify(log).identical == 8000
+    assert verify_log(log).identical == 8000
     assert compare_with_virtual(log).fed.identical == 8000
 
 

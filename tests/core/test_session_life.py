@@ -21,7 +21,7 @@ from trilat_net.core.step.ticks import (
     TickInput,
 )
 from trilat_net.errors import ScenarioError
-from trilat_net.execution.verification import verify
+from trilat_net.execution.verification import verify_log
 from trilat_net.log.log_reader import Log
 from trilat_net.scenario import Scenario, parse_scenario
 
@@ -119,7 +119,7 @@ def test_every_driver_gives_the_same_bits() -> None:
             for name in ("q", "qd", "tau", "q_des")
         )
     log = trilat_net.simulate(scenario)
-    assert verify(log).identical == 6000
+    assert verify_log(log).identical == 6000
 
 
 @pytest.mark.parametrize(

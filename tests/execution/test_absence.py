@@ -23,7 +23,7 @@ from tests.log.surgery import Pieces, Stored, repack_message, take_apart
 from trilat_net.app.cli import options
 from trilat_net.errors import LogError, ScenarioError
 from trilat_net.execution.log_checks import LogCheckReport
-from trilat_net.execution.verification import verify
+from trilat_net.execution.verification import verify_log
 from trilat_net.execution.what_if import rerun
 from trilat_net.log.accounting import MIN_COVERAGE, Coverage
 from trilat_net.log.log_reader import open_log
@@ -224,7 +224,7 @@ def test_two_runs_over_a_gap_are_refused() -> None:
 
 def test_sparse_logs_fail_with_the_judged_share() -> None:
     log = make_log_without({"m1": range(2, 100)})
-    verdict = verify(log)
+    verdict = verify_log(log)
     assert verdict.agreed
     assert not verdict.passed
     assert verdict.coverage.judged["m1"] < 25
@@ -237,11 +237,11 @@ def test_sparse_logs_fail_with_the_judged_share() -> None:
 def test_torn_logs_pass_no_more_than_asked() -> None:
     data = edit_log_bytes(make_log_bytes("paper"), chunk_bytes=2048)
     log = open_bytes(data[: len(data) // 2])
-    assert not verify(log).passed
-    share = verify(log).coverage.share
+    assert not verify_log(log).passed
+    share = verify_log(log).coverage.share
     assert 0.1 < share < 0.9
-    assert verify(log, min_coverage=share).passed
-    assert not verify(log, min_coverage=share + 1e-6).passed
+    assert verify_log(log, min_coverage=share).passed
+    assert not verify_log(log, min_coverage=share + 1e-6).passed
     whole = make_log_bytes("paper")
     assert (
         judge_integrity(open_bytes(whole[: whole.index(b"trilat.chain")])).state
@@ -256,7 +256,7 @@ def test_foreign_records_are_found_without_execution() -> None:
         changed = {**r, "boot": 1} if (r["site"], r["tick"]) == ("s", 45) else r
         return drop_records("s", {43, 44})(changed)
 
-    first = verify(open_bytes(edit_log_bytes(make_log_bytes("paper"), record=record))).first
+    first = verify_log(open_bytes(edit_log_bytes(make_log_bytes("paper"), record=record))).first
     assert first is not None
     assert first[:3] == ("s", 45, "boot")
 
@@ -267,8 +267,8 @@ def test_a_claimed_rerun_is_executed_whole() -> None:
 
     claims = {"rerun_executed": "s", "rerun_mode": "open loop"}
     data = edit_log_bytes(make_log_bytes("paper"), record=zeroed, session=claims)
-    assert not verify(open_bytes(data)).agreed
-    worse = verify(open_bytes(edit_log_bytes(data, session={**claims, "driver": "rerun"})))
+    assert not verify_log(open_bytes(data)).agreed
+    worse = verify_log(open_bytes(edit_log_bytes(data, session={**claims, "driver": "rerun"})))
     assert worse.agreed  # its m1 and m2 met samples that are not in it
     assert worse.coverage.share == 0.0
     assert not worse.passed
@@ -278,7 +278,7 @@ def test_open_loop_reruns_are_judged_beside_logs(tmp_path: Path) -> None:
     write_log(tmp_path, make_log_bytes("free"))
     log_path = tmp_path / "again.mcap"
     rerun(tmp_path / "run.mcap", ["s"], {"control.Kd": 5}).save(log_path)
-    verdict = verify(open_log(log_path))
+    verdict = verify_log(open_log(log_path))
     assert verdict.passed
     assert verdict.identical == 3 * TICKS
     forged = edit_log_bytes(
@@ -286,7 +286,7 @@ def test_open_loop_reruns_are_judged_beside_logs(tmp_path: Path) -> None:
         record=lambda r: {**r, "tau": [0.0, 0.0]} if r["site"] == "m1" else r,
     )
     log_path.write_bytes(forged)
-    assert verify(open_log(log_path)).first[:3] == ("m1", 0, "record")
+    assert verify_log(open_log(log_path)).first[:3] == ("m1", 0, "record")
     # no more the file that the rerun names
     write_log(tmp_path, make_log_bytes("free") + b"x")
     alone = LogCheckReport.of_log(open_log(log_path), virtual=True)

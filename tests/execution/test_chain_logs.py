@@ -10,7 +10,7 @@ import pytest
 from tests.log.builders import Record, edit_log_bytes, open_bytes
 from tests.scenario.builders import six_joint_text
 from trilat_net.errors import LogError
-from trilat_net.execution.verification import verify
+from trilat_net.execution.verification import verify_log
 from trilat_net.execution.virtual import simulate_scenario, write_virtual_log
 from trilat_net.log.log_reader import Log
 from trilat_net.scenario.scenario_reader import load_scenario, parse_scenario
@@ -46,7 +46,7 @@ def test_records_with_other_joints_are_refused(field: str, numbers: int) -> None
     with pytest.raises(
         LogError, match=f"a record of s cannot be read: .*{field} has {numbers} numbers, not"
     ):
-        verify(log)
+        verify_log(log)
     with pytest.raises(LogError, match="a record of s cannot be read"):
         getattr(log["s"], field)
 
@@ -57,7 +57,7 @@ def test_one_bit_of_the_last_joint_is_found() -> None:
             record["qd"][N - 1] = math.nextafter(record["qd"][N - 1], math.inf)
         return record
 
-    first = verify(open_bytes(edit_log_bytes(make_chain_bytes(), record=change))).first
+    first = verify_log(open_bytes(edit_log_bytes(make_chain_bytes(), record=change))).first
     assert first is not None
     assert (first.site, first.tick, first.field) == ("m1", 50, f"qd[{N - 1}]")
 

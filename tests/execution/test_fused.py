@@ -223,7 +223,9 @@ def test_unsupported_runs_are_refused() -> None:
         ScenarioError, match=r"sites\.m1\.plant: is external: .* can only run live"
     ):
         FusedRun(load_scenario("free", {"sites.m1.plant": "external"}))
-    with pytest.raises(ScenarioError, match="makes 10000 ticks within one tick of the slowest"):
+    with pytest.raises(
+        ScenarioError, match="executes 10000 ticks within one tick of the slowest"
+    ):
         FusedRun(load_scenario("free", {"rate_hz": 10_000, "sites.s.rate_hz": 1}))
 
 

@@ -13,7 +13,7 @@ from tests.execution.deliveries import SITES, TICKS
 from tests.log.builders import Record, edit_log_bytes, make_log_bytes, open_bytes
 from trilat_net.errors import LogError
 from trilat_net.execution import virtual
-from trilat_net.execution.verification import verify
+from trilat_net.execution.verification import verify_log
 from trilat_net.log.log_reader import open_log
 from trilat_net.log.ros2.ros2_messages import read_ros2_channels
 from trilat_net.log.view_rates import FULL_RATE_HZ
@@ -64,7 +64,7 @@ def test_a_changed_number_shows_at_its_own_tick(
             r["ch"][place] += 1e-3
         return r
 
-    first = verify(
+    first = verify_log(
         open_bytes(edit_log_bytes(make_talking_bytes(), record=record, session=session))
     ).first
     assert first is not None
@@ -81,7 +81,7 @@ def test_arrival_sums_cover_exactly_the_received_numbers(place: int, differing: 
         return r
 
     assert (
-        verify(open_bytes(edit_log_bytes(make_talking_bytes(), record=record))).differing
+        verify_log(open_bytes(edit_log_bytes(make_talking_bytes(), record=record))).differing
         == differing
     )
 

@@ -12,7 +12,7 @@ from trilat_net.analysis.certificate.energy_balance import (
 )
 from trilat_net.analysis.torque_sources import TorqueSplit, compute_live_torque
 from trilat_net.errors import ScenarioError
-from trilat_net.execution.verification import verify
+from trilat_net.execution.verification import verify_log
 from trilat_net.execution.virtual import simulate_scenario
 from trilat_net.execution.virtual_comparison import compare_with_virtual
 from trilat_net.execution.what_if import rerun
@@ -31,7 +31,7 @@ def held_log(request: pytest.FixtureRequest) -> Log:
 
 
 def test_logs_of_people_are_verified_and_repeated(held_log: Log) -> None:
-    verification = verify(held_log)
+    verification = verify_log(held_log)
     assert verification.passed
     assert verification.identical == verification.records == 3 * round(SECONDS * 1000)
     compared = compare_with_virtual(held_log)
@@ -85,7 +85,7 @@ def test_a_changed_hand_is_found(mode: str) -> None:
     live = [{"kind": "live", "mode": mode}]
     scenario = load_scenario("paper", {"duration_s": SECONDS, "sites.m1.hands": live})
     data = simulate_bytes(scenario, hands={"m1": CirclingHand(scenario, "m1")})
-    first = verify(open_bytes(edit_log_bytes(data, record=change))).first
+    first = verify_log(open_bytes(edit_log_bytes(data, record=change))).first
     assert first is not None
     assert (first.site, first.tick) == ("m1", 400)
 

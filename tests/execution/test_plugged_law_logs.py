@@ -11,7 +11,7 @@ from tests.log.builders import make_log_bytes, open_bytes
 from trilat_net.core.step.site_step import Site
 from trilat_net.core.step.ticks import TickInput
 from trilat_net.execution.resumption import RecordedInputs, read_output
-from trilat_net.execution.verification import verify
+from trilat_net.execution.verification import verify_log
 from trilat_net.execution.virtual_comparison import compare_with_virtual
 from trilat_net.execution.what_if import rerun
 
@@ -39,7 +39,7 @@ def test_logs_of_any_law_are_executed_again(law: str) -> None:
     """Whole, beside virtual time, and as a rerun without changes, every record is identical."""
     log = open_bytes(record_law(law))
     records = len(log.sites) * TICKS
-    verdict = verify(log)
+    verdict = verify_log(log)
     assert verdict.whole_run
     assert verdict.identical == verdict.records == records
     twins = compare_with_virtual(log)
@@ -53,11 +53,11 @@ def test_logs_of_any_law_are_executed_again(law: str) -> None:
 def test_any_law_resumes_behind_a_gap(law: str, session: dict[str, str] | None) -> None:
     """As much can be judged as of the law of the paper, and all of it agrees."""
     lost = {"s": range(50, 61)}
-    verdict = verify(make_log_without(lost, record_law(law), session))
+    verdict = verify_log(make_log_without(lost, record_law(law), session))
     assert verdict.gaps == [("s", 50, 60)]
     assert verdict.agreed
     scenario, _ = LAWS.get(law, ("paper", {}))
-    paper = verify(make_log_without(lost, make_log_bytes(scenario, SHORT), session))
+    paper = verify_log(make_log_without(lost, make_log_bytes(scenario, SHORT), session))
     assert (verdict.identical, verdict.unjudged) == (paper.identical, paper.unjudged)
     assert verdict.identical > verdict.records - 60
 

@@ -26,11 +26,11 @@ def verify_singly(log: Log, **options: Any) -> verification.VerifyResult:
     """Verifies a log by `Site.step` alone."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(verification, "make_sample_table", lambda _: None)
-        return verification.verify(log, **options)
+        return verification.verify_log(log, **options)
 
 
 def assert_same_result(data: bytes, **options: Any) -> verification.VerifyResult:
-    result = verification.verify(open_bytes(data), **options)
+    result = verification.verify_log(open_bytes(data), **options)
     assert result == verify_singly(open_bytes(data), **options)
     return result
 
@@ -43,7 +43,7 @@ def without_single_ticks(log: Log) -> verification.VerifyResult:
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(Site, "step", step)
-        return verification.verify(log)
+        return verification.verify_log(log)
 
 
 @pytest.mark.parametrize("name", ["paper", "six_joints", "jitter", "contact", "unlike_arms"])
@@ -120,15 +120,15 @@ def test_both_ways_agree_on_spoiled_records(seed: int) -> None:
 def test_both_ways_agree_behind_gaps() -> None:
     log = make_log_without({"m1": range(100, 110), "s": [200, 202]}, PAPER)
     again = make_log_without({"m1": range(100, 110), "s": [200, 202]}, PAPER)
-    result = verification.verify(log)
+    result = verification.verify_log(log)
     assert result == verify_singly(again)
     assert result.unjudged > 0
 
 
 def test_short_and_long_blocks_end_alike(monkeypatch: pytest.MonkeyPatch) -> None:
-    expected = verification.verify(open_bytes(PAPER))
+    expected = verification.verify_log(open_bytes(PAPER))
     monkeypatch.setattr(recorded_rows, "BLOCK_ROWS", 37)
-    assert verification.verify(open_bytes(PAPER)) == expected
+    assert verification.verify_log(open_bytes(PAPER)) == expected
 
 
 def test_calendars_that_are_too_short_are_replaced() -> None:
@@ -136,7 +136,7 @@ def test_calendars_that_are_too_short_are_replaced() -> None:
     log = make_log(
         "paper", {"duration_s": 1.5, "link.delay_ms": 5.0, "timeline": changes, "expect": {}}
     )
-    result = verification.verify(log)
+    result = verification.verify_log(log)
     assert result.passed
     assert result == verify_singly(log)
 

@@ -66,7 +66,7 @@ def test_late_logs_are_executed_where_possible(changes: dict[str, float]) -> Non
     effect = again.sites["s"]
     assert 20 <= effect.stands <= 24
     assert effect.stands + effect.executed == len(log["s"]) == 80
-    assert any("stand as they are" in note for note in again.notes)
+    assert any("are copied unchanged" in note for note in again.notes)
     assert again.identical is not bool(changes)
     first = 40 + effect.stands
     assert (

@@ -10,7 +10,7 @@ from tests.execution.builders import make_log_without
 from tests.log.builders import make_log, make_log_bytes, write_log
 from trilat_net.errors import UsageError
 from trilat_net.execution.log_checks import LogCheckReport
-from trilat_net.execution.verification import verify
+from trilat_net.execution.verification import verify_log
 from trilat_net.execution.virtual_comparison import compare_with_virtual
 from trilat_net.execution.what_if import rerun
 from trilat_net.log.log_reader import open_log
@@ -65,7 +65,7 @@ def test_recorded_sites_stay_byte_for_byte(changes: dict[str, float]) -> None:
 @pytest.mark.parametrize("replace", [["s"], ["m1", "s"], list(SITES)], ids=" ".join)
 def test_only_executed_sites_are_verified(replace: list[str]) -> None:
     after = rerun(make_log("free"), replace, {"control.Kd": 5}).after
-    verdict = verify(after)
+    verdict = verify_log(after)
     assert after.executed_sites == tuple(sorted(replace))
     assert verdict.agreed, str(verdict.first)
     assert verdict.identical == verdict.records == TICKS * len(replace)
@@ -88,7 +88,7 @@ def test_a_closed_loop_is_virtual_time_again() -> None:
 
 def test_copied_records_are_not_judged() -> None:
     log = make_log_without({"s": [40, 41, 70], "m1": [40, 41, 42]})
-    verdict = verify(rerun(log, ["s"]).after)
+    verdict = verify_log(rerun(log, ["s"]).after)
     assert verdict.agreed, str(verdict.first)
     assert [gap[1:] for gap in verdict.gaps] == [(40, 41), (70, 70)]
 
@@ -107,7 +107,7 @@ def test_older_logs_become_this_version() -> None:
                 (ours.tau, theirs.tau),
             ):
                 assert mine == (pytest.approx(old, abs=1e-9) if name == "m2" else old)
-    assert verify(again.after).agreed
+    assert verify_log(again.after).agreed
     assert {event.n for event in again.after.events if event.member == "s"} == set(range(4))
 
 

@@ -17,7 +17,7 @@ from tests.log.builders import Record, edit_log_bytes, make_log_bytes, open_byte
 from trilat_net.errors import LawFailed, ScenarioError, UsageError, join_arguments
 from trilat_net.execution import virtual
 from trilat_net.execution.log_checks import LogCheckReport
-from trilat_net.execution.verification import verify
+from trilat_net.execution.verification import verify_log
 from trilat_net.execution.virtual_comparison import compare_with_virtual
 from trilat_net.log.log_reader import Log, open_log
 from trilat_net.own_code.code_consent import find_user_laws
@@ -47,8 +47,8 @@ def test_own_paper_law_gives_equal_bits(name: str) -> None:
 def test_incomplete_memory_is_found(session: dict[str, str] | None) -> None:
     """If no memory has to be restored the law passes; behind a gap, or tick by tick, it does not."""
     data = make_own_law_bytes("tests.laws:Forgetful")
-    assert verify(open_bytes(data)).passed
-    verdict = verify(make_log_without({"s": range(50, 61)}, data, session))
+    assert verify_log(open_bytes(data)).passed
+    verdict = verify_log(make_log_without({"s": range(50, 61)}, data, session))
     assert verdict.first is not None
     assert verdict.first.field.startswith(("theta_hat", "tau"))
 
@@ -70,15 +70,15 @@ def test_restarted_sites_are_the_same(law: str) -> None:
     ]
     stream = io.BytesIO()
     virtual.write_virtual_log(scenario, stream, commands={"s": {50: changes}})
-    verdict = verify(open_bytes(stream.getvalue()), resume_every=7)
+    verdict = verify_log(open_bytes(stream.getvalue()), resume_every=7)
     assert verdict.identical == verdict.records == 900
 
 
 def test_hidden_memory_shows_at_a_restart() -> None:
     log = open_bytes(make_own_law_bytes("tests.laws:Forgetful"))
-    assert verify(log).passed
-    assert verify(log, resume_every=1000).passed
-    verification = verify(log, resume_every=40)
+    assert verify_log(log).passed
+    assert verify_log(log, resume_every=1000).passed
+    verification = verify_log(log, resume_every=40)
     assert verification.first is not None
     assert verification.first.tick == 40
 
@@ -113,7 +113,7 @@ def test_changed_memory_shows_at_its_tick() -> None:
             r["mem"][4] += 1e-3
         return r
 
-    verdict = verify(open_bytes(edit_log_bytes(make_own_law_bytes(), record=record)))
+    verdict = verify_log(open_bytes(edit_log_bytes(make_own_law_bytes(), record=record)))
     assert verdict.differing == 1
     assert (verdict.first.site, verdict.first.tick, verdict.first.field) == ("m2", 70, "mem")
 
@@ -150,7 +150,7 @@ def test_changed_files_are_judged_on_request(file: Path) -> None:
     (law,) = find_user_laws(log.scenario)
     assert not law.allowed
     assert f"--law {file} --other-version (it was changed" in str(law)
-    verdict = verify(log)
+    verdict = verify_log(log)
     assert (verdict.withheld, verdict.records, verdict.agreed, verdict.passed) == (
         ["m", "s"],
         0,
@@ -159,9 +159,9 @@ def test_changed_files_are_judged_on_request(file: Path) -> None:
     )
     with pytest.raises(UsageError, match="is not the file that ran"):
         reopen_log(stream, law=file)
-    assert verify(reopen_log(stream, law=file, other_version=True)).passed
+    assert verify_log(reopen_log(stream, law=file, other_version=True)).passed
     file.write_text(file.read_text().replace("pass", "def memory(self): return [1.0]"))
-    assert verify(reopen_log(stream, law=file, other_version=True)).first.field == "mem"
+    assert verify_log(reopen_log(stream, law=file, other_version=True)).first.field == "mem"
 
 
 def reopen_log(stream: io.BytesIO, **how: Any) -> Log:
@@ -174,7 +174,7 @@ def test_a_missing_file_names_the_remedy(file: Path) -> None:
     file.unlink()
     (law,) = find_user_laws(log.scenario)
     assert str(law).endswith("external code, which may not run; if you trust it: --law FILE")
-    assert verify(log).withheld == ["m", "s"]
+    assert verify_log(log).withheld == ["m", "s"]
 
 
 def test_a_law_failing_only_now_is_a_difference(file: Path) -> None:
@@ -183,7 +183,7 @@ def test_a_law_failing_only_now_is_a_difference(file: Path) -> None:
     failing = f"def torque(self, now): return {wrong} else super().torque(now)"
     file.write_text(file.read_text().replace("pass", failing))
     log = open_log(stream, law=file, other_version=True)
-    verdict = verify(log)
+    verdict = verify_log(log)
     assert (verdict.first.site, verdict.first.tick) == ("s", 7)
     assert "ZeroDivisionError" in str(verdict.first)
     assert (verdict.identical, verdict.differing, verdict.unjudged) == (50 + 7, 1, 42)
@@ -220,7 +220,7 @@ def test_failing_laws_leave_a_finished_log(how: str, at: int) -> None:
     assert [len(log[name]) for name in SITES] == [at + 1, at + 1, at]
     assert [event.text for event in log.events if event.kind == "failed"] == [text]
     assert {event.member: event.ticks for event in log.events if event.kind == "end"}["s"] == at
-    verdict = verify(log)
+    verdict = verify_log(log)
     assert verdict.agreed
     assert verdict.identical == 3 * at + 2
     assert compare_with_virtual(log).fed.first is None
@@ -230,7 +230,7 @@ def test_failing_laws_leave_a_finished_log(how: str, at: int) -> None:
 def test_external_records_are_inputs(session: dict[str, str] | None) -> None:
     log = open_bytes(edit_log_bytes(make_external_arm_bytes(), session=session))
     assert log["s"].q[50].tolist() == [0.5, -0.3]
-    verdict = verify(log)
+    verdict = verify_log(log)
     assert verdict.agreed
     assert verdict.identical == 2 * TICKS
     twins = compare_with_virtual(log)
@@ -240,9 +240,11 @@ def test_external_records_are_inputs(session: dict[str, str] | None) -> None:
 
 def test_external_arms_are_executed_behind_gaps() -> None:
     """As much can be judged as of a simulated arm."""
-    verdict = verify(make_log_without({"s": range(40, 45)}, make_external_arm_bytes()))
+    verdict = verify_log(make_log_without({"s": range(40, 45)}, make_external_arm_bytes()))
     assert verdict.agreed
-    ours = verify(make_log_without({"s": range(40, 45)}, make_log_bytes("two_sites", SHORT)))
+    ours = verify_log(
+        make_log_without({"s": range(40, 45)}, make_log_bytes("two_sites", SHORT))
+    )
     assert (verdict.identical, verdict.unjudged) == (ours.identical, ours.unjudged)
 
 
@@ -252,7 +254,7 @@ def test_another_measurement_gives_another_torque() -> None:
             r["q"][1] += 1e-6
         return r
 
-    verdict = verify(open_bytes(edit_log_bytes(make_external_arm_bytes(), record=record)))
+    verdict = verify_log(open_bytes(edit_log_bytes(make_external_arm_bytes(), record=record)))
     assert (verdict.first.site, verdict.first.tick) == ("s", 70)
     assert verdict.first.field.startswith("tau")
 

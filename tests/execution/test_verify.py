@@ -21,7 +21,7 @@ from tests.execution.deliveries import (
 )
 from tests.log.builders import Record, drop_records, edit_log_bytes, make_log_bytes, open_bytes
 from trilat_net.core.step.site_setup import Layout
-from trilat_net.execution.verification import RecordDifference, verify
+from trilat_net.execution.verification import RecordDifference, verify_log
 from trilat_net.scenario import list_shipped
 
 VECTORS = Layout().lengths()
@@ -49,7 +49,7 @@ def change_tick(
 
 def find_first_difference(name: str = "paper", **changes: Any) -> RecordDifference:
     """The first difference of the log of a scenario that was changed as `edited` says."""
-    first = verify(open_bytes(edit_log_bytes(make_log_bytes(name), **changes))).first
+    first = verify_log(open_bytes(edit_log_bytes(make_log_bytes(name), **changes))).first
     assert first is not None
     return first
 
@@ -58,7 +58,7 @@ def find_first_difference(name: str = "paper", **changes: Any) -> RecordDifferen
 @pytest.mark.parametrize("scheme", ["second_order", "digital"])
 def test_every_record_of_an_untouched_log_is_identical(name: str, scheme: str) -> None:
     log = open_bytes(make_log_bytes(name, {"duration_s": 0.5, "scheme": scheme}))
-    verdict = verify(log)
+    verdict = verify_log(log)
     assert verdict.whole_run
     assert verdict.passed
     assert verdict.identical == verdict.records == 500 * len(log.sites)
@@ -68,7 +68,7 @@ def test_every_record_of_an_untouched_log_is_identical(name: str, scheme: str) -
 def test_different_rates_are_identical() -> None:
     rates = {"sites.m1.rate_hz": 1000, "sites.m2.rate_hz": 700, "sites.s.rate_hz": 333}
     log = open_bytes(make_log_bytes("paper", {**rates, "duration_s": 0.5}))
-    assert verify(log).identical == 500 + 350 + 166
+    assert verify_log(log).identical == 500 + 350 + 166
 
 
 def test_diverged_runs_are_identical_to_their_end() -> None:
@@ -76,7 +76,7 @@ def test_diverged_runs_are_identical_to_their_end() -> None:
     log = open_bytes(data)
     assert log["m1"].states[-1].tick < 999
     assert "diverged" in {log[name].states[-1].mode for name in log.sites}
-    verdict = verify(log)
+    verdict = verify_log(log)
     assert verdict.identical == verdict.records
 
 
@@ -211,7 +211,7 @@ def list_ranges(lost: set[int]) -> list[tuple[int, int]]:
     ],
 )
 def test_execution_resumes_behind_a_reported_gap(site: str, lost: set[int]) -> None:
-    verdict = verify(make_log_without({site: lost}))
+    verdict = verify_log(make_log_without({site: lost}))
     assert verdict.agreed, str(verdict.first)
     assert verdict.gaps == [(site, first, last) for first, last in list_ranges(lost)]
     assert verdict.records == 3 * TICKS - len(lost)
@@ -234,7 +234,7 @@ def test_gaps_are_never_a_false_alarm(
     site: str, holes: list[tuple[int, int]], whole_run: bool
 ) -> None:
     lost = {t for start, length in holes for t in range(start, start + length) if t < TICKS - 1}
-    verdict = verify(
+    verdict = verify_log(
         make_log_without({site: lost}, session={} if whole_run else OTHER_PLATFORM)
     )
     assert verdict.agreed, str(verdict.first)
@@ -247,7 +247,7 @@ def test_gaps_are_never_a_false_alarm(
 def test_scattered_samples_are_no_difference(
     delays: dict[Sample, int], never: frozenset[Sample]
 ) -> None:
-    verdict = verify(open_bytes(make_delivered_bytes(delays, never)))
+    verdict = verify_log(open_bytes(make_delivered_bytes(delays, never)))
     assert verdict.identical == verdict.records == 3 * TICKS
 
 
@@ -261,7 +261,7 @@ def test_gaps_with_lost_samples_are_no_difference(
 ) -> None:
     """On links that keep their order, as those of a session do."""
     data = make_delivered_bytes(first_in_first_out(delays), never)
-    verdict = verify(make_log_without(lost, data, {} if whole_run else OTHER_PLATFORM))
+    verdict = verify_log(make_log_without(lost, data, {} if whole_run else OTHER_PLATFORM))
     assert verdict.agreed, str(verdict.first)
     assert {gap[0] for gap in verdict.gaps} == set(lost)
 
@@ -270,7 +270,7 @@ def test_gaps_among_reordered_samples_are_no_difference() -> None:
     """Sample 45 comes at 53, after newer ones; record 50 is missing, and the first to be listed is 45."""
     delays = {("m2", peer, tick): way for peer in (0, 1) for tick, way in ((45, 8), (52, 5))}
     data = make_delivered_bytes(delays)
-    verdict = verify(open_bytes(edit_log_bytes(data, record=drop_records("m2", {50}))))
+    verdict = verify_log(open_bytes(edit_log_bytes(data, record=drop_records("m2", {50}))))
     assert verdict.agreed, str(verdict.first)
 
 
@@ -293,7 +293,7 @@ def test_a_record_that_stands_twice_is_found() -> None:
 @pytest.mark.parametrize("name", list_shipped())
 def test_other_platforms_execute_from_two_records(name: str) -> None:
     data = make_log_bytes(name, {"duration_s": 0.5})
-    verdict = verify(open_bytes(edit_log_bytes(data, session=OTHER_PLATFORM)))
+    verdict = verify_log(open_bytes(edit_log_bytes(data, session=OTHER_PLATFORM)))
     assert not verdict.whole_run
     assert verdict.agreed, str(verdict.first)
     assert verdict.identical == verdict.records
@@ -316,7 +316,7 @@ def test_on_another_platform_rounding_is_no_difference() -> None:
         r["tau"] = [v * (1 + 1e-13) for v in r["tau"]]
         return r
 
-    assert verify(
+    assert verify_log(
         open_bytes(
             edit_log_bytes(make_log_bytes("free"), record=record, session=OTHER_PLATFORM)
         )
@@ -328,7 +328,7 @@ def test_torn_logs_verify_while_whole(share: float) -> None:
     data = edit_log_bytes(make_log_bytes("paper"), chunk_bytes=2048)
     log = open_bytes(data[: int(share * len(data))])
     assert not log.complete
-    verdict = verify(log)
+    verdict = verify_log(log)
     assert verdict.agreed, str(verdict.first)
     assert 0 < verdict.identical + verdict.unjudged == verdict.records < 3 * TICKS
     assert verdict.unjudged <= 3

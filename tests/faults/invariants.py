@@ -10,7 +10,7 @@ import msgspec
 import numpy as np
 
 from trilat_net.errors import TrilatError
-from trilat_net.execution.verification import verify
+from trilat_net.execution.verification import verify_log
 from trilat_net.log.log_reader import open_log
 from trilat_net.net.messages import State
 from trilat_net.scenario import Scenario
@@ -242,7 +242,7 @@ def check_log(session: FaultSession) -> Iterator[str]:
         return  # its log ends where the disk does
     try:
         log = open_log(session.path)
-        verification = verify(log)
+        verification = verify_log(log)
     except TrilatError as error:
         yield f"the log cannot be read: {error}"
         return

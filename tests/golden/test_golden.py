@@ -15,7 +15,7 @@ import pytest
 
 from trilat_net.app.api import simulate
 from trilat_net.core.step.fingerprint import compute_fingerprint
-from trilat_net.execution.verification import TOLERANCE, verify
+from trilat_net.execution.verification import TOLERANCE, verify_log
 from trilat_net.execution.virtual_comparison import compare_with_virtual
 from trilat_net.log.log_reader import open_log
 
@@ -27,7 +27,7 @@ GOLDEN = sorted(Path(__file__).parent.glob("v*.mcap"))
 @pytest.mark.parametrize("path", GOLDEN, ids=lambda path: path.stem)
 def test_a_golden_log_is_executed_again(path: Path) -> None:
     log = open_log(path)
-    verdict = verify(log)
+    verdict = verify_log(log)
     assert log.complete
     assert verdict.passed, str(verdict.first)
     assert verdict.identical == verdict.records == 1200

@@ -13,7 +13,7 @@ import numpy as np
 from tests.cli.running import COMMAND, PLAIN
 from tests.faults.invariants import SILENT_TICKS, count_silence, split_stretches
 from tests.net.waiting import sleep_for_ns, until
-from trilat_net.execution.verification import verify
+from trilat_net.execution.verification import verify_log
 from trilat_net.execution.virtual_comparison import compare_with_virtual
 from trilat_net.log.log_layout import active_path
 from trilat_net.log.log_reader import Log, open_log
@@ -275,7 +275,7 @@ def allow_own_laws(log: Log) -> Log:
 
 def assert_executed_again(log: Log) -> None:
     """Asserts that every record follows from its inputs."""
-    verdict = verify(allow_own_laws(log))
+    verdict = verify_log(allow_own_laws(log))
     assert verdict.whole_run
     assert verdict.first is None
     assert verdict.identical == verdict.records == sum(len(log[name]) for name in log.sites)

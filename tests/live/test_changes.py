@@ -35,8 +35,8 @@ def test_python_and_commands_change_sessions_alike(stage: Stage) -> None:
         session.set_dominance("s", {"m1": 0.9, "m2": 0.2})
     with pytest.raises(RunFailed, match="reset is possible only in mode fault"):
         session.reset("s")
-    assert "s: stop at tick" in session.stop("s")[0]
-    assert "s: enable at tick" in session.enable("s")[0]
+    assert "s executes stop at tick" in session.stop("s")[0]
+    assert "s executes enable at tick" in session.enable("s")[0]
     assert {row["member"] for row in session.ping(count=5).to_rows()} >= set(PAPER)
     session.end()
     running.ends_well()

@@ -8,7 +8,7 @@ from mcap.reader import make_reader
 
 from tests.live.killing import kill_recorder
 from tests.live.processes import assert_executed_again
-from trilat_net.execution.verification import verify
+from trilat_net.execution.verification import verify_log
 from trilat_net.log.log_layout import active_path
 from trilat_net.log.log_reader import open_log
 from trilat_net.log.recovery import recover
@@ -68,7 +68,7 @@ def _full_disk(stage: Stage, disk: SmallDisk) -> None:
         assert list(make_reader(stream, validate_crcs=True).iter_messages())
     log = open_log(disk.seen(path))
     assert log.complete
-    assert verify(log).agreed
+    assert verify_log(log).agreed
     for name in SITES:
         states = log[name].states
         assert [state.tick for state in states] == list(range(len(states)))

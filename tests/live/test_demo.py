@@ -12,7 +12,7 @@ import trilat_net
 from tests.cli.running import trilat
 from tests.live.processes import is_gone, wait_for_records
 from tests.net.waiting import until
-from trilat_net.execution.verification import verify
+from trilat_net.execution.verification import verify_log
 from trilat_net.log.log_reader import open_log
 
 from .processes import Process, Stage
@@ -49,7 +49,7 @@ def test_a_killed_site_is_named_with_its_signal(stage: Stage) -> None:
     assert all(is_gone(pid) for pid in children)
     log = open_log(log_file)
     assert log.complete
-    verdict = verify(log)
+    verdict = verify_log(log)
     assert verdict.passed
     assert verdict.identical > 0
     assert [event.about for event in log.events if event.kind == "lost"] == ["s"]
@@ -71,7 +71,7 @@ def test_ctrl_c_ends_everything_and_finishes_file(stage: Stage) -> None:
     log = open_log(log_file)
     assert log.complete
     assert {event.member for event in log.events if event.kind == "end"} == {"m1", "m2", "s"}
-    assert verify(log).passed
+    assert verify_log(log).passed
     assert "session play; Ctrl-C ends it" in running.text()
     assert re.search(r"; torque \d+\.\d\d N m; age .*; late ", running.text())
     assert "run.mcap holds the records so far" in running.text()
@@ -107,7 +107,7 @@ def test_ctrl_c_while_drawing_keeps_the_log(stage: Stage) -> None:
     assert not children
     log = open_log(stage.folder / "out" / "run.mcap")
     assert log.complete
-    assert verify(log).identical == 1000
+    assert verify_log(log).identical == 1000
     words = next(line for line in running.text().splitlines() if "drawn later: " in line)
     assert f"the log is kept: {log.source}" in words
     later = shlex.split(words.partition("drawn later: trilat ")[2])

@@ -10,7 +10,7 @@ import pytest
 from tests.live.namespaces import can_reach, connect_as_star, connect_by_bridge, list_pairs
 from tests.live.processes import assert_executed_again, list_engagements_s, open_whole_log
 from tests.truth import Member, find_restarted, judge_link, list_members, offset_errors
-from trilat_net.execution.verification import verify
+from trilat_net.execution.verification import verify_log
 from trilat_net.execution.virtual_comparison import compare_with_virtual
 from trilat_net.log.log_reader import Log, open_log
 from trilat_net.net.clock import SystemClock
@@ -162,7 +162,7 @@ def test_machines_hold_during_cuts_and_return(stage: Stage, apart: Machines) -> 
         assert held > 4000
     assert max(max(holds) for holds in ticks_to_hold(log).values()) <= 21
     assert [log.missing(name) for name in PAPER] == [0, 0, 0]
-    result = verify(log)
+    result = verify_log(log)
     assert result.passed
     assert result.differing == 0
     assert [site for site, _, _ in result.absences] == ["m1"]

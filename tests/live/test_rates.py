@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from trilat_net.execution.verification import verify
+from trilat_net.execution.verification import verify_log
 from trilat_net.log.log_reader import Log, open_log
 from trilat_net.scenario import parse_scenario
 
@@ -44,7 +44,7 @@ def assert_accounted(log: Log) -> None:
         )
         assert made == log.scenario.ticks(name)
         assert len(log[name]) + log.missing(name) == made
-    verdict = verify(log)
+    verdict = verify_log(log)
     assert verdict.passed
     assert verdict.differing == 0
     assert verdict.identical > 0

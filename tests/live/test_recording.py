@@ -7,7 +7,7 @@ import pytest
 
 from tests.live.processes import assert_executed_again, open_whole_log
 from tests.net.waiting import sleep_for_ns, until
-from trilat_net.execution.verification import verify
+from trilat_net.execution.verification import verify_log
 from trilat_net.log.log_layout import active_path
 from trilat_net.log.log_reader import Log, open_log
 from trilat_net.net.clock import SystemClock
@@ -82,7 +82,7 @@ def test_a_killed_recorders_successor_has_all_records(stage: Stage) -> None:
     assert {"epoch", "start", "setup", "lost", "back", "end"} <= events
     torn = open_log(active_path(session.log))
     assert not torn.complete
-    assert verify(torn).agreed
+    assert verify_log(torn).agreed
 
 
 @pytest.mark.long

@@ -7,7 +7,7 @@ import pytest
 
 from tests.faults.invariants import SILENT_TICKS
 from tests.live.processes import list_engagements_s
-from trilat_net.execution.verification import verify
+from trilat_net.execution.verification import verify_log
 from trilat_net.log.log_reader import Log, open_log
 from trilat_net.log.session_check import check_file
 
@@ -57,7 +57,7 @@ def test_restarted_sites_follow_within_two_seconds(
         assert log.missing(site) == 0
         if site not in victims:
             assert log[site].tick.tolist() == list(range(len(log[site])))
-    result = verify(log)
+    result = verify_log(log)
     assert result.passed
     assert (result.differing, result.gaps) == (0, [])
     assert len(result.absences) == len(victims)
@@ -76,4 +76,4 @@ def test_leaving_sites_are_named_by_the_others(stage: Stage) -> None:
     assert "ended by SIGHUP; s did not rejoin the session" in session.processes["m"].text()
     log = open_log(session.log)
     assert len(log["m"]) == 6000
-    assert verify(log).passed
+    assert verify_log(log).passed

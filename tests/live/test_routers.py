@@ -115,7 +115,7 @@ def test_all_may_stop_but_only_operators_enable(stage: Stage) -> None:
         code, text = order("stop s", whose)
         trying, answer = text.splitlines()
         assert (code, trying) == (0, "stopping every arm of session t ..."), text
-        assert answer.startswith("s: stop at tick")
+        assert answer.startswith("s executes stop at tick")
         code, text = order("enable s", whose)
         assert code != 0
         assert f"these are the keys of {whose}; the keys of operator are needed" in text

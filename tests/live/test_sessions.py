@@ -12,7 +12,7 @@ from tests.live.processes import (
     open_whole_log,
 )
 from tests.net.waiting import sleep_for_ns
-from trilat_net.execution.verification import verify
+from trilat_net.execution.verification import verify_log
 from trilat_net.execution.virtual_comparison import find_absent_samples
 from trilat_net.log.log_reader import open_log
 from trilat_net.net.clock import SystemClock
@@ -110,8 +110,8 @@ def test_interrupted_recorders_finish_files_and_sites_continue(stage: Stage) -> 
     log = open_log(session.log)
     assert log.complete
     assert 0 < len(log["m"]) < 2000
-    assert verify(log).agreed
-    assert not verify(log).passed  # the rest of the run is not in it
+    assert verify_log(log).agreed
+    assert not verify_log(log).passed  # the rest of the run is not in it
     assert session.codes() == {"recorder": 130, "m": 0, "s": 0}
     assert "m: 2000 ticks" in session.processes["m"].text()
 

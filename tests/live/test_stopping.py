@@ -89,7 +89,7 @@ def test_every_arm_stops_from_everywhere_and_returns(scenario: str, stage: Stage
         session = page.hello["session"]
         stop = run_command(stage, "stop", "--session", session).text()
         assert stop.startswith(f"stopping every arm of session {session} ...\n")
-        assert len(re.findall(r"^\w+: stop at tick \d+$", stop, re.MULTILINE)) == len(
+        assert len(re.findall(r"^\w+ executes stop at tick \d+$", stop, re.MULTILINE)) == len(
             page.frame["sites"]
         )
         enable_sites(stage, page)

@@ -13,7 +13,7 @@ from mcap.writer import CompressionType, Writer
 from tests.log.builders import make_log_bytes
 from tests.log.split_logs import Message, read_messages
 from trilat_net.errors import LogError, NothingSaved
-from trilat_net.execution.verification import verify
+from trilat_net.execution.verification import verify_log
 from trilat_net.log.log_reader import open_log
 from trilat_net.log.recovery import recover
 from trilat_net.log.torn_chunk import PAGE_BYTES
@@ -183,7 +183,7 @@ def _judge_recovery(
         return "its session or scenario is lost"
     if not verified:
         return "opens"
-    verdict = verify(log)
+    verdict = verify_log(log)
     if verdict.first is not None:
         tally.false.append(case)
     is_stated = bool(result.lost or result.missing)

@@ -16,7 +16,7 @@ from tests.log.builders import edit_log_bytes
 from trilat_net.analysis.file_overview import info
 from trilat_net.app.play.session_reader import PlaySelection, preload_messages
 from trilat_net.errors import TrilatError
-from trilat_net.execution.verification import verify
+from trilat_net.execution.verification import verify_log
 from trilat_net.log.log_reader import open_log
 from trilat_net.log.mcap_records import RecordScanner, iterate_records, unpack_chunk
 from trilat_net.log.recovery import recover
@@ -331,7 +331,7 @@ def _read_arrays(path: Path) -> None:
 
 
 def _verify(path: Path) -> None:
-    verify(open_log(path))
+    verify_log(open_log(path))
 
 
 def _recover(path: Path) -> None:

@@ -21,7 +21,7 @@ from tests.log.bad_pages import (
 from tests.log.builders import make_log_bytes, write_log
 from tests.log.split_logs import read_messages
 from trilat_net.errors import LogError, NothingSaved
-from trilat_net.execution.verification import verify
+from trilat_net.execution.verification import verify_log
 from trilat_net.log.log_layout import SCENARIO, SESSION
 from trilat_net.log.log_reader import open_log
 from trilat_net.log.mcap_records import RecordScanner
@@ -84,7 +84,7 @@ def test_torn_chunks_with_zeroed_pages_add_nothing(tmp_path: Path) -> None:
         assert not Counter(read_messages(saved)) - truth
         salvaged += result.salvaged
         if offset:
-            assert verify(open_log(tmp_path / "zz.mcap")).agreed
+            assert verify_log(open_log(tmp_path / "zz.mcap")).agreed
     assert salvaged > 1000
 
 
@@ -128,7 +128,7 @@ def test_a_damaged_definition_leaves_the_log_intact(tmp_path: Path) -> None:
     data[PAGE_BYTES : 2 * PAGE_BYTES] = bytes(PAGE_BYTES)
     result, _ = recover_bytes(bytes(data), tmp_path)
     assert result.chain is DigestState.OPEN
-    assert verify(open_log(tmp_path / "zz.mcap")).passed
+    assert verify_log(open_log(tmp_path / "zz.mcap")).passed
 
 
 def test_a_session_of_another_log_is_not_believed(tmp_path: Path) -> None:
@@ -170,7 +170,7 @@ def test_chunks_of_other_virtual_runs_are_refused(tmp_path: Path) -> None:
         "a chunk belongs to another run"
     ]
     assert not Counter(read_messages(saved)) - Counter(read_messages(data))
-    assert verify(open_log(tmp_path / "zz.mcap")).agreed
+    assert verify_log(open_log(tmp_path / "zz.mcap")).agreed
     result, _ = recover_bytes(
         data[:begin] + data[begin:end] + data[last_begin:last_end], tmp_path
     )
@@ -240,7 +240,7 @@ def test_lost_scenarios_are_taken_from_beside_logs(tmp_path: Path) -> None:
     assert b"scenario.toml.damaged" in saved
     (tmp_path / SCENARIO).write_bytes(open_log(io.BytesIO(data)).scenario_text.encode())
     recover_bytes(without_scenario(data), tmp_path)
-    assert verify(open_log(tmp_path / "zz.mcap")).agreed
+    assert verify_log(open_log(tmp_path / "zz.mcap")).agreed
     (tmp_path / SCENARIO).write_text("another = 1")
     recover_bytes(without_scenario(data), tmp_path)
     with pytest.raises(LogError):

@@ -210,7 +210,7 @@ def test_joint_states_of_others_are_read(
         velocity=np.array(speeds),
         effort=np.zeros(0),
     )
-    joint_state = cdr.read_joint_state(serialize_cdr(cdr.JOINT_STATE, message))
+    joint_state = cdr.RosJoints.read(serialize_cdr(cdr.JOINT_STATE, message))
     assert joint_state == (stamp_ns, names, tuple(range(len(names))), tuple(speeds), ())
 
 
@@ -252,6 +252,6 @@ def test_responses_of_triggers_are_boolean_and_text(success: bool, text: str) ->
 
 @given(st.binary(max_size=200) | st.binary(max_size=200).map(lambda rest: b"\0\1\0\0" + rest))
 def test_an_invalid_message_is_a_value_error(data: bytes) -> None:
-    for read in (cdr.read_joint_state, lambda data: cdr.read_frame_vectors(data, 7)):
+    for read in (cdr.RosJoints.read, lambda data: cdr.read_frame_vectors(data, 7)):
         with suppress(ValueError):
             read(data)

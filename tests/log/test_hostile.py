@@ -24,7 +24,7 @@ from tests.log.builders import edit_log_bytes, make_log_bytes, open_bytes, write
 from tests.log.hostility import CHANGES, make_chunk, mangle_log, read_by_all
 from trilat_net.analysis.file_overview import info
 from trilat_net.errors import LogError, ScenarioError
-from trilat_net.execution.verification import verify
+from trilat_net.execution.verification import verify_log
 from trilat_net.log.mcap_records import RecordScanner, iterate_records, unpack_chunk
 from trilat_net.scenario import load_scenario, parse_embedded
 
@@ -167,7 +167,7 @@ def test_claims_of_endless_ticks_are_refused() -> None:
         msgspec.structs.replace(e, ticks=1 << 60) if e.kind == "end" else e for e in log.events
     ]
     log.events = endless
-    assert verify(log).gaps == [(site, 31, 39) for site in log.sites]
+    assert verify_log(log).gaps == [(site, 31, 39) for site in log.sites]
     assert [log.missing(site) for site in log.sites] == [9] * 3
 
 

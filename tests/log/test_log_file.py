@@ -350,7 +350,7 @@ def test_largest_files_are_cut_and_recovered(tmp_path: Path) -> None:
         [sys.executable, "-c", LIMITED, path], capture_output=True, text=True, timeout=60
     )
     assert done.returncode == 5, done
-    assert f"{active_path(path)}: the file system takes no longer file" in done.stdout
+    assert f"{active_path(path)}: the file system does not accept a longer file" in done.stdout
     assert "split_size" in done.stdout
     assert recover(active_path(path)).lossless
     assert [message[1] for message in read_messages(path)] == list(

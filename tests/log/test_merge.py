@@ -18,7 +18,7 @@ from tests.log.split_logs import (
     read_messages,
 )
 from trilat_net.errors import LogError
-from trilat_net.execution.verification import verify
+from trilat_net.execution.verification import verify_log
 from trilat_net.log.log_reader import Log, open_log
 from trilat_net.log.log_writer import LogWriter
 from trilat_net.log.provenance import collect_provenance
@@ -77,7 +77,7 @@ def test_parts_in_any_order_read_as_the_whole(dealing, chance) -> None:
 
 def test_a_log_of_parts_verifies_as_the_whole() -> None:
     parts = make_parts(make_whole_bytes(), [range(200), range(150, count_records())])
-    verdict = verify(open_parts(*parts))
+    verdict = verify_log(open_parts(*parts))
     assert (verdict.identical, verdict.first) == (360, None)
     assert verdict.gaps == []
 
@@ -128,7 +128,7 @@ def test_other_sessions_are_refused_with_differences(
         make_bytes_of_messages(make_whole_bytes(), [], session=session, scenario=scenario)
     )
     with pytest.raises(
-        LogError, match=rf"two\.mcap: is not a part of the session in .*one\.mcap: {named}"
+        LogError, match=rf"two\.mcap is not a part of the session in .*one\.mcap: {named}"
     ):
         open_log(first, two)
 

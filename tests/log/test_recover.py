@@ -28,7 +28,7 @@ from tests.log.builders import (
 from tests.log.hostility import make_chunk as packed_chunk
 from tests.log.split_logs import Message, make_foreign_bytes, read_messages
 from trilat_net.errors import LogError, NothingSaved, UsageError
-from trilat_net.execution.verification import verify
+from trilat_net.execution.verification import verify_log
 from trilat_net.log.log_layout import active_path
 from trilat_net.log.log_reader import open_log
 from trilat_net.log.log_writer import LogWriter
@@ -140,7 +140,7 @@ def test_cut_files_keep_every_whole_chunk(
     if len(recovered):
         again = open_log(tmp_path / "run.mcap")
         assert again.complete
-        verdict = verify(again)
+        verdict = verify_log(again)
         assert verdict.agreed
         assert verdict.records == sum(len(again[name]) for name in again.sites)
 
@@ -450,4 +450,4 @@ def test_exit_codes_give_the_outcome(
 def test_an_unfinished_log_is_named_where_it_is(command: list[str], tmp_path: Path) -> None:
     write_log(tmp_path, make_chunked_bytes()[:-60], "run.mcap.active")
     done = trilat(*command, "run.mcap", cwd=tmp_path)
-    done.refuses("run.mcap: cannot be read", "trilat log recover run.mcap.active")
+    done.refuses("run.mcap cannot be read", "trilat log recover run.mcap.active")

@@ -18,7 +18,7 @@ from tests.log.builders import drop_records, edit_log_bytes, make_log_bytes, wri
 from tests.log.hostility import make_chunk
 from tests.log.split_logs import make_foreign_bytes, write_late_parts
 from trilat_net.errors import LogError
-from trilat_net.execution.verification import verify
+from trilat_net.execution.verification import verify_log
 from trilat_net.log.log_reader import open_log
 from trilat_net.log.mcap_records import (
     MAGIC,
@@ -233,7 +233,7 @@ def test_parts_with_late_records_are_whole(tmp_path: Path) -> None:
     result = check_file(*parts)
     assert result.passed, result.findings
     assert "20 came late" in next(f.text for f in result.findings if f.check == "sequence")
-    verdict = verify(open_log(*parts))
+    verdict = verify_log(open_log(*parts))
     assert (verdict.records, verdict.identical, verdict.gaps) == (360, 360, [])
 
 
@@ -243,7 +243,7 @@ def test_parts_are_judged_from_their_beginning(tmp_path: Path) -> None:
     assert check_file(*parts[1:2]).passed
     first_and_last = check_file(parts[0], parts[2])
     assert list_failed_checks(first_and_last) == {"sequence", "accounts"}
-    assert verify(open_log(parts[0], parts[2])).gaps
+    assert verify_log(open_log(parts[0], parts[2])).gaps
 
 
 def test_recovered_files_lack_only_lost_records(tmp_path: Path) -> None:
@@ -254,7 +254,7 @@ def test_recovered_files_lack_only_lost_records(tmp_path: Path) -> None:
     result = check_file(recovered)
     assert list_failed_checks(result) & BUILT == set(), result.findings
     assert "accounts" not in list_failed_checks(result), result.findings
-    verdict = verify(open_log(recovered))
+    verdict = verify_log(open_log(recovered))
     assert verdict.agreed
     assert verdict.records == sum(len(open_log(torn)[site]) for site in ("m1", "m2", "s"))
 

@@ -510,7 +510,11 @@ def test_added_members_meet_the_others(tmp_path: Path) -> None:
     ends = read_member_keys(folder / "m2").ends
     done = trilat("keys", "add", "keys", "s", "--host", "192.0.2.9", cwd=tmp_path)
     assert done.code == 0, done
-    for path in ("keys/s: for s", "keys/m1/members.json: for m1", "keys/m2/members.json"):
+    for path in (
+        "keys/s: keys for s",
+        "m1/members.json: list of members for m1",
+        "keys/m2/members.json",
+    ):
         assert path in done.out
 
     after = read_files(folder)
@@ -561,10 +565,10 @@ def test_impossible_members_change_nothing(
             add_keys(folder, ["s2"])
     assert read_files(folder) == before
 
-    with pytest.raises(UsageError, match="there is no such folder of keys"):
+    with pytest.raises(UsageError, match="is not a folder of keys"):
         add_keys(tmp_path / "nothing", ["s2"])
     shutil.move(folder / "s", tmp_path / "elsewhere")
-    with pytest.raises(UsageError, match="no folder of the member s, whose list"):
+    with pytest.raises(UsageError, match="has no folder for s, but the list of members"):
         add_keys(folder, ["s2"])
     shutil.move(tmp_path / "elsewhere", folder / "s")
     shutil.rmtree(folder / "authority")

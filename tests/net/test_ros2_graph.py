@@ -29,7 +29,6 @@ from trilat_net.net.ros2.ros2_graph import (
     describe_mismatch,
     find_type_hash,
     make_gid,
-    parse_attachment,
     topic_key,
 )
 from trilat_net.net.ros2.ros2_names import check_ros_name
@@ -154,12 +153,12 @@ def test_attachments_have_33_bytes_and_return(
     attachment = Attachment(number, sent_unix_ns, gid)
     assert len(attachment.encode()) == 33
     assert attachment.encode()[16] == 0x10
-    assert parse_attachment(attachment.encode()) == attachment
+    assert Attachment.decode(attachment.encode()) == attachment
 
 
 @given(st.binary(max_size=70))
 def test_an_invalid_attachment_is_none(data: bytes) -> None:
-    attachment = parse_attachment(data)
+    attachment = Attachment.decode(data)
     assert attachment is None or attachment.encode() == data
 
 
@@ -321,7 +320,7 @@ def test_requests_without_attachment_get_no_answer(wire: Wire) -> None:
 
     until(lambda: ask(attachment=SENT.encode()))
     (answer,) = ask(attachment=SENT.encode())
-    attachment = parse_attachment(answer.attachment.to_bytes())
+    attachment = Attachment.decode(answer.attachment.to_bytes())
     assert attachment is not None
     assert (answer.payload.to_bytes(), attachment.number, attachment.gid) == (
         b"done",

@@ -19,7 +19,7 @@ from tests.analysis.builders import (
 )
 from tests.log.builders import add_clock_readings, rewrite_log
 from trilat_net.analysis import site_signals
-from trilat_net.analysis.certificate.stability_certificate import certify
+from trilat_net.analysis.certificate.stability_certificate import certify_log
 from trilat_net.analysis.file_overview import summarise_run
 from trilat_net.log.findings import Finding
 from trilat_net.presentation.figures.registry import (
@@ -72,7 +72,7 @@ def test_a_report_has_numbers_and_pictures(tmp_path):
     """With a certificate: of a run in which V rose."""
     log = make_run("free", {**JITTER, "rate_hz": 100}).log
     paths = write_report(
-        log, tmp_path / "new", twin=log, certificate=certify(log), verdicts=VERDICTS
+        log, tmp_path / "new", twin=log, certificate=certify_log(log), verdicts=VERDICTS
     )
     assert [path.name for path in paths] == ["report.html", "summary.json"]
     assert sorted(paths) == sorted((tmp_path / "new").iterdir())
@@ -198,7 +198,9 @@ def test_nearly_empty_logs_have_reports(sites, tmp_path):
         some, lambda r: r.tick < 1 and r.site in sites, finished=False, driver="live"
     )
     twin = make_log_without_hands("paper")
-    paths = write_report(log, tmp_path, certificate=certify(log), twin=twin, verdicts=VERDICTS)
+    paths = write_report(
+        log, tmp_path, certificate=certify_log(log), twin=twin, verdicts=VERDICTS
+    )
     assert [path.name for path in paths] == ["report.html", "summary.json"]
     pictures = write_report_figures(log, tmp_path, twin)
     assert {"positions.png", "arms.png"} <= {path.name for path in pictures}

@@ -18,7 +18,7 @@ from tests.log.builders import (
     write_log,
 )
 from trilat_net.analysis.certificate.certificate_result import Certificate
-from trilat_net.analysis.certificate.stability_certificate import certify
+from trilat_net.analysis.certificate.stability_certificate import certify_log
 from trilat_net.analysis.decision_facts import LoopRoots
 from trilat_net.analysis.file_overview import summarise_run
 from trilat_net.analysis.judge import certify_run
@@ -78,7 +78,7 @@ def test_stable_run_names_its_proof() -> None:
 
 def test_lasting_errors_are_explained() -> None:
     certificate = make_certificate(EndBehaviour.CONVERGED, 2 * SETTLED_ERROR_RAD)
-    assert certificate.headline().startswith("stable: at rest, with errors that stay; ")
+    assert certificate.headline().startswith("stable: at rest, with remaining errors; ")
     html = verdict_text(certificate)
     speed_rad_s = certificate.end.end_speed_rad_s
     assert f"no joint was faster than {speed_rad_s:.2g} rad/s, and errors stay" in html
@@ -175,7 +175,7 @@ def test_key_numbers_have_place_and_time() -> None:
 def test_all_texts_have_the_same_last_error(name: str) -> None:
     """The page, the table of `report` and `certify` name one number and its joint."""
     log = make_short_log(name)
-    certificate = certify(log)
+    certificate = certify_log(log)
     error = find_last_error(log)
     assert error is not None
     facts = summarise_run(log)

@@ -30,7 +30,7 @@ def test_active_ports_have_frequency_and_amount() -> None:
     (span,) = section.velocity.minima.below
     assert f"not passive at 0.001-{span.to_hz:.3g} Hz" in text
     assert f"least eigenvalue {section.velocity.minima.least:.3g} at" in text
-    assert "no damping at the joints would make it so" in text
+    assert "no damping at the joints would make it passive" in text
     assert "the proof's premise: passive; sites weighted 1, 1" in text
     assert "some make it unstable at" in text
 

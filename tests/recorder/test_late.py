@@ -10,7 +10,7 @@ from tests.sites.relay import RelayClock
 from tests.sites.sessions import SESSION as REAL
 from tests.sites.sessions import Session, execute_packed, pack_log
 from trilat_net.app.recorded_session import make_scenario_reader
-from trilat_net.execution.verification import verify
+from trilat_net.execution.verification import verify_log
 from trilat_net.log.log_reader import open_log
 from trilat_net.log.log_writer import LogStorage
 from trilat_net.log.provenance import collect_provenance
@@ -130,7 +130,7 @@ def test_recorders_take_over_from_ended_ones(tmp_path: Path, ahead_ns: int) -> N
     assert session.relay.results["second"] is None
     log = open_log(later)
     assert pack_log(log) == execute_packed(scenario)
-    assert verify(log).whole_run
+    assert verify_log(log).whole_run
     (late_event,) = [event for event in log.events if event.kind == "late"]
     assert 0 < late_event.t_ns < 3 * S
     assert any("joins the session" in sentence for sentence in session.said)

@@ -18,7 +18,7 @@ from tests.sites.relay import Relay, RelayClock
 from trilat_net.app.recorded_session import make_scenario_reader
 from trilat_net.core.step.site_step import Site
 from trilat_net.core.step.ticks import TickInput
-from trilat_net.execution.verification import verify
+from trilat_net.execution.verification import verify_log
 from trilat_net.log.log_reader import open_log
 from trilat_net.log.log_writer import LogStorage
 from trilat_net.log.provenance import collect_provenance
@@ -103,7 +103,7 @@ def test_foreign_messages_are_dropped_and_others_kept(
     assert desk.recording.describe_problem() is None
     written = [message for topic, message in desk.messages() if topic == "m/state"]
     log = open_log(io.BytesIO(desk.stream.getvalue()))
-    assert verify(log).identical == 2 * TICKS
+    assert verify_log(log).identical == 2 * TICKS
     assert (log.complete, log.driver, log.session["session"]) == (True, "live", SESSION)
     assert log.accounts[f"dropped: {reason}"] == "1"
     assert [message.data for message in written] == encode_states("m")
@@ -241,7 +241,7 @@ def test_floods_of_events_leave_usable_logs() -> None:
     written = EVENT_BYTES // 60_000
     assert desk.recording.dropped["flood of events"] >= 299 - written
     log = desk.log()
-    assert verify(log).identical == 2 * TICKS
+    assert verify_log(log).identical == 2 * TICKS
     assert len([event for event in log.events if event.member == "m"]) <= written + 2
     assert {event.member for event in log.events if event.kind == "end"} == {"m", "s"}
     assert "missing" in (desk.recording.describe_problem() or "")
@@ -333,7 +333,7 @@ def test_a_crash_keeps_flushed_data() -> None:
     assert not log.complete
     assert log.accounts == {}
     assert [state.tick for state in log["m"].states][:30] == list(range(30))
-    assert verify(log).agreed
+    assert verify_log(log).agreed
 
 
 def test_waiting_messages_are_written_at_the_end() -> None:
@@ -396,7 +396,7 @@ def test_stopped_recorders_finish_their_file(tmp_path: Path) -> None:
     log = open_log(tmp_path / "run.mcap")
     assert log.complete
     assert 30 <= len(log["m"]) < TICKS
-    assert verify(log).agreed
+    assert verify_log(log).agreed
 
 
 def test_lagging_recorders_catch_up(tmp_path: Path) -> None:

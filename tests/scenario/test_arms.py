@@ -15,7 +15,7 @@ from tests.scenario.builders import SIX_JOINTS, make_six_joint_scenario
 from trilat_net.analysis.arm_rows import joint_positions_m
 from trilat_net.core.step.site_setup import MotionLimits
 from trilat_net.errors import ScenarioError
-from trilat_net.execution.verification import verify
+from trilat_net.execution.verification import verify_log
 from trilat_net.scenario import load_scenario, parse_embedded
 from trilat_net.scenario.describe import list_arm_notes
 from trilat_net.scenario.named_files import SHIPPED_FOLDER
@@ -187,7 +187,7 @@ def test_an_arm_beyond_its_stop_moves_inside() -> None:
     assert np.abs(np.diff(q[:3])).max() < 1e-4  # a stop of 1000 N m/rad would throw it by 1e-3
     assert q.max() <= 2.1 + 1e-6
     assert q[-1] < 2.0
-    assert verify(log).passed
+    assert verify_log(log).passed
 
 
 def test_position_limits_yield_to_nearby_starts() -> None:

@@ -170,7 +170,11 @@ RAMP = [{"at_s": 1.0, "dominance": "s", "to": {"m1": 0.1, "m2": 0.9}, "ramp_s": 
     [
         ({"law": "p_d"}, {}, []),
         ({"law": "tdpa"}, {}, []),
-        ({"law": "tdpa", "K": 0.0, "B": 0.0}, {}, ["m1, m2, s: K = 0 and B = 0 follow nobody"]),
+        (
+            {"law": "tdpa", "K": 0.0, "B": 0.0},
+            {},
+            ["m1, m2, s: with K = 0 and B = 0, an arm does not follow others"],
+        ),
         ({"law": "wave"}, {}, []),
         ({"law": "wave", "lines": {}}, {}, ["m1, m2: lines share as b_ij / sum b_ik"]),
         ({"law": "wave", "lines": {"m1-m2": 5.0, "m1-s": 15.0, "m2-s": 15.0}}, {}, []),
@@ -178,7 +182,7 @@ RAMP = [{"at_s": 1.0, "dominance": "s", "to": {"m1": 0.1, "m2": 0.9}, "ramp_s": 
             {"law": "wave"},
             {"dominance": ONE_WAY},
             [
-                "m1, m2, s: lines share as b_ij / sum b_ik, as the shares of sites are not reversible"
+                "m1, m2, s: lines share as b_ij / sum b_ik, because the shares of the sites are not reversible"
             ],
         ),
         (

@@ -6,7 +6,7 @@ import pytest
 
 from tests.sites.sessions import execute_packed, pack_log
 from tests.truth import judge_link, list_members, offset_errors
-from trilat_net.execution.verification import verify
+from trilat_net.execution.verification import verify_log
 from trilat_net.execution.virtual_comparison import compare_with_virtual
 from trilat_net.log.log_reader import Log
 from trilat_net.scenario import load_scenario
@@ -42,7 +42,7 @@ def test_clocks_that_differ_and_drift_change_no_bit(skewed: tuple[Session, Log])
     session, log = skewed
     assert log.complete
     assert pack_log(log) == execute_packed(session.scenario)
-    assert verify(log).passed
+    assert verify_log(log).passed
     assert not compare_with_virtual(log).late
 
 

@@ -82,7 +82,7 @@ def list_states(findings: Iterator[doctor.DoctorFinding]) -> list[str]:
 def test_valid_keys_pass(folder: Path) -> None:
     (finding,) = examine_keys(folder / "m1")
     assert finding.state == "ok"
-    assert "m1 of m1, s, recorder, until" in finding.text
+    assert "keys of m1 for m1, s, recorder, valid until" in finding.text
     assert list_states(examine_keys(None)) == ["ok"]
 
 
@@ -240,10 +240,10 @@ def test_rates_hold_if_ticks_begin_in_time(late_ns: int, stride: int, held: list
         (
             [(1000, 90, 4000)],
             "ok",
-            "holds 1000 Hz: 99% of the ticks began within 0.09 ms of their time",
+            "achieves 1000 Hz: 99% of the ticks began within 0.09 ms of their time",
         ),
-        ([(1000, 700, 900), (500, 700, 900)], "warn", "holds 500 Hz"),
-        ([(100, 9000, 12000)], "fail", "holds not even 100 Hz"),
+        ([(1000, 700, 900), (500, 700, 900)], "warn", "achieves 500 Hz"),
+        ([(100, 9000, 12000)], "fail", "does not even achieve 100 Hz"),
     ],
 )
 def test_rates_are_reported_with_their_lateness(
@@ -258,7 +258,7 @@ def test_rates_are_reported_with_their_lateness(
 
 @pytest.mark.push
 def test_real_loops_are_measured_in_own_processes() -> None:
-    assert doctor.examine_rate().text.startswith("a site alone ")
+    assert doctor.examine_rate().text.startswith("a single site ")
 
 
 @pytest.mark.parametrize(

@@ -33,7 +33,7 @@ from trilat_net.analysis.link_summary import summarise_links
 from trilat_net.core.step.site_step import Site
 from trilat_net.core.step.ticks import LifeReason, Mode, TickInput
 from trilat_net.errors import ScenarioError, SessionError
-from trilat_net.execution.verification import verify
+from trilat_net.execution.verification import verify_log
 from trilat_net.execution.virtual_comparison import compare_with_virtual
 from trilat_net.log.log_reader import Log
 from trilat_net.net import topics
@@ -149,7 +149,7 @@ def test_external_measurements_are_the_record_and_drive(tmp_path: Path) -> None:
 def assert_reproduced(log: Log) -> None:
     """Asserts that the log is executed again, and equals virtual time fed with the log, bit for bit."""
     assert log.complete
-    verdict = verify(log)
+    verdict = verify_log(log)
     assert verdict.whole_run
     assert verdict.identical == verdict.records == sum(len(log[name]) for name in log.sites)
     assert compare_with_virtual(log).fed.identical == verdict.records
@@ -285,7 +285,7 @@ def test_skipped_ticks_count_as_missing_nowhere(tmp_path: Path) -> None:
     assert isinstance(summary, list)
     (of_recorder,) = [line for line in summary if line.startswith("recorder: s:")]
     assert f", {skipped} skipped" in of_recorder
-    assert "not made" not in of_recorder
+    assert "not executed" not in of_recorder
     phrase = "of them late by a period or more"
     assert any(f"{phrase}, {skipped} of them skipped" in line for line in session.said)
     assert any(
@@ -297,7 +297,7 @@ def test_skipped_ticks_count_as_missing_nowhere(tmp_path: Path) -> None:
 
     late = rewrite_log(log, change=delay)
     page = render_loops(late, summarise_run(late))
-    assert "; 4 ticks began a period or more late and were made all the same; " in page
+    assert "; 4 ticks began a period or more late and were executed nevertheless; " in page
     assert f"{skipped} ticks were skipped." in page
 
 
@@ -474,7 +474,7 @@ def test_killed_sites_return_with_their_arm(tmp_path: Path) -> None:
     assert set(log["m"].mode[gone[0] + 72 : first]) == {"hold"}
     assert np.abs(np.diff(part.tau[again], axis=0)).max() <= 2.0 * (1.0 + 1e-9)  # 2000 N m/s
     assert log.complete
-    result = verify(log)
+    result = verify_log(log)
     assert (result.differing, result.unjudged, result.gaps) == (0, 0, [])
     assert result.absences == [("s", *gone)]
 

@@ -16,7 +16,7 @@ from tests.net.waiting import sleep_for_ns
 from trilat_net.app.running_session import open_hand
 from trilat_net.core.life.live_hand import ANOTHER_HOLDS, HandInForce, empty_hand_vector
 from trilat_net.errors import UsageError
-from trilat_net.execution.verification import verify
+from trilat_net.execution.verification import verify_log
 from trilat_net.execution.virtual_comparison import compare_with_virtual
 from trilat_net.log.log_reader import Log
 from trilat_net.net import topics
@@ -87,7 +87,7 @@ def test_a_session_with_people_is_verified_and_repeated(
     session: tuple[Log, Felt],
 ) -> None:
     log, _ = session
-    verification = verify(log)
+    verification = verify_log(log)
     assert verification.passed
     assert verification.identical == verification.records == 3 * 1500
     assert compare_with_virtual(log).fed.identical == verification.records

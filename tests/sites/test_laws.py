@@ -10,7 +10,7 @@ from tests.control_laws.law_settings import LAWS
 from tests.energy_runs import FOLLOWER
 from tests.sites.sessions import execute_packed, pack_log
 from trilat_net.errors import LawFailed
-from trilat_net.execution.verification import verify
+from trilat_net.execution.verification import verify_log
 from trilat_net.execution.virtual_comparison import compare_with_virtual
 from trilat_net.log.log_reader import Log
 from trilat_net.scenario import load_scenario
@@ -30,7 +30,7 @@ def test_own_paper_law_has_live_bits(tmp_path: Path) -> None:
     assert ends == {"m": 0, "s": 0}
     assert pack_log(log) == execute_packed(log.scenario)
     assert pack_log(log) == execute_packed(load_scenario("two_sites", {"duration_s": 0.5}))
-    verdict = verify(log)
+    verdict = verify_log(log)
     assert verdict.whole_run
     assert verdict.identical == verdict.records == 1000
 
@@ -40,7 +40,7 @@ def test_law_messages_equal_those_of_virtual_time(tmp_path: Path) -> None:
         tmp_path, "paper", control={"law": "tests.channel_law:Talking"}, duration_s=0.3
     )
     assert pack_log(log) == execute_packed(log.scenario)
-    assert verify(log).identical == 900
+    assert verify_log(log).identical == 900
     assert log["m1"].sent["target[s]"].any()
 
 
@@ -60,7 +60,7 @@ def test_every_plugged_law_has_live_bits(law: str, tmp_path: Path) -> None:
     keys = {"link.delay_ms": 20.0, "control.law": law, **digital, **settings}
     log, _ = lived(tmp_path, name, duration_s=0.3, **keys)
     assert pack_log(log) == execute_packed(log.scenario)
-    assert verify(log).identical == 300 * len(log.sites)
+    assert verify_log(log).identical == 300 * len(log.sites)
 
 
 @pytest.mark.parametrize("how", ["nan", "raises"])
@@ -78,7 +78,7 @@ def test_failing_laws_end_the_session_in_order(how: str, tmp_path: Path) -> None
     assert ticks_made["m2"] == len(log["m2"]) == 250
     for other in ("m1", "s"):
         assert 250 < ticks_made[other] == len(log[other]) < 500
-    assert verify(log).passed
+    assert verify_log(log).passed
     twins = compare_with_virtual(log)
     assert twins.fed.first is None
     assert twins.fed.identical == sum(ticks_made.values())

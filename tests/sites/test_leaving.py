@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 
 from tests.sites.sessions import make_gliding_scenario
-from trilat_net.analysis.certificate.stability_certificate import certify
+from trilat_net.analysis.certificate.stability_certificate import certify_log
 from trilat_net.analysis.certificate.verdict_facts import StabilityFinding
 from trilat_net.analysis.link_summary import summarise_links
 from trilat_net.errors import PeerLeft, SessionError
 from trilat_net.execution.log_checks import LogCheckReport
-from trilat_net.execution.verification import verify
+from trilat_net.execution.verification import verify_log
 from trilat_net.log.log_reader import Log, open_log
 from trilat_net.log.log_writer import LogStorage
 from trilat_net.log.session_check import check_file
@@ -47,7 +47,7 @@ def test_killed_sites_return_and_logs_are_whole(tmp_path: Path) -> None:
         assert measure_engagement_s(log, site, first) < 2.0
         assert log.missing(site) == 0
         assert log[site].mode[-1] == "run"
-    result = verify(log)
+    result = verify_log(log)
     assert (result.differing, result.unjudged, result.gaps) == (0, 0, [])
     assert result.passed
     assert result.absences == [("m", *log.absences["m"][0])]
@@ -77,7 +77,7 @@ def test_ended_sites_are_named_to_the_others(tmp_path: Path) -> None:
     assert kinds_about(log, "m", "s") == ["left"]
     assert len(log["m"]) == 800
     assert log["m"].mode[-1] == "hold"
-    assert verify(log).passed
+    assert verify_log(log).passed
     assert log.expected_ticks("s") == end.ticks
 
 
@@ -107,7 +107,7 @@ def test_a_departed_site_may_return_and_leave_again(tmp_path: Path) -> None:
     assert len(log.starts["s"]) == len(log.absences["s"]) == 2
     (early,) = (event for event in log.events if event.kind == "end" and event.about == "s")
     assert log.absences["s"][0][0] == early.ticks
-    result = verify(log)
+    result = verify_log(log)
     assert (result.differing, result.unjudged, result.gaps) == (0, 0, [])
     assert "missing 0" in log.account("s")
     check = check_file(session.path)
@@ -132,7 +132,7 @@ def test_late_sites_may_join_a_flexible_start(tmp_path: Path) -> None:
     assert log.absences[late] == [(0, first - 1)]
     assert set(log["m1"].mode[:first]) == {"waiting"}
     assert {str(log[name].mode[-1]) for name in log.sites} == {"run"}
-    assert verify(log).passed
+    assert verify_log(log).passed
     assert check_file(session.path).passed
 
 
@@ -148,7 +148,7 @@ def test_sites_on_other_clocks_find_the_grid(dies: str, tmp_path: Path) -> None:
     log = session.run()
     assert session.ends == dict.fromkeys(log.sites, 0)
     assert {str(log[name].mode[-1]) for name in log.sites} == {"run"}
-    result = verify(log)
+    result = verify_log(log)
     assert (result.differing, result.unjudged, result.gaps) == (0, 0, [])
     for name in log.sites:
         dropped = {
@@ -211,7 +211,7 @@ def test_samples_without_record_leave_few_ticks_open(tmp_path: Path) -> None:
     log = session.run()
     used = log["s"].used["m"][log["s"].mode == "hold"]
     assert not set(used.tolist()) & set(log["m"].tick.tolist())
-    result = verify(log)
+    result = verify_log(log)
     assert (result.differing, result.gaps) == (0, [])
     assert 0 < result.unjudged <= 3 + 4
 
@@ -222,8 +222,8 @@ def test_one_way_cuts_are_in_last_messages(tmp_path: Path) -> None:
     log = session.run()
     ends = {event.member: event.text for event in log.events if event.kind == "end"}
     assert ends == {
-        "m": "m made 600 ticks; s did not hear it at the end",
-        "s": "s made 600 ticks",
+        "m": "m executed 600 ticks; s did not confirm its last samples",
+        "s": "s executed 600 ticks",
     }
 
 
@@ -260,7 +260,7 @@ def test_sites_report_peers_that_cannot_hear_them(tmp_path: Path) -> None:
     assert 0.2 <= texts[0][2] / S - cut_s <= 0.4
     assert "hold" in log["s"].mode
     assert "hold" not in log["m"].mode
-    assert verify(log).passed
+    assert verify_log(log).passed
 
 
 @pytest.mark.long
@@ -269,7 +269,7 @@ def test_certificates_of_left_sessions_judge_the_rest(tmp_path: Path) -> None:
     session.clocks["m1"].dies_ns = 4 * S
     session.site("m1", at_ns=5 * S)
     log = session.run()
-    certificate = certify(log)
+    certificate = certify_log(log)
     premises = {premise.name: premise for premise in certificate.premises}
     assert premises["presence"].holds is False
     first, last = log.absences["m1"][0]
@@ -307,7 +307,7 @@ def test_starts_dead_before_tick_0_free_places(
     admitted = [event for event in log.events if event.kind == "admit"]
     assert len({event.boots["m"] for event in admitted}) == 2
     assert [last + 1 for _, last in log.absences["m"]] == [log.starts["m"][-1][0]]
-    assert verify(log).passed
+    assert verify_log(log).passed
     assert check_file(session.path).passed
 
 
@@ -341,7 +341,7 @@ def test_two_sites_returning_together_admit_each_other(later_ms: int, tmp_path: 
     assert {name: log[name].mode[-1] for name in log.sites} == dict.fromkeys(
         ("m1", "m2", "s"), "run"
     )
-    assert verify(log).passed
+    assert verify_log(log).passed
 
 
 def test_frozen_starts_end_after_their_replacement(tmp_path: Path) -> None:
@@ -358,7 +358,7 @@ def test_frozen_starts_end_after_their_replacement(tmp_path: Path) -> None:
     assert "another start of m has replaced this site" in str(frozen)
     assert again == 0
     assert log["m"].mode[-1] == "run"
-    assert verify(log).differing == 0
+    assert verify_log(log).differing == 0
 
 
 @pytest.mark.long
@@ -382,7 +382,7 @@ def test_successive_recorders_agree_on_ticks_not_made(tmp_path: Path) -> None:
     assert 0 < absence[0] < first - 200
     assert log.missing("m") == log.missing("s") == 0
     assert "missing 0" in log.account("m")
-    assert verify(log).passed
+    assert verify_log(log).passed
     assert check_file(*parts).passed
 
 

@@ -14,7 +14,7 @@ from tests.sites.sessions import execute_packed, pack_log
 from trilat_net.core.step.site_step import Site
 from trilat_net.core.step.ticks import Arrival, Mode, TickInput, TickRecord
 from trilat_net.errors import RunFailed, SessionError
-from trilat_net.execution.verification import verify
+from trilat_net.execution.verification import verify_log
 from trilat_net.execution.virtual_comparison import compare_with_virtual
 from trilat_net.net import topics
 from trilat_net.net.bus import Bus
@@ -203,7 +203,7 @@ def test_ten_timed_changes_have_live_bits(tmp_path: Path) -> None:
     log = Session.whole(scenario, tmp_path).run()
     assert len(log.scenario.timeline) == 10
     assert pack_log(log) == execute_packed(scenario)
-    assert verify(log).passed
+    assert verify_log(log).passed
     assert set(log["s"].mode) == {"run", "hold"}
 
 
@@ -227,7 +227,7 @@ def test_live_loops_equal_virtual_time_bitwise(name: str, tmp_path: Path) -> Non
         scenario.ticks(site) for site in scenario.names
     ]
     assert pack_log(log) == execute_packed(scenario)
-    assert verify(log).passed
+    assert verify_log(log).passed
 
 
 def test_a_site_beyond_limits_ends_its_session(tmp_path: Path) -> None:
@@ -241,7 +241,7 @@ def test_a_site_beyond_limits_ends_its_session(tmp_path: Path) -> None:
         assert failed.exit_code == 1
         assert "m2 diverged at t = " in str(failed)
     assert log.complete
-    assert verify(log).passed
+    assert verify_log(log).passed
     assert {event.member for event in log.events if event.kind == "diverged"} == {"m2"}
     assert {name: log[name].mode[-1] for name in log.sites} == {
         "m1": "run",
@@ -275,7 +275,7 @@ def test_stalls_matter_only_from_late_samples(tmp_path: Path) -> None:
     for site in log.sites:
         assert live[site][: first.due_tick] == plain[site][: first.due_tick]
     assert live != plain
-    assert verify(log).passed
+    assert verify_log(log).passed
 
 
 def publish_garbage(bus: Bus, clock: RelayClock) -> None:
@@ -327,7 +327,7 @@ def test_a_site_ends_in_order_on_request(tmp_path: Path) -> None:
     assert 0 < ticks < 1000
     assert [e.ticks for e in log.events if e.kind == "end" and e.member == "s"] == [ticks]
     assert log.complete
-    assert verify(log).passed
+    assert verify_log(log).passed
 
 
 def test_latecomers_learn_the_sessions_progress(tmp_path: Path) -> None:

@@ -13,9 +13,8 @@ from trilat_net.app.network_benchmark import (
     SESSION,
     NearEnd,
     NetworkBenchmark,
+    NetworkNeeds,
     answer_benchmarks,
-    find_needs,
-    judge_network,
     ping_benchmark,
     run_far_end,
 )
@@ -93,34 +92,32 @@ def make_row(needs, p99_ms: float, lost: int = 0) -> dict:
 @pytest.mark.long
 def test_delay_margins_judge_a_network() -> None:
     """P+d at 200 ms tolerates up to 229.8 ms, docs/studies/linear.md, and its links hide shorter delays."""
-    needs = find_needs(tn.load_scenario("p_d_margin"))
+    needs = NetworkNeeds.of_scenario(tn.load_scenario("p_d_margin"))
     margin = tn.linear("p_d_margin", ports=False).to_dict()["margin"]["stable"]
     assert needs.stable_ms == [
         [1e3 * window["from_s"], 1e3 * window["to_s"]] for window in margin
     ]
     edge_ms = needs.stable_ms[0][1]
     assert edge_ms == pytest.approx(229.8, abs=0.05)
-    hidden = judge_network(needs, make_row(needs, 150.0))
+    hidden = needs.judge(make_row(needs, 150.0))
     assert hidden["hidden"]
     assert (hidden["good"], hidden["age_ms"]) == (True, 200.0)
     assert hidden["spare_ms"] == pytest.approx(edge_ms - 200.0)
-    near = judge_network(needs, make_row(needs, 228.4))
+    near = needs.judge(make_row(needs, 228.4))
     assert (near["good"], near["hidden"], near["age_ms"]) == (True, False, 229.0)
-    assert not judge_network(needs, make_row(needs, 230.0))["good"]
-    assert not judge_network(needs, make_row(needs, 150.0, lost=2))["good"]
-    assert not judge_network(needs, {**make_row(needs, 1.0, lost=1000), "one_way_us": None})[
-        "good"
-    ]
+    assert not needs.judge(make_row(needs, 230.0))["good"]
+    assert not needs.judge(make_row(needs, 150.0, lost=2))["good"]
+    assert not needs.judge({**make_row(needs, 1.0, lost=1000), "one_way_us": None})["good"]
 
 
 def test_measured_links_add_their_play_out() -> None:
-    needs = find_needs(
+    needs = NetworkNeeds.of_scenario(
         tn.load_scenario("p_d_margin", {"link.model": "measured", "link.playout_ms": 40})
     )
     assert (needs.playout_ms, needs.held_ms, needs.in_use_ms) == (40.0, 40.0, None)
-    assert judge_network(needs, make_row(needs, 12.3))["age_ms"] == 40.0
-    assert judge_network(needs, make_row(needs, 41.3))["age_ms"] == 42.0
-    assert judge_network(needs, make_row(needs, 41.3))["playout_ms"] == 83
+    assert needs.judge(make_row(needs, 12.3))["age_ms"] == 40.0
+    assert needs.judge(make_row(needs, 41.3))["age_ms"] == 42.0
+    assert needs.judge(make_row(needs, 41.3))["playout_ms"] == 83
 
 
 def check_result(result: Result, transports: list[str]) -> None:
@@ -150,7 +147,7 @@ def check_result(result: Result, transports: list[str]) -> None:
     ],
 )
 def test_the_first_line_names_the_measurement(connect: tuple[str, ...], line: str) -> None:
-    needs = find_needs(tn.load_scenario("free"))
+    needs = NetworkNeeds.of_scenario(tn.load_scenario("free"))
     network_benchmark = NetworkBenchmark("free", 1.0, needs, [], [], connect)
     assert network_benchmark.summary().startswith(line)
     assert network_benchmark.to_dict()["connect"] == list(connect)

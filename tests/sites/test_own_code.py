@@ -12,7 +12,7 @@ from tests.net.waiting import sleep_for_ns
 from tests.own_code import Circle, Failing, Follower
 from trilat_net.core.life.own_hand import HandProgram, HandView
 from trilat_net.errors import PlantFailed, RunFailed
-from trilat_net.execution.verification import verify
+from trilat_net.execution.verification import verify_log
 from trilat_net.execution.virtual import simulate_scenario
 from trilat_net.log.log_reader import Log
 from trilat_net.net.bus import Bus
@@ -95,7 +95,7 @@ def test_records_are_alike_wherever_a_hand_runs(kind: type[Any], tmp_path: Path)
     inner_log = Session.whole(within, tmp_path / "within").run()
     assert_same(inner_log, simulate_scenario(within))
     assert_same(log, inner_log)
-    assert verify(log).passed
+    assert verify_log(log).passed
 
 
 def test_thinking_within_the_delay_changes_nothing(tmp_path: Path) -> None:
@@ -113,7 +113,7 @@ def test_a_program_that_is_too_slow_is_counted(tmp_path: Path) -> None:
     log = session.run()
     assert any("hand: late" in text for text in session.said)
     assert log["m2"].hand[-1, 2] == 1.0
-    assert verify(log).passed
+    assert verify_log(log).passed
 
 
 def test_killed_programs_let_go_without_harm(tmp_path: Path) -> None:
@@ -126,7 +126,7 @@ def test_killed_programs_let_go_without_harm(tmp_path: Path) -> None:
     assert held.any()
     assert not held[-1]
     assert {state.mode for name in log.sites for state in log[name].states} == {"run"}
-    assert verify(log).passed
+    assert verify_log(log).passed
 
 
 def test_a_program_that_fails_lets_go_and_ends(tmp_path: Path) -> None:
@@ -153,7 +153,7 @@ def test_a_program_that_fails_lets_go_and_ends(tmp_path: Path) -> None:
         ended[0],
     )
     assert log["m2"].hand[430, 2] == 0.0
-    assert verify(log).passed
+    assert verify_log(log).passed
 
 
 def test_strangers_move_no_own_hand(tmp_path: Path) -> None:
@@ -221,7 +221,7 @@ def test_plants_move_alike_live_and_virtually(tmp_path: Path) -> None:
     )
     log = Session.whole(scenario, tmp_path).run()
     assert_same(log, simulate_scenario(scenario))
-    assert verify(log).passed
+    assert verify_log(log).passed
 
 
 def test_failing_live_plants_are_named_and_end(tmp_path: Path) -> None:
@@ -235,4 +235,4 @@ def test_failing_live_plants_are_named_and_end(tmp_path: Path) -> None:
     assert [
         event.text for event in log.events if event.kind == "failed" and event.member == "s"
     ]
-    assert verify(log).passed
+    assert verify_log(log).passed

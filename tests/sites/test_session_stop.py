@@ -17,7 +17,7 @@ from tests.sites.sessions import reach_session
 from trilat_net.app.monitor import SessionDisplay, StatusRow
 from trilat_net.core.step.ticks import LifeAlarm, LifeReason
 from trilat_net.errors import SessionError
-from trilat_net.execution.verification import verify
+from trilat_net.execution.verification import verify_log
 from trilat_net.log.log_reader import Log
 from trilat_net.net.bus import Bus
 from trilat_net.scenario import load_scenario
@@ -56,7 +56,7 @@ def test_stop_ends_all_sites_at_one_time(tmp_path: Path) -> None:
     assert 1500 < ticks < 4000
     assert said == [f"{name} ends at t = {ticks / 1000:.3f} s" for name in log.sites]
     assert log.complete
-    assert verify(log).identical == 3 * ticks
+    assert verify_log(log).identical == 3 * ticks
     last = shown[-1]
     assert [row["site"] for row in last] == ["m1", "m2", "s"]
     assert last[0]["angles"] == " ".join(f"{q:+.3f}" for q in log["m1"].q[-1]) + " rad"
@@ -144,7 +144,7 @@ def test_one_arm_stops_and_continues_alone(stopped_arm: StoppedArm) -> None:
     assert set(log["s"].mode[stopped:enabled]) == {"stopped"}
     assert log["s"].mode[enabled] == "return"
     assert "stopped" not in set(log["m"].mode)
-    assert verify(log).identical == 8000
+    assert verify_log(log).identical == 8000
 
 
 def test_orders_that_fit_no_mode_are_explained(stopped_arm: StoppedArm) -> None:
@@ -252,7 +252,7 @@ def test_watching_sees_returns_and_stops_everything(tmp_path: Path) -> None:
     ended = {name: str(end) for name, end in session.ends.items()} if session.ends else {}
     assert ended["s"] == "killed"
     assert "s has been gone since" in ended["m1"]
-    assert verify(log).differing == 0
+    assert verify_log(log).differing == 0
 
 
 @pytest.mark.long
@@ -283,4 +283,4 @@ def test_killed_masters_are_replaced_and_return(tmp_path: Path) -> None:
         assert reasons.index(LifeReason.DROPPED) < reasons.index(LifeReason.RESTORED)
         assert log[name].mode[-1] == "run"
     assert log["m1"].mode[-1] == "run"
-    assert verify(log).differing == 0
+    assert verify_log(log).differing == 0

@@ -8,7 +8,7 @@ import pytest
 from tests.net.waiting import sleep_for_ns
 from tests.scenario.builders import six_joint_text
 from tests.sites.sessions import execute_packed, pack_log
-from trilat_net.execution.verification import verify
+from trilat_net.execution.verification import verify_log
 from trilat_net.log.log_reader import Log
 from trilat_net.net import topics
 from trilat_net.net.bus import Bus, Inbox
@@ -59,7 +59,7 @@ def test_samples_are_records_and_blocks_hold_10_ms(scenario: Scenario, tmp_path:
     session = Session.whole(scenario, tmp_path)
     samples, blocks = listen_to_sites(session, scenario.names)
     log = session.run()
-    assert verify(log).passed
+    assert verify_log(log).passed
     assert pack_log(log) == execute_packed(scenario)
     for name in scenario.names:
         small = [
@@ -109,7 +109,7 @@ def test_a_lost_block_is_filled_with_its_records(tmp_path: Path) -> None:
     log = session.run()
     assert any(lost)
     assert len(log["s"]) == scenario.ticks("s")
-    assert verify(log).passed
+    assert verify_log(log).passed
     refilled = log.recorder_stats()[-1].refilled["s/state"]
     assert refilled == sum(len([*split_states(block)]) for block in lost if block)
 

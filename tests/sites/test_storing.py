@@ -11,7 +11,7 @@ from tests.log.disks import SmallDisk, open_file_on
 from tests.net.waiting import sleep_for_ns
 from tests.sites.sessions import pack_computed
 from trilat_net.errors import LogRefused
-from trilat_net.execution.verification import verify
+from trilat_net.execution.verification import verify_log
 from trilat_net.log import log_writer
 from trilat_net.log.log_layout import ChannelFilter, active_path
 from trilat_net.log.log_reader import open_log
@@ -79,7 +79,7 @@ def test_on_a_full_disk_accounts_match_the_file(
     assert refusal.value.exit_code == 5
     log = open_log(path)
     assert log.complete
-    verdict = verify(log)
+    verdict = verify_log(log)
     assert verdict.agreed
     assert verdict.integrity.passed
     assert not verdict.passed  # no site could say how it ended

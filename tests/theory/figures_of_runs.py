@@ -6,7 +6,7 @@ The figures that tests here cite were made with another implementation of the sa
 from typing import Any
 
 import pytest
-from trilat_studies.measure_run import RunMetrics, measure_virtual_run
+from trilat_studies.measure_run import RunMetrics
 
 from trilat_net.scenario import load_scenario
 from trilat_net.scenario.expect import ALL_SITES_QUANTITIES, ExpectWindow
@@ -29,7 +29,7 @@ def measure_run(
         }
         for from_s, to_s, site in windows
     ]
-    return measure_virtual_run(
+    return RunMetrics.of_virtual_run(
         load_scenario(name, {**(overrides or {}), "expect": {"windows": windows_of_run}})
     )
 

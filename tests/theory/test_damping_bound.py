@@ -382,5 +382,5 @@ def test_springs_between_end_effectors_have_no_known_bound() -> None:
         },
     )
     (condition,) = describe_law_conditions(scenario)
-    assert "is undecided: known for joints that follow joints" in condition
+    assert "is undecided: known only for joints that follow joints" in condition
     assert list_law_proofs(scenario) == []

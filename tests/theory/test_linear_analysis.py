@@ -125,7 +125,7 @@ def test_lasting_motions_are_separated_from_decaying() -> None:
     )
     text = describe_linear_verdict(analysis)
     assert text.startswith(
-        "at the edge: 2 motions keep their speed, and the slowest of the others goes as exp(-0."
+        "at the edge: 2 motions keep their speed, and the slowest of the other motions goes as exp(-0."
     )
 
 
@@ -146,7 +146,7 @@ def test_a_line_without_losses_has_no_margin() -> None:
 
 @pytest.mark.parametrize("roots", [0, -1, 61])
 def test_invalid_numbers_of_roots_are_refused(roots: int) -> None:
-    with pytest.raises(UsageError, match="roots is a number of roots, 1 to 60"):
+    with pytest.raises(UsageError, match="roots must be from 1 to 60"):
         analyse_linear_loop("free", roots=roots)
 
 

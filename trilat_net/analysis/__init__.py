@@ -37,7 +37,7 @@ __all__ = [
     "ObservedFinding",
     "RecordWindow",
     "RunningEnergy",
-    "certify",
+    "certify_log",
     "find_missing_functionals",
     "find_unjudged_spans",
     "premise_quantities",
@@ -148,7 +148,7 @@ if TYPE_CHECKING:
     from .certificate.observed_energy import ObservedEnergy, ObservedFinding
     from .certificate.premises import find_missing_functionals, find_unjudged_spans
     from .certificate.running_energy import KEPT_S, EnergyCourse, RecordWindow, RunningEnergy
-    from .certificate.stability_certificate import certify
+    from .certificate.stability_certificate import certify_log
     from .dominance_history import (
         find_closed_groups,
         find_program,
@@ -246,7 +246,7 @@ else:
             "certificate.premise_quantities": "premise_quantities",
             "certificate.premises": "find_missing_functionals find_unjudged_spans",
             "certificate.running_energy": "EnergyCourse KEPT_S RecordWindow RunningEnergy",
-            "certificate.stability_certificate": "certify",
+            "certificate.stability_certificate": "certify_log",
             "certificate.verdict_facts": "verdict_facts",
             "decision_facts": "decision_facts",
             "dominance_history": (

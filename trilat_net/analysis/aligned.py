@@ -9,8 +9,8 @@ of an arm at any time, and `DelayedPeer` the motion that another arm used.
 Invariant:
     - A missing record is interpolated, so that sums have all their terms. Such a row is not
       marked as `known`, and no metric uses it.
-    - Between two records, an arm moves along a cubic polynomial that meets the recorded angles
-      and velocities. Before its first record it does not move.
+    - Between two records, an arm moves along a cubic polynomial that matches the recorded
+      angles and velocities. Before its first record it does not move.
     - Within a tick, the delay of the used state is constant, as the stability theorem assumes.
       The difference from the next state is a jump at the end of the tick.
 """
@@ -34,7 +34,8 @@ _NO_ROWS: Bools = np.zeros(0, dtype=np.bool_)
 RESUMING_S = 2.0 * BLEND_S
 """Time after a resting mode in which the torque may differ from that of the law, in s."""
 _TICK_TOLERANCE = 1e-5
-"""Largest difference from a tick of a time that counts as the tick, as a share of a period."""
+"""Largest distance from a tick at which a time counts as the tick, as a fraction of a period.
+"""
 
 
 class AlignedRecords(NamedTuple):
@@ -51,7 +52,8 @@ class AlignedRecords(NamedTuple):
         first: Number of the tick in row 0.
         known: True if the tick has a record, False if the row is interpolated, shape (K,).
         follows: True if the site followed its peers, the sites whose motion it receives, shape
-            (K,). It did not hold, brake or return, and its reference was slower than its limit.
+            (K,). In these rows the site did not hold, brake or return, and its reference was
+            slower than its limit.
         q: Joint angles, shape (K, n), in rad.
         qd: Joint velocities, shape (K, n), in rad/s.
         q_des: Reference of the shared coordinates, shape (K, n) in rad, or (K, m) in task
@@ -109,8 +111,8 @@ class AlignedRecords(NamedTuple):
         """Velocity of the coordinates in which the sites follow each other, one row per tick.
 
         Sites follow each other's joint angles, or in task space the positions of their end
-        effectors. The energy terms use this velocity for both cases: it is qd, shape (K, n), in
-        rad/s, or in task space xd, shape (K, m).
+        effectors. The velocity is qd, shape (K, n), in rad/s, or in task space xd, shape (K,
+        m).
         """
         return self.xd if self.x.size else self.qd
 
@@ -123,8 +125,8 @@ class AlignedRecords(NamedTuple):
     def t_s(self) -> Array:
         """Nominal time of every row, tick / rate_hz, shape (K,), in s.
 
-        A tick is a period of the control loop. If it was computed late, its nominal time is the
-        same.
+        A tick is a period of the control loop. A tick that was computed late has the same
+        nominal time.
         """
         return self._ticks / self.rate_hz
 
@@ -171,8 +173,9 @@ class AlignedRecords(NamedTuple):
     def known_periods(self) -> Bools:
         """Marks the tick periods that can be judged: both of their ticks have a record.
 
-        Energy changes between two ticks. If a record was lost, the periods before and after its
-        tick are therefore unknown. K ticks bound K - 1 periods, so that the shape is (K - 1,).
+        Energy changes between two ticks. If the record of a tick was lost, the periods before
+        and after this tick are therefore unknown. K ticks bound K - 1 periods, so the shape is
+        (K - 1,).
         """
         is_known_at_start = self.known[:-1]
         is_known_at_end = self.known[1:]
@@ -271,10 +274,10 @@ def align_records(log: Log, *, common: bool = False) -> dict[str, AlignedRecords
 
 
 def _find_resting_rows(modes: NDArray[Any], tick: Ints, rate_hz: int) -> Bools:
-    """Marks the records in which an arm is brought to rest, or was so shortly before.
+    """Marks the records in which an arm is being brought to rest, or was until shortly before.
 
     The torque of these records may differ from that of the control law. The arm is in one of
-    the `RESTING_MODES`, or was so in the last `RESUMING_S`.
+    the `RESTING_MODES`, or was in one of them within the last `RESUMING_S`.
 
     Args:
         modes: Mode of each record.
@@ -298,13 +301,13 @@ def _fill_tick_grid(
 ) -> AlignedRecords:
     """Returns a site's records with one row for every tick. Missing records are interpolated.
 
-    Values that cannot be interpolated, such as modes, are those of the last record before.
+    Values that cannot be interpolated, such as modes, are those of the previous record.
 
     Args:
         scenario: Scenario of the run.
         site_log: The site's part of the log.
         rows: Rows of the records to use, one per tick, in ascending order of ticks.
-        last: Last tick. By default that of the last record.
+        last: Last tick. If `None`, the tick of the last record.
     """
     names = [*RECORD_COLUMNS]
     if site_log.layout.task:
@@ -365,8 +368,8 @@ def _fill_tick_grid(
 class _PeerMotion(NamedTuple):
     """Motion of another arm (a peer) at K times, computed from its records.
 
-    Joint by joint, the motion has n coordinates, in rad. In task space it has the m coordinates
-    of the end effector, in m. Units below are for joints.
+    If arms follow joint by joint, the motion has n coordinates, in rad. In task space it has
+    the m coordinates of the end effector, in m. Units below are for joints.
 
     Attributes:
         q: Positions, shape (K, n) or (K, m), in rad.
@@ -385,8 +388,9 @@ class _PeerMotion(NamedTuple):
 class PeerTrajectory:
     """The motion of a site as a function of continuous time, interpolated from its records.
 
-    It tells where the site was when it sent a sample, or between two ticks. The motion is a
-    polynomial between two records. Before the first record the arm rests (assumption L7).
+    The trajectory gives the position of the site at the time of sending a sample, or between
+    two ticks. The motion is a polynomial between two records. Before the first record the arm
+    rests (assumption L7).
 
     Args:
         records: Records of the site.
@@ -403,11 +407,12 @@ class PeerTrajectory:
         self._squares: Array = np.vstack([start, running_sums])
 
     def evaluate(self, t_s: Array) -> _PeerMotion:
-        """Returns the site's motion at some times. At its ticks this equals its records.
+        """Returns the site's motion at the given times, interpolated between its records.
 
-        Between two records, q is the cubic polynomial that has the recorded angles and
-        velocities at both ends (Hermite interpolation), and qd is linear. The integral of qd
-        squared is computed by the trapezoid rule.
+        At the site's ticks the motion equals the records. Between two records, q is the cubic
+        polynomial that has the recorded angles and velocities at both ends (Hermite
+        interpolation), and qd is linear. The integral of qd squared is computed by the
+        trapezoid rule.
 
         Args:
             t_s: Times after the start of the session, shape (K,), in s.
@@ -506,9 +511,9 @@ class DelayedPeer(NamedTuple):
     def known(self) -> Bools:
         """Marks the tick periods in which records alone determine the motion of the peer.
 
-        Both its present and its delayed motion must be known. In other periods some record is
-        missing and was interpolated, so that energies that depend on the peer are not judged. K
-        ticks bound K - 1 periods, so that the shape is (K - 1,).
+        Both its present and its delayed motion must be known. The other periods contain
+        interpolated records. Energies that depend on the peer are not judged there. K ticks
+        bound K - 1 periods, so the shape is (K - 1,).
         """
         now = self.now.known
         delayed = self.delayed.known
@@ -526,7 +531,7 @@ def view_delayed_peer(records: AlignedRecords, past: PeerTrajectory) -> DelayedP
     """Returns the motion of another arm as this arm received it, with the network delay.
 
     The records of this arm say which message was used in each tick (control period), and the
-    motion of the other arm says what this message contained.
+    motion of the other arm says which state this message contained.
 
     Args:
         records: Records of the site, which name the sample in use at every tick.
@@ -551,7 +556,7 @@ def find_latest_rows(records: AlignedRecords, t_s: Array) -> tuple[Ints, Bools]:
     """Finds the last record of an arm at or before each of several times.
 
     It relates arms whose control loops have different rates: a time of one arm is looked up in
-    the records of another one.
+    the records of another arm.
 
     Args:
         records: Records of the site, with one row per tick.

@@ -51,7 +51,7 @@ from ..records import JOINTS, MAX_JOINTS
 from ..scenario import ArmModel, Scenario
 
 HANGING_RAD = 0.3
-"""Largest angle to straight down of a link that hangs, in rad."""
+"""Largest angle between a hanging link and the downward vertical, in rad."""
 _NO_WEIGHT_J = 1e-6
 """Largest variation of the potential energy of an arm that cannot hang, in J."""
 _ENERGY_SWEEPS = 20
@@ -68,8 +68,8 @@ B).
 def multiply_columns(matrix: Numbers, vector: Numbers) -> Numbers:
     """Multiplies many matrices by many vectors in one call, one product per log record.
 
-    Numbers of the records are on the last axes, so that NumPy computes all records at once
-    instead of a slow Python loop.
+    The last axes count the records. NumPy then computes all records at once, which avoids a
+    slow Python loop.
 
     Args:
         matrix: Entries of the matrices, shape (a, b, ...). The axes "..." count the records.
@@ -109,7 +109,7 @@ class PlacedArm:
 
     The methods compute inertia, gravity and the other terms of the equation of motion. The
     trailing axes of all arrays, written as "...", stand for the poses. All methods are analytic
-    in every argument, so that a complex step (a tiny imaginary change of an argument) gives
+    in every argument. Therefore a complex step (a tiny imaginary change of an argument) gives
     exact derivatives.
 
     They follow "Adaptive Control of Dual User Teleoperation with Time Delay and Dynamic
@@ -193,8 +193,8 @@ class PlacedArm:
     ) -> Numbers:
         """Returns the torque that a reference motion requires, shape (2, ...), in N m.
 
-        It is M(q) a + C(q, qd) v + G(q), which equals Y theta in Eq. (12). M is the inertia
-        matrix, C the Coriolis matrix, G the gravity torque, and Y the regressor.
+        This torque is M(q) a + C(q, qd) v + G(q), which equals Y theta in Eq. (12). M is the
+        inertia matrix, C the Coriolis matrix, G the gravity torque, and Y the regressor.
 
         Args:
             theta: Dynamic parameters of the arm, shape (5, ...).
@@ -220,7 +220,7 @@ class PlacedArm:
             a: Reference accelerations of the joints, shape (2, ...), in rad/s^2.
         """
         columns = self.q.shape[1:]
-        # one further axis, for the arms of which one parameter is 1
+        # one further axis, for the arms that have one parameter 1 and all others 0
         unit_parameters = np.multiply.outer(np.eye(5), np.ones(columns))
         return self.required_torque(unit_parameters, qd, v, a)
 
@@ -334,10 +334,10 @@ class PlanarArmRows(NamedTuple):
 
     @property
     def task(self) -> None:
-        """Always None: the planar arm follows other arms joint by joint, never by end effector.
+        """Always `None`, because the planar arm follows other arms joint by joint.
 
-        `ChainArmRows.task` has the settings of arms that do, so that callers need not
-        distinguish the two kinds of arms.
+        `ChainArmRows.task` contains the settings of arms that follow by end effector. Callers
+        therefore need not distinguish the two kinds of arms.
         """
         return
 
@@ -364,8 +364,8 @@ class PlanarArmRows(NamedTuple):
     def weightless(self) -> "PlanarArmRows":
         """Returns a model of the same arm without gravity.
 
-        The torque of such an arm is linear in the reference velocity v and acceleration a, so
-        that the effects of parts of a motion can be computed separately and added.
+        The torque of such an arm is linear in the reference velocity v and acceleration a.
+        Therefore the effects of parts of a motion can be computed separately and added.
         """
         return self._replace(g=0.0)
 
@@ -483,7 +483,7 @@ class PlanarArmRows(NamedTuple):
         """
         return np.zeros_like(speed)
 
-    def stop_torque(self, q: Array, qd: Array) -> Array:  # noqa: ARG002 - as of a chain
+    def stop_torque(self, q: Array, qd: Array) -> Array:  # noqa: ARG002 - chains need it
         """Returns zeros, because the joints of this arm have no mechanical stops.
 
         The method exists so that this arm can be used in place of a chain.
@@ -520,7 +520,8 @@ class PlanarArmRows(NamedTuple):
     def hanging_angle(self, q: Array) -> float:
         """Returns the largest angle between a link and the direction straight down, in rad.
 
-        A small angle means that the arm hangs down, as an arm does that was not held up.
+        A small angle means that the arm hangs down, as an arm does when its motors do not hold
+        it up.
 
         Args:
             q: Joint angles of one pose, shape (2,), in rad.
@@ -581,7 +582,7 @@ def _put_gradients(
     a: Array,
     gradient: Array,
 ) -> None:
-    """Writes Y'r of each of K poses into `gradient`, shape (K, 10 n).
+    """Writes Y'r for each of K poses into `gradient`, shape (K, 10 n).
 
     Y'r is the direction in which the adaptive law changes the parameter estimates, with the
     regressor Y and the velocity error r = qd - v. The motion has the shape (K, n).
@@ -669,7 +670,7 @@ class ChainArmRows(NamedTuple):
     def task(self) -> TaskSetup | None:
         """Settings for following other arms with the end effector (tip), such as its axes.
 
-        None if the arm follows other arms joint by joint.
+        `None` if the arm follows other arms joint by joint.
         """
         return self.chain.task
 
@@ -703,8 +704,8 @@ class ChainArmRows(NamedTuple):
     def weightless(self) -> "ChainArmRows":
         """Returns a model of the same arm without gravity and dry (Coulomb) friction.
 
-        The torque of this model is linear in the reference velocity v and acceleration a, so
-        that the effects of parts of a motion can be computed separately and added.
+        The torque of this model is linear in the reference velocity v and acceleration a.
+        Therefore the effects of parts of a motion can be computed separately and added.
         """
         bare = self._replace_in_joints(coulomb=0.0)
         no_gravity = (0.0, 0.0, 0.0)
@@ -723,7 +724,7 @@ class ChainArmRows(NamedTuple):
         """Returns the product of the inertia matrix, with drives, and a vector, in each pose.
 
         The product (M(q) + armature) x is computed by one recursion along the chain without
-        gravity, so that the matrix itself is never formed.
+        gravity. The matrix itself is never formed.
 
         Args:
             q: Joint angles, shape (K, n), in rad.
@@ -785,7 +786,7 @@ class ChainArmRows(NamedTuple):
         qd: Array,
         v: Array,
         a: Array,
-        r: Array,  # noqa: ARG002 - as of the planar arm
+        r: Array,  # noqa: ARG002 - the planar arm needs it
     ) -> Array:
         """Returns Y'r, the direction in which the adaptive law changes the parameter estimates.
 
@@ -967,12 +968,12 @@ class ChainArmRows(NamedTuple):
         return rate.transpose(0, 2, 1)
 
     def hanging_angle(self, q: Array) -> float:
-        """Returns how far the chain is from hanging straight down, as an angle in rad.
+        """Returns an angle, in rad, that says how far the chain is from hanging straight down.
 
         The angle compares the chain's potential energy E with the lowest and highest energy
         that it can have: cos(angle) = 1 - 2 (E - lowest) / (highest - lowest). So 0 means
-        hanging down, and pi means upright. The extremes are searched from this pose on, one
-        joint after the other. Mechanical stops are ignored.
+        hanging down, and pi means upright. The search for the extremes starts from this pose
+        and varies one joint after the other. Mechanical stops are ignored.
 
         Args:
             q: Joint angles of one pose, shape (n,) for n joints, in rad.
@@ -1002,7 +1003,7 @@ class ChainArmRows(NamedTuple):
         """Returns the least (sign 1) or largest (sign -1) potential energy of the arm, in J.
 
         The search is a coordinate descent over the revolute joints. As a function of one
-        joint's angle q, the energy is mean + b cos q + c sin q, so that its values at three
+        joint's angle q, the energy is mean + b cos q + c sin q. Therefore its values at three
         angles determine the extreme.
         """
         q = q.copy()
@@ -1041,7 +1042,7 @@ def build_arm_rows(scenario: Scenario, site: str) -> ArmRows:
         return PlanarArmRows(model.theta, spec.arm.g_m_s2, model.lengths_m)
     chain = model.chain
     if chain.task is not None and not chain.task.posture:
-        # a task without a posture prefers the start pose
+        # if the task has no preferred posture, the start pose is preferred
         task = chain.task._replace(posture=spec.q0_rad)
         chain = chain._replace(task=task)
     return ChainArmRows(model.theta, chain)
@@ -1119,15 +1120,17 @@ def upright_axes(chain: ChainSetup) -> Array:
 
 
 DEPENDENT_SHARE = 1e-9
-"""Largest independent share of a column that counts as dependent on the columns before it."""
+"""Largest part of a column that is independent of the columns before it for the column to count
+as dependent on them, relative to the column.
+"""
 
 
 class _BaseParameters(NamedTuple):
     """Base parameters of an arm: combinations of masses and inertias that torques determine.
 
-    No measurement of torque and motion can determine every dynamic parameter theta of a chain
-    by itself. It determines only the B linear combinations in the rows of `combination`, so
-    that the base parameters are combination theta.
+    No measurement of torque and motion can determine every single dynamic parameter in the
+    vector theta of a chain. Such a measurement determines only the B linear combinations in the
+    rows of `combination`, and the base parameters are combination @ theta.
 
     Attributes:
         kept: For each combination, the index of the parameter after which the combination is
@@ -1179,9 +1182,9 @@ def stack_regressors(arm: ChainArmRows, states: int) -> Array:
 def _find_chain_base(chain: ChainSetup, learnt: tuple[bool, ...]) -> _BaseParameters:
     """Finds the base parameters of a serial arm by a QR decomposition (Gautier 1991).
 
-    Base parameters are the combinations of masses and inertias that joint torques determine. A
-    column of the stacked regressors that depends on the columns before it belongs to a
-    parameter that torques do not determine by itself.
+    Base parameters are the combinations of masses and inertias that joint torques determine. If
+    a column of the stacked regressors depends linearly on the columns before it, torques do not
+    determine the parameter of this column by itself.
 
     Args:
         chain: The chain.
@@ -1223,9 +1226,9 @@ def _find_chain_base(chain: ChainSetup, learnt: tuple[bool, ...]) -> _BaseParame
 def find_base_parameters(arm: ArmRows, learnt: NDArray[np.bool_]) -> _BaseParameters:
     """Finds which combinations of an arm's dynamic parameters can be learnt from its torques.
 
-    Torques do not determine every parameter of a chain by itself, but only some linear
-    combinations of them, the base parameters. For the planar arm, each of its five parameters
-    is a base parameter.
+    Torques do not determine every single parameter of a chain, but only some linear
+    combinations of the parameters, which are called base parameters. For the planar arm, each
+    of its five parameters is a base parameter.
 
     Args:
         arm: The arm, with P dynamic parameters.
@@ -1274,7 +1277,7 @@ def find_pseudo_inertias(theta: Array) -> Array:
 
 
 def find_consistent_links(theta: Array) -> list[bool]:
-    """Finds the links whose learnt masses and inertias are those of a possible rigid body.
+    """Finds the links whose learnt masses and inertias a rigid body can have.
 
     A negative mass, for example, is impossible. The condition is that the link's pseudo-inertia
     (see `find_pseudo_inertias`) is positive definite (Wensing et al. 2018).

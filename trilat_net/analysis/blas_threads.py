@@ -1,10 +1,11 @@
 """Keeps the linear algebra of NumPy and SciPy (OpenBLAS) on one thread.
 
 The matrices of this package are small. OpenBLAS distributes even these over all processors, and
-its idle threads wait actively. A characteristic root then takes twice the processor time, and
-the processes of a parameter sweep disturb each other.
+its idle threads wait actively. The computation of a characteristic root then takes twice the
+processor time, and the processes of a parameter sweep slow each other down.
 
-NumPy and SciPy each bring their own copy of OpenBLAS, with a number of threads of its own.
+NumPy and SciPy each contain their own copy of OpenBLAS, and each copy has its own number of
+threads.
 """
 
 import ctypes
@@ -46,7 +47,7 @@ def limit_blas_threads() -> Iterator[None]:
 
     The function can also decorate another function. The numbers of threads are restored at the
     end, also after an exception. SciPy is limited only if it has been imported before. If a
-    library has no functions for this, its threads are left as they are.
+    library has no functions to set the number of threads, its threads are left as they are.
     """
     libraries = []
     for module_name in _MODULES:
@@ -72,7 +73,7 @@ def _find_blas_functions(module_name: str) -> _BlasFunctions | None:
         module_name: Name of an imported module that is linked to the library.
 
     Returns:
-        The functions. None if the module uses another library.
+        The functions. `None` if the module uses another library.
     """
     try:
         library = ctypes.CDLL(sys.modules[module_name].__file__)

@@ -18,8 +18,9 @@ class BodyTurns:
     """Chooses the signs of the quaternions of a plant's bodies in one stream of frames.
 
     A plant is a simulated environment with bodies, whose poses are published in frames. Two
-    quaternions of opposite sign describe the same orientation. Of both, the one nearer to the
-    quaternion of the frame before is chosen, so that a plot or an interpolation sees no jump.
+    quaternions of opposite sign describe the same orientation. Of the two, the one nearer to
+    the quaternion of the previous frame is chosen, so that a plot or an interpolation sees no
+    jump.
     """
 
     def __init__(self) -> None:
@@ -32,11 +33,11 @@ class BodyTurns:
         previous call.
 
         Args:
-            bodies: Seven numbers for each of the b bodies: position x, y, z in m, and unit
+            bodies: Seven values for each of the b bodies: position x, y, z in m, and unit
                 quaternion w, x, y, z.
 
         Returns:
-            The same numbers, in which the signs of some quaternions are reversed, shape (7 b,).
+            The same values, with the signs of some quaternions reversed, shape (7 b,).
         """
         pose_length = POSITION + len(QUATERNION_AXES)
         numbers = np.array(bodies, dtype=np.float64)

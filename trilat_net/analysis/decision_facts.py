@@ -1,7 +1,7 @@
 """Defines the evidence on the stability of a run, and the decision that rests on it.
 
-`stability_decision` decides, and the package `presentation` writes the sentences about what a
-decision rests on and what prevents a better one.
+`stability_decision` decides, and the package `presentation` writes the sentences about the
+basis of a decision and the reasons against a better one.
 
 Invariant:
     - A decision and its evidence contain only names and numbers, apart from phrases that the
@@ -22,9 +22,9 @@ from .twins.envelope_trend import EnvelopeTrend
 from .twins.twin_growth import DOUBLES, TwinGrowth
 
 _RATE_AGREEMENT_SHARE = 0.25
-"""Largest difference between the rates of a push and of the slowest root, as a share."""
+"""Largest relative difference at which the rates of a push and of the slowest root agree."""
 _RATE_AGREEMENT_PER_S = 2e-4
-"""Difference of these rates that always confirms the root, in 1/s."""
+"""Difference between these rates up to which they always agree, in 1/s."""
 
 Basis = Literal[
     "nothing",
@@ -35,12 +35,12 @@ Basis = Literal[
     "growing pushes",
     "dying pushes",
 ]
-"""What a decision rests on.
+"""Evidence on which a decision rests.
 
 "divergence" and "end" are the end of the run: an arm exceeded its limits, or its motion does
 not come to rest. "roots" are the exact roots of the loop, and "proofs" all proofs that exist.
-"growing pushes" and "dying pushes" are the repetitions of the run with small pushes. An open
-run may rest on nothing.
+"growing pushes" and "dying pushes" are the repetitions of the run with small pushes. The
+decision that a run is open may rest on nothing.
 """
 Obstacle = Literal[
     "divergence",
@@ -58,14 +58,13 @@ Obstacle = Literal[
     "few bursts",
     "unclear end",
 ]
-"""What prevents a better decision.
-
-The first six are findings that speak against a stable run: an arm exceeded its limits, the end
-of the run has doubts, sites have no records, delays repeat only after the judged part, other
-analyses have doubts, or the roots show growth. The others say why nothing decides: the record
-is too short, its end does not agree with a proof, a numerical root decays too slowly to be told
-from lasting motion, no run with pushes was made or judged, the pushes show no clear trend, the
-judged part has few bursts of lost samples, or the end of the run shows no clear trend.
+"""Reasons that prevent a better decision. The first six are findings against stability: an arm
+exceeded its limits, there are doubts about the end of the run, sites have no records, delays
+repeat only after the judged part, other analyses contradict stability, or the roots show
+growth. The others say why the evidence does not suffice: the record is too short, its end does
+not agree with a proof, a numerical root decays too slowly to be distinguished from lasting
+motion, no run with pushes was made or judged, the pushes show no clear trend, the judged part
+has few bursts of lost samples, or the end of the run shows no clear trend.
 """
 Doubt = StabilityVerdict | UnsuppliedGrowth | ObservedEnergy | EvidenceDoubt
 """A finding of another analysis that contradicts a stable run."""
@@ -82,16 +81,17 @@ class LoopRoots(NamedTuple):
         verdict: "stable", "unstable" or "at the edge", for small motions. Empty if the loop
             cannot be linearised.
         rate_per_s: Largest real part of the roots, in 1/s, without those that are zero because
-            of the structure of the loop. None if there is no such root.
+            of the structure of the loop. `None` if there is no such root.
         exact: True if the loop was analysed with its ticks and its repeating delays. Otherwise
             the roots may cast doubt on a run, but prove nothing.
         distance_rad: Largest difference between the last angle of a joint and its angle at the
             pose at rest to which the roots belong, in rad.
-        leaves_out: What the linearised loop leaves out, as a phrase, for example "how the
-            program at m2 reacts to the arms". Empty if it contains everything.
+        leaves_out: Phrase that names the part of the loop that the linearisation leaves out,
+            for example "how the program at m2 reacts to the arms". Empty if the linearisation
+            is complete.
         is_numerical: True if the code of a user's law was differentiated numerically. Such
             roots can refute a run, but not prove it stable.
-        swing_rate_per_s: Largest real part of the computed roots that oscillate, in 1/s. None
+        swing_rate_per_s: Largest real part of the computed roots that oscillate, in 1/s. `None`
             if no computed root oscillates.
         omega_rad_s: Angular frequency of the root with the largest real part, in rad/s.
         drifting: Number of motions that keep their speed, because of the structure of the loop.
@@ -114,14 +114,14 @@ class LoopRoots(NamedTuple):
 
     @property
     def text(self) -> str:
-        """A sentence on the roots, or on the reason why there are none, for the user.
+        """A sentence for the user on the roots, or on the reason why there are no roots.
 
         The package `presentation` writes it.
         """
         return str(find_hook("describe a finding")(self))
 
     def to_json(self) -> JsonObject:
-        """Returns the roots as values for JSON, with the sentence about them."""
+        """Converts the roots to plain values for JSON, with the sentence about them."""
         return {
             "verdict": self.verdict,
             "rate_per_s": self.rate_per_s,
@@ -138,7 +138,8 @@ class LoopRoots(NamedTuple):
         """The verdict on small motions about the final pose that the roots prove.
 
         It is "stable" if the motions decay and "unstable" if they grow. Only exact roots prove
-        it: those of a loop with its ticks and its repeating delays. Empty otherwise.
+        a verdict: those of a loop with its ticks and its repeating delays. Empty if the roots
+        are not exact.
         """
         return self.verdict if self.exact else ""
 
@@ -153,19 +154,20 @@ class LoopRoots(NamedTuple):
         return self.proven == "unstable"
 
     def measure_decay_misfit(self, end: RunEnd) -> float:
-        """Measures how badly the slow decay of these roots explains an end that looks lasting.
+        """Measures how poorly the slow decay of the roots explains motion that seems to last.
 
         An oscillation is compared with the roots that oscillate, because another slow root does
         not explain the oscillation, and a drift with the slowest root. The decay is compatible
-        if the root halves the motion at most once in the judged part, so that no trend can show
-        the decay, or if |e| and |qd| have the rate of the root.
+        in two cases: if the root halves the motion at most once in the judged part, because no
+        trend can then show the decay, or if |e| and |qd| have the rate of the root.
 
         Args:
             end: How the motion ends.
 
         Returns:
-            A share without unit: at most 1 if the end may be the decay, infinity if the roots
-            are not numerical or not stable, or if the motion grows or is not lasting.
+            A share without unit: at most 1 if the motion at the end may be the decay, infinity
+            if the roots are not numerical or not stable, or if the motion grows or is not
+            lasting.
         """
         is_swing = end.behaviour is EndBehaviour.BOUNDED
         is_lasting = is_swing or end.behaviour is EndBehaviour.DRIFTS
@@ -200,7 +202,7 @@ class LoopRoots(NamedTuple):
 
 
 def _compute_rate_misfit(measured_per_s: float, root_per_s: float) -> float:
-    """Returns the difference of a measured rate and a root, divided by its tolerance."""
+    """Returns the difference between a measured rate and a root, divided by its tolerance."""
     tolerance_per_s = _RATE_AGREEMENT_SHARE * abs(root_per_s) + _RATE_AGREEMENT_PER_S
     return abs(measured_per_s - root_per_s) / tolerance_per_s
 
@@ -210,15 +212,15 @@ class RunFindings(NamedTuple):
 
     Attributes:
         end: How the motion ends.
-        twins: How small pushes in repeated runs develop. None if no run was repeated.
-        roots: Roots of the loop at the end of the run. None if they were not computed.
+        twins: How small pushes in repeated runs develop. `None` if no run was repeated.
+        roots: Roots of the loop at the end of the run. `None` if they were not computed.
         is_covered: True if the stability theorem proves the loop stable.
         law_proofs: Phrases that name the stability conditions of control laws that prove the
             loop stable.
         doubts: Findings that contradict a stable run, such as an energy function that rises, or
             missing records.
-        rises: True if the energy function V of the stability proof rose by energy that nobody
-            supplied.
+        rises: True if the energy function V of the stability proof rose without supplied
+            energy.
     """
 
     end: RunEnd
@@ -236,7 +238,7 @@ class RunFindings(NamedTuple):
 
     @property
     def proven_by_roots(self) -> str:
-        """The verdict that the roots prove: "stable", "unstable", or empty for none."""
+        """The verdict that the roots prove: "stable", "unstable", or empty if there is none."""
         return "" if self.roots is None else self.roots.proven
 
 
@@ -247,9 +249,10 @@ class StabilityDecision(NamedTuple):
         stability: The decision.
         findings: The evidence.
         basis: Name of the evidence on which the decision rests.
-        obstacles: Names of what prevents a better decision. Empty if the run is stable.
+        obstacles: Names of the reasons that prevent a better decision. Empty if the run is
+            stable.
         advised_s: Length of a run that would show the decay of the slowest motion clearly, in
-            s. None if none is advised.
+            s. `None` if none is advised.
     """
 
     stability: Stability
@@ -260,7 +263,7 @@ class StabilityDecision(NamedTuple):
 
     @property
     def rests_on(self) -> str:
-        """What the decision rests on, as a phrase for the user. Empty if it rests on nothing.
+        """Phrase for the user that names the evidence of the decision. May be empty.
 
         The package `presentation` writes it.
         """
@@ -268,7 +271,7 @@ class StabilityDecision(NamedTuple):
 
     @property
     def reasons(self) -> tuple[str, ...]:
-        """Sentences that prevent a better decision. Empty if the run is stable.
+        """Sentences on the reasons that prevent a better decision. Empty if the run is stable.
 
         The package `presentation` writes them.
         """
@@ -282,5 +285,5 @@ class StabilityDecision(NamedTuple):
 
     @property
     def is_too_short(self) -> bool:
-        """True if only the length of the record prevents a better decision."""
+        """True if a better decision is prevented only by the length of the record."""
         return "short record" in self.obstacles

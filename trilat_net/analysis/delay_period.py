@@ -2,8 +2,8 @@
 
 A stability analysis of a loop with changing delays covers one such period. For example, two
 sinusoidal delays with periods of 1.20 s and 1.21 s repeat together after 145.2 s, the least
-common multiple. A delay may also be constant, or follow a trace, a table of delays by time that
-starts again at its end.
+common multiple. A delay may also be constant, or follow a trace, which is a table of delays
+over time that is repeated from the start.
 
 Invariant:
     - Periods are computed in exact fractions of a second, so that no rounding error turns a
@@ -24,19 +24,21 @@ from ..scenario import LinkBase, Scenario
 MAX_PERIOD_TICKS = 400_000
 """Longest true period that is analysed, in ticks of the fastest site."""
 MAX_NEAR_PERIOD_S = 60.0
-"""Longest near period that is searched, and longest analysed span of a delay trace, in s."""
+"""Longest approximate period that is considered, and longest analysed span of a delay trace, in
+s.
+"""
 _SLIP = 0.05
-"""Largest change of delays that count as repeating after a span, as a share of a tick.
+"""Largest change of the delays after a span at which they count as repeating, in ticks.
 
-If there is no such span, the span with the smallest slip is used, up to half a tick.
+If there is no such span, the span with the smallest change is used, up to half a tick.
 """
 _US_PER_S = 1_000_000
 
 
 def _find_cycle(link: LinkBase) -> Fraction | None:
-    """Returns the period of a link's delay, in s. None if its delay is constant or random.
+    """Returns the period of a link's delay, in s. `None` if its delay is constant or random.
 
-    The period is a fraction of whole numbers, so that common multiples of periods are exact.
+    The period is a fraction of whole numbers, which makes common multiples of periods exact.
 
     Args:
         link: Delay model of the link.
@@ -62,7 +64,7 @@ def find_link_period_s(link: LinkBase) -> float | None:
         link: Delay model of the link.
 
     Returns:
-        The period. None if the delay is constant, random or measured, or follows a trace that
+        The period. `None` if the delay is constant, random or measured, or follows a trace that
         ends.
     """
     if is_ending_trace(link):
@@ -103,12 +105,12 @@ def _find_near_period_s(
         rates_hz: Tick rate of each site.
 
     Returns:
-        The time, at most `MAX_NEAR_PERIOD_S`. None if there is none.
+        The time, at most `MAX_NEAR_PERIOD_S`. `None` if there is none.
     """
     common_hz = math.gcd(*rates_hz)
     span_count = round(MAX_NEAR_PERIOD_S * common_hz)
     spans_s = np.arange(1, span_count + 1) / common_hz
-    # share of a tick by which the delays fail to repeat after each span
+    # distance, in ticks, by which the delays fail to repeat after each span
     slips = np.zeros(len(spans_s))
     for cycle in cycles:
         cycle_s = float(cycle)
@@ -130,9 +132,9 @@ class _DelayPeriod(NamedTuple):
     analysis of a sampled loop needs such a period.
 
     Attributes:
-        true_s: The period, in s. None if some delay never repeats.
-        span_s: A period that can be analysed, in s: the true one, or a shorter one after which
-            the delays repeat to within half a tick. None if there is neither.
+        true_s: The period, in s. `None` if some delay never repeats.
+        span_s: A period that can be analysed, in s: the true period, or a shorter time after
+            which the delays repeat to within half a tick. `None` if there is neither.
     """
 
     true_s: float | None
@@ -140,9 +142,9 @@ class _DelayPeriod(NamedTuple):
 
     @property
     def is_exact(self) -> bool:
-        """True if the analysed period is the true one, so that results for it hold for ever.
+        """True if the analysed period is the true period, so that results hold for all time.
 
-        False if the analysed period is only nearly the true one, or if there is none.
+        False if the analysed period is only an approximation, or if there is no period.
         """
         return self.span_s is not None and self.span_s == self.true_s
 
@@ -151,15 +153,17 @@ def find_delay_period(links: Sequence[LinkBase], rates_hz: Sequence[int]) -> _De
     """Finds the period after which the delays of links and the ticks of sites repeat.
 
     A tick is one period of a site's control loop. The true period is the least common multiple
-    of the ticks and of the periods of all delays. If it is longer than `MAX_PERIOD_TICKS`, a
-    shorter time is searched after which the delays nearly repeat.
+    of the ticks and of the periods of all delays. If the true period is longer than
+    `MAX_PERIOD_TICKS`, the function looks for a shorter time after which the delays nearly
+    repeat.
 
     Args:
         links: Delay models of the links.
         rates_hz: Tick rate of each site.
 
     Returns:
-        The period. It has no values if a delay is random, or follows a trace that ends.
+        The period. Its attributes are `None` if a delay is random, or follows a trace that
+        ends.
     """
     for link in links:
         if link.random or link.measured or is_ending_trace(link):
@@ -175,7 +179,7 @@ def find_delay_period(links: Sequence[LinkBase], rates_hz: Sequence[int]) -> _De
 def is_ending_trace(link: LinkBase) -> bool:
     """Returns True if a link plays a delay trace that does not start again at its end.
 
-    The delay after this end is not a repetition, so that the link has no period.
+    The delay after this end is not a repetition, so the link has no period.
 
     Args:
         link: Delay model of the link.
@@ -187,7 +191,7 @@ def is_ending_trace(link: LinkBase) -> bool:
 def find_final_link(scenario: Scenario, name: str) -> LinkBase:
     """Returns the delay model of a link that is in force at the end of a scenario.
 
-    The linear analysis of a run belongs to this model, because it concerns the final pose.
+    The linear analysis of a run uses this model, because it concerns the final pose.
 
     Args:
         scenario: Description of the experiment. Its timeline may change the link.
@@ -203,7 +207,7 @@ def find_final_link(scenario: Scenario, name: str) -> LinkBase:
 def find_final_delay_period(scenario: Scenario) -> _DelayPeriod:
     """Finds the time after which all delays and control periods repeat at the end of a run.
 
-    Models and rates that the scenario changes earlier do not count.
+    Models and rates that the scenario replaces before the end do not count.
 
     Args:
         scenario: Description of the experiment.
@@ -214,7 +218,7 @@ def find_final_delay_period(scenario: Scenario) -> _DelayPeriod:
 
 
 def find_burst_interval_s(scenario: Scenario) -> float | None:
-    """Finds the mean time from one burst of lost samples to the next one, in s.
+    """Finds the mean time from one burst of lost samples to the next, in s.
 
     Bursts follow the Gilbert-Elliott model: a sample that arrives may be followed by a burst,
     in which a share `loss_bad` of the samples is lost. If a sample leaves a burst with the
@@ -224,8 +228,8 @@ def find_burst_interval_s(scenario: Scenario) -> float | None:
         scenario: Description of the experiment.
 
     Returns:
-        The longest of these times of all links that are in force at the end of the scenario.
-        None if no link loses samples in bursts.
+        The longest of these times over all link models that are in force at the end of the
+        scenario. `None` if no link loses samples in bursts.
     """
     intervals_s = []
     for name in scenario.links:

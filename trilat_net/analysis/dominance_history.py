@@ -1,4 +1,4 @@
-"""Computes the weights with which arms follow each other over a run, and their energy weights.
+"""Computes the weights with which arms follow each other, and the energy weights of the arms.
 
 A slave may follow two masters, for example with weights 0.7 and 0.3, and these weights may
 change during the run, at once or in a ramp. The weight with which arm i follows arm j is called
@@ -30,7 +30,9 @@ from ..log import Ints, Log
 from ..scenario import POLICY, Scenario
 
 RAMP_TIME_TOLERANCE_S = 5e-10
-"""Half of the nanosecond to which the starts and ends of ramps are rounded, in s."""
+"""Tolerance for the starts and ends of ramps, in s: half of the nanosecond to which they are
+rounded.
+"""
 
 
 class DominanceHistory(NamedTuple):
@@ -64,9 +66,9 @@ class DominanceHistory(NamedTuple):
 def trace_dominance(log: Log, site: str, t_s: Array) -> DominanceHistory:
     """Returns the dominance factors of a site at successive ticks.
 
-    They change by the timeline of the scenario and by commands during the run. If the site lost
-    a peer and continues without it, the factors of the others are scaled so that their sum is
-    1.
+    The factors change according to the timeline of the scenario and the commands during the
+    run. If the site lost a peer and continues without it, the factors of the others are scaled
+    so that their sum is 1.
 
     Args:
         log: The log of the run.
@@ -102,17 +104,16 @@ def trace_dominance(log: Log, site: str, t_s: Array) -> DominanceHistory:
 def list_ramps(log: Log, site: str) -> tuple[Array, list[DominanceRamp]]:
     """Lists the planned and commanded changes of the weights with which a site follows others.
 
-    A site is the process that runs one arm. It follows each of its P peers with a weight, the
-    dominance factor. Every change is a ramp from the old to the new factors. A sudden change is
-    a ramp without length.
+    A site is the process that runs one arm. A site follows each of its P peers with a weight,
+    the dominance factor. Every change is a ramp from the old to the new factors. A sudden
+    change is a ramp without length.
 
     Args:
         log: The log of the run.
         site: Name of the site.
 
     Returns:
-        The factors at the start, shape (P,).
-        The ramps.
+        The factors at the start, shape (P,). The ramps.
 
     Raises:
         LogError: A recorded change is not valid.
@@ -133,8 +134,8 @@ def find_users(scenario: Scenario) -> tuple[str, list[str]]:
         scenario: The description of the experiment.
 
     Returns:
-        Name of the first slave. Empty if there is none.
-        Names of all masters, each of which stands for its user.
+        Name of the first slave, empty if there is no slave. Names of all masters, each of which
+        represents its user.
     """
     slaves = []
     masters = []
@@ -152,7 +153,7 @@ class UserShares(NamedTuple):
 
     The slave follows the master of each user with a weight, the dominance factor. For example,
     shares of 0.7 and 0.3 mean that the first user leads. In some experiments a program moves
-    the arm of one user. While another user leads, a person intervenes.
+    the arm of one user. Whenever another user leads, a person intervenes.
 
     Attributes:
         shares: The slave's dominance factors for its U users, shape (K, U).
@@ -169,8 +170,8 @@ class UserShares(NamedTuple):
 def find_program(log: Log) -> str:
     """Returns the user whose arm a program moved in a run.
 
-    It is the last user with a hand of kind "own", or otherwise the last user whose arm a policy
-    held, through the LeRobot plugin or in an environment.
+    This is the last user with a hand of kind "own", or otherwise the last user whose arm a
+    policy moved, through the LeRobot plugin or in an environment.
 
     Args:
         log: Log of the run.
@@ -181,7 +182,7 @@ def find_program(log: Log) -> str:
     users = find_users(log.scenario)[1]
     held_by_policy = [user for user in users if _is_held_by_policy(log, user)]
     moved_by_program = [user for user in users if log.scenario.sites[user].has_program_hand]
-    # the last candidate wins, and without any the name is empty
+    # the last candidate wins, and the name is empty if there is no candidate
     candidates = ["", *held_by_policy, *moved_by_program]
     return candidates[-1]
 
@@ -189,8 +190,8 @@ def find_program(log: Log) -> str:
 def list_program_sites(log: Log) -> list[str]:
     """Lists the sites whose arms a program moved in a run, in scenario order.
 
-    The program is a hand of kind "own", or a policy that held the arm through the LeRobot
-    plugin or in an environment. It reacts to the motion of the arms, unlike a script.
+    The program is a hand of kind "own", or a policy that moved the arm through the LeRobot
+    plugin or in an environment. Unlike a script, the program reacts to the motion of the arms.
 
     Args:
         log: Log of the run.
@@ -250,9 +251,9 @@ def find_user_shares(scenario: Scenario, alpha: Array, program: str = "") -> Use
 
 
 def find_lost_peers(log: Log, site: str, t_s: Array) -> NDArray[np.bool_]:
-    """Finds the times at which an arm continued without another arm that it had lost.
+    """Finds the times at which an arm continued without another arm whose messages had stopped.
 
-    An arm is lost if nothing was heard of it for some time, see `core.lost_peers`.
+    An arm counts as lost if no message from it arrived for some time, see `core.lost_peers`.
 
     Args:
         log: The log of the run.
@@ -300,16 +301,16 @@ class PeerLoss(NamedTuple):
 
 
 def list_losses(log: Log) -> list[PeerLoss]:
-    """Lists when sites continued without a peer that they no longer heard.
+    """Lists the times in which sites continued without a peer whose messages had stopped.
 
-    In these times the dominance factors differ from the planned ones, because a site gives the
-    share of the lost peer to the others.
+    In these times the dominance factors differ from the planned ones, because a site
+    distributes the share of the lost peer among the others.
 
     Args:
         log: The log of the run.
 
     Returns:
-        Each span of time, by site and peer. Empty if no peer was lost.
+        The spans of time, ordered by site and peer. Empty if no peer was lost.
     """
     losses = []
     for site in log.sites:
@@ -336,7 +337,7 @@ def list_losses(log: Log) -> list[PeerLoss]:
 def list_scripted_ramps(scenario: Scenario, site: str) -> tuple[Array, list[DominanceRamp]]:
     """Lists the changes of dominance factors that the scenario plans for an arm.
 
-    They are the weights with which the arm follows its P peers, the other arms.
+    Dominance factors are the weights with which the arm follows its P peers, the other arms.
 
     Args:
         scenario: The description of the experiment.
@@ -357,10 +358,10 @@ def drop_finished_ramps(
     ramps: Sequence[DominanceRamp],
     from_s: float,
 ) -> tuple[Array, list[DominanceRamp]]:
-    """Removes changes of dominance factors that were complete before a given time.
+    """Removes changes of dominance factors that were completed before a given time.
 
     A ramp is a linear change of the factors, the weights with which an arm follows others. The
-    start factors are changed so that the factors from this time on stay the same.
+    start factors are adapted so that the factors after this time stay the same.
 
     Args:
         start: Factors at the start of the session, shape (P,).
@@ -444,7 +445,7 @@ def evaluate_ramps(
 def plan_dominance(scenario: Scenario, site: str, t_s: Array) -> Array:
     """Returns the dominance factors of an arm over time, as its scenario plans them.
 
-    A dominance factor is the weight, from 0 to 1, with which an arm follows another one. A
+    A dominance factor is the weight, from 0 to 1, with which an arm follows another arm. A
     scenario can shift these weights during the run, for example from a teacher to a student.
 
     Args:
@@ -467,17 +468,17 @@ KD_SHAPE_TOLERANCE = 1e-9
 class _LyapunovWeights(NamedTuple):
     """Weights beta of the N arms in the energy function V of the stability proof.
 
-    With these weights the energies that arms transfer to each other cancel in V. They follow
-    from the matrix alpha of the dominance factors and from the damping gains Kd.
+    With these weights the energies that arms transfer to each other cancel in V. The weights
+    follow from the matrix alpha of the dominance factors and from the damping gains Kd.
 
     Attributes:
         beta: Weight of each site, shape (N,), with the sum N. With equal dominance factors each
             weight is 1, as in the paper.
-        groups: Groups of sites that follow nobody outside their group, as tuples of indices.
+        groups: Groups of sites that follow no site outside their group, as tuples of indices.
             With a single group the left eigenvector pi of alpha is unique, though some of its
             entries may be 0. With several groups beta is not unique.
         scales: Factors c_i such that Kd_i = c_i Kbar with a common Kbar, and c_i = 1 for the
-            first site, shape (N,). None if no such factors exist.
+            first site, shape (N,). `None` if no such factors exist.
     """
 
     beta: Array
@@ -486,9 +487,9 @@ class _LyapunovWeights(NamedTuple):
 
 
 def find_closed_groups(alpha: Array) -> tuple[tuple[int, ...], ...]:
-    """Finds the groups of arms that follow each other, and that follow nobody else.
+    """Finds the groups of arms that follow each other, and no arm outside the group.
 
-    An arm may follow another one directly or through further arms. If there are several groups,
+    An arm may follow another arm directly or through further arms. If there are several groups,
     the weights of the arms in the energy function V are not unique.
 
     Args:
@@ -514,9 +515,10 @@ def find_closed_groups(alpha: Array) -> tuple[tuple[int, ...], ...]:
 def left_perron_vector(alpha: Array) -> Array:
     """Returns the left eigenvector pi of the dominance factors for the eigenvalue 1.
 
-    It satisfies pi >= 0, pi' alpha = pi', and its sum is 1. A closed group is a group of sites
-    that follow nobody outside the group. pi is 0 for sites outside closed groups. With several
-    closed groups pi is not unique: each group then counts by its number of sites.
+    The vector satisfies pi >= 0 and pi' alpha = pi', and its sum is 1. A closed group is a
+    group of sites that follow no site outside the group. pi is 0 for sites outside closed
+    groups. With several closed groups pi is not unique: the sum of its entries in each group is
+    then chosen proportional to the number of sites in the group.
 
     Args:
         alpha: Matrix of the dominance factors, shape (N, N).
@@ -537,15 +539,15 @@ def left_perron_vector(alpha: Array) -> Array:
 def find_kd_scales(Kd: Array) -> Array | None:
     """Finds the ratio of the damping gain Kd of each arm to the gain of the first arm.
 
-    The stability proof allows arms with different gains if all joints have the same ratio: the
-    weights of the arms in V then balance it.
+    The stability proof allows arms with different gains if all joints have the same ratio,
+    because the weights of the arms in V then compensate for the ratio.
 
     Args:
         Kd: Damping gains of the N arms along n axes, shape (N, n). NaN along an axis that an
             arm does not follow.
 
     Returns:
-        The ratios, shape (N,). All are 1 if all gains are zero. None if the gains of the arms
+        The ratios, shape (N,). All are 1 if all gains are zero. `None` if the gains of the arms
         are not multiples of each other.
     """
     if not np.nan_to_num(Kd).any():
@@ -569,10 +571,11 @@ def find_kd_scales(Kd: Array) -> Array | None:
 def compute_lyapunov_weights(alpha: Array, Kd: Array) -> _LyapunovWeights:
     """Computes the weight of each site in the energy function of the stability proof.
 
-    A site is the process that runs one arm. Its weight is beta_i = pi_i / c_i, where pi is the
-    left eigenvector of `alpha` for the eigenvalue 1, and c_i is the factor between the damping
-    gain of site i and that of the first site. The weights are scaled so that their sum is N. If
-    the gains differ by more than a factor, c_i = 1 is used, and the energy may rise.
+    A site is the process that runs one arm. The weight of site i is beta_i = pi_i / c_i, where
+    pi is the left eigenvector of `alpha` for the eigenvalue 1, and c_i is the factor between
+    the damping gain of site i and that of the first site. The weights are scaled so that their
+    sum is N. If the gains are not multiples of each other, c_i = 1 is used, and the energy may
+    rise.
 
     Args:
         alpha: Dominance factors: entry (i, j) is the weight with which site i follows site j,

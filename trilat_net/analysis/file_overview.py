@@ -5,10 +5,10 @@ message rates. For a log of this program it adds how well the control loops, the
 and the clocks worked. `summarise_run` computes the content of the file `summary.json` of a run.
 
 Invariant:
-    - The list of channels and messages decodes no message, so that it works for any MCAP file.
-      If a log cannot be opened, the overview states the reason.
+    - The channels and messages are listed without decoding any message. Therefore the list
+      works for any MCAP file. If a log cannot be opened, the overview states the reason.
     - Missing messages are counted only in channels whose messages have consecutive numbers.
-    - Keys end in their unit. A quantity that the log does not determine is None, never NaN.
+    - Keys end in their unit. A quantity that the log does not determine is `None`, never NaN.
     - A run is never executed again for its summary.
 """
 
@@ -87,7 +87,7 @@ class FileInventory:
     Args:
         paths: The files.
         progress: Function that is called with the number of bytes read so far and with the
-            number of all bytes.
+            total number of bytes.
 
     Attributes:
         files: Size, compression, damage and other facts of every file, with keys that end in
@@ -95,7 +95,7 @@ class FileInventory:
         metadata: Metadata records of all files, by name. A later file replaces an earlier one.
 
     Raises:
-        LogError: A file cannot be read, or is no MCAP file.
+        LogError: A file cannot be read, or is not an MCAP file.
     """
 
     def __init__(self, paths: Sequence[Path], progress: Progress | None = None) -> None:
@@ -225,7 +225,7 @@ def _count_gaps(
     rates_hz: Mapping[str, int],
     absences: Absences,
 ) -> JsonObject:
-    """Counts the messages that are missing from a channel, and those that it has twice.
+    """Counts the missing and the duplicate messages of a channel.
 
     Only the records and the link statistics of a site have consecutive numbers. Ticks during
     which the site was absent, or which the site skipped, are not missing.
@@ -239,7 +239,7 @@ def _count_gaps(
 
     Returns:
         The number of missing messages, the gaps as spans of message numbers, and the number of
-        duplicates. All are None for channels without consecutive numbers.
+        duplicates. All are `None` for channels without consecutive numbers.
     """
     key = topics.parse_key(topic.removeprefix("/"))
     if key is None or key.session != session or key.member not in rates_hz:
@@ -303,8 +303,8 @@ def info(*files: str | Path, progress: Progress | None = None) -> FileOverview:
     """Returns the content of an MCAP file, or of the parts of one log.
 
     `trilat log info` shows the same. The key `kind` is "trilat" for a log of this program that
-    could be opened. Otherwise it is "mcap", and `problem` states the reason if the file looks
-    like such a log.
+    could be opened. Otherwise `kind` is "mcap", and `problem` states why the log could not be
+    opened if the file looks like a log of this program.
 
     >>> path = tn.simulate("two_sites", duration_s=0.1).save("short.mcap")
     >>> tn.info(path).to_dict()["sites"]["m"]["records"]
@@ -312,10 +312,11 @@ def info(*files: str | Path, progress: Progress | None = None) -> FileOverview:
 
     Args:
         files: The file, or the parts of one log.
-        progress: Function that is called with the work done so far and with the whole work.
+        progress: Function that is called with the amount of work done so far and with the total
+            amount.
 
     Raises:
-        LogError: A file cannot be read, or is no MCAP file.
+        LogError: A file cannot be read, or is not an MCAP file.
     """
     paths = [Path(file) for file in files]
 
@@ -330,7 +331,7 @@ def info(*files: str | Path, progress: Progress | None = None) -> FileOverview:
                 second.
 
         Returns:
-            The function. It is None if the caller of `info` wants no reports.
+            The function. `None` if the caller of `info` requests no progress reports.
         """
         if progress is None:
             return None
@@ -387,8 +388,8 @@ _LAST_EPOCH_NS = 253_402_300_799 * NS_PER_S
 def _describe_session(log: Log) -> JsonObject:
     """Collects the facts about the session of a log that `trilat log info` shows.
 
-    They are the start time, the length, how each site ended, the scenario, and the versions of
-    the programs that made the log.
+    The facts are the start time, the length, the end of each site, the scenario, and the
+    versions of the programs that wrote the log.
 
     Args:
         log: The log.
@@ -440,9 +441,9 @@ def _describe_session(log: Log) -> JsonObject:
 
 
 def describe_site_health(log: Log, site: str) -> JsonObject:
-    """Collects how completely an arm was recorded, and how punctual its control loop was.
+    """Collects facts on the completeness of an arm's records and the timing of its loop.
 
-    The timing is None in a simulation, in which no clock is read.
+    The timing is `None` in a simulation, in which no clock is read.
 
     Args:
         log: The log of the run.
@@ -469,11 +470,11 @@ def describe_site_health(log: Log, site: str) -> JsonObject:
 
 
 def _describe_link_health(log: Log, peer: str, site: str) -> JsonObject:
-    """Collects how well the link from a peer to a site worked.
+    """Collects facts on how well the link from a peer to a site worked.
 
     The facts are the delay that the scenario prescribes, the age of the samples in use, the
     measured one-way delay, the offset of the clocks, and the last counts that the site
-    published. A fact that the log does not contain is None.
+    published. A fact that the log does not contain is `None`.
 
     Args:
         log: The log of the run.
@@ -520,11 +521,11 @@ def _compute_percentiles(
 
     Args:
         values: The numbers.
-        shares: Percentage of each percentile, by the name that the result uses.
+        shares: Percentage of each percentile, by the name of the percentile in the result.
         unit: Number by which the values are divided, to change their unit.
 
     Returns:
-        The percentiles, by name. None if there are no numbers.
+        The percentiles, by name. `None` if there are no numbers.
     """
     numbers = np.asarray(values)
     if not numbers.size:
@@ -537,14 +538,14 @@ def _compute_percentiles(
 def _count_executed_ticks(log: Log, site: str) -> int | None:
     """Returns how many control periods (ticks) an arm's process executed, by its own report.
 
-    The process reports the number at the end of a run, in its event "end".
+    The process reports this number in its event "end" at the end of a run.
 
     Args:
         log: The log of the run.
         site: Name of the site.
 
     Returns:
-        The number in the last such event. None if the site published none.
+        The number in the last event "end". `None` if the site published no such event.
     """
     ticks = None
     for event in log.events:
@@ -561,7 +562,7 @@ def _count_overruns(site_log: SiteLog) -> int:
 
 
 def _parse_number(text: str) -> int | None:
-    """Parses a number of at most 19 decimal digits. Returns None for any other text."""
+    """Parses a number of at most 19 decimal digits. Returns `None` for any other text."""
     is_number = text.isascii() and text.isdigit()
     if is_number and len(text) < 20:
         return int(text)
@@ -569,17 +570,17 @@ def _parse_number(text: str) -> int | None:
 
 
 def summarise_run(log: Log, twin: Log | None = None) -> JsonObject:
-    """Collects the most important numbers of a run, for the file `summary.json`.
+    """Collects the most important quantities of a run, for the file `summary.json`.
 
-    The log may be torn, short or empty. Numbers that the log does not determine are None.
+    The log may be torn, short or empty. Quantities that the log does not determine are `None`.
 
     Args:
         log: The log of the run.
         twin: Log of the same run without operators, from which the effect of the operators is
-            computed. None if there is no such log.
+            computed. `None` if there is no such log.
 
     Returns:
-        The numbers as plain values, ready for JSON.
+        The quantities as plain values, ready for JSON.
     """
     sites = {site: _summarise_site(log, site, twin) for site in log.sites}
     settling_times_s = [site["settle_s"] for site in sites.values()]
@@ -631,14 +632,14 @@ def summarise_run(log: Log, twin: Log | None = None) -> JsonObject:
 
 
 def _summarise_site(log: Log, site: str, twin: Log | None) -> JsonObject:
-    """Returns the most important numbers of one arm in a run, such as its largest error.
+    """Returns the most important quantities of one arm in a run, such as its largest error.
 
-    They are written to `summary.json`, so that other programs can read them.
+    These quantities are written to `summary.json`, from which other programs can read them.
 
     Args:
         log: The log of the run.
         site: Name of the site.
-        twin: Log of the same run without operators, or None.
+        twin: Log of the same run without operators, or `None`.
     """
     site_log = log[site]
     spec = log.scenario.sites[site]
@@ -689,7 +690,7 @@ def _summarise_site(log: Log, site: str, twin: Log | None) -> JsonObject:
 
 
 def _summarise_link(log: Log, link: LinkSummary) -> JsonObject:
-    """Returns the numbers of a link for `summary.json`, such as its delays and losses."""
+    """Returns the quantities of a link for `summary.json`, such as its delays and losses."""
     counts = link.counts
     clock = summarise_clock(log, link.peer, link.site)
 
@@ -729,6 +730,6 @@ def _summarise_link(log: Log, link: LinkSummary) -> JsonObject:
 
 
 def _largest_magnitude(values: ArrayLike) -> float | None:
-    """Returns the largest absolute value. None without values."""
+    """Returns the largest absolute value. Returns `None` if there are no values."""
     magnitudes = np.abs(np.asarray(values))
     return float(magnitudes.max()) if magnitudes.size else None

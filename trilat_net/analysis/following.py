@@ -69,7 +69,7 @@ def find_task_reference(
 
 
 class JointFollowing(NamedTuple):
-    """How a site that follows joint by joint turns errors into motion and torque.
+    """Converts errors to motion and torque for a site that follows joint by joint.
 
     Its coordinates are the joint angles. Therefore every function is a product with a gain, or
     the identity. `TaskFollowing` has the same methods for sites that follow with the end
@@ -92,8 +92,8 @@ class JointFollowing(NamedTuple):
         The velocity is -Lambda e, with the error e of the joints and the gain Lambda, in 1/s.
 
         Args:
-            rows: Rows of the records. They have no effect, because the result depends on no
-                pose.
+            rows: Rows of the records. They have no effect, because the result does not depend
+                on the pose.
             e: Differences between the joint angles and the angles that the arm follows, shape
                 (K, n), in rad.
             ed: Derivatives of the errors, shape (K, n), in rad/s.
@@ -110,7 +110,8 @@ class JointFollowing(NamedTuple):
         The error e jumps by de. As r = qd + Lambda e, the jump is Lambda de, shape (K, n).
 
         Args:
-            rows: Rows of the records. Not needed here, as the result depends on no pose.
+            rows: Rows of the records. Not needed here, because the result does not depend on
+                the pose.
             de: Jumps of e, shape (K, n), in rad.
         """
         return self.Lambda * de
@@ -121,7 +122,8 @@ class JointFollowing(NamedTuple):
         The shared coordinates are the joint angles here. Therefore the force is the torque.
 
         Args:
-            rows: Rows of the records. Not needed here, as the result depends on no pose.
+            rows: Rows of the records. Not needed here, because the result does not depend on
+                the pose.
             force: Generalised force, shape (K, n), in N m.
         """
         return force
@@ -158,7 +160,7 @@ class JointFollowing(NamedTuple):
 
 @dataclass(frozen=True)
 class TaskFollowing:
-    """How a site that follows with its end effector turns errors into motion and torque.
+    """Converts errors to motion and torque for a site that follows with its end effector.
 
     The arm has n joints, and its end effector follows along some of the m coordinates of the
     task. Joints that the task leaves free move towards a preferred posture. Near singular
@@ -279,7 +281,7 @@ class TaskFollowing:
         return replace(self, psi=still, psi_rate=still)
 
     def compute_damping_deviation(self, rows: Rows, e: Array) -> tuple[Array, Array]:
-        """Returns by how much damping near singular poses violates two equations of the proof.
+        """Returns how much the damping near singular poses violates two equations of the proof.
 
         Without damping, the equations J r = xd + Lambda e and a = dv/dt hold exactly. Here J is
         the Jacobian, r the filtered error, xd the velocity of the end effector, e its error and
@@ -325,7 +327,8 @@ def build_following(
     An arm follows either joint by joint or with its end effector (tip).
 
     Args:
-        arm: The arm. If it has a task for its end effector, it follows with the end effector.
+        arm: The arm. If the arm has a task for its end effector, it follows with the end
+            effector.
         q: Joint angles in K records, shape (K, n) for n joints, in rad.
         qd: Joint velocities, shape (K, n), in rad/s.
         Lambda: Gain of the error in 1/s, shape (n,). If the arm follows with its end effector,

@@ -1,11 +1,11 @@
 """Decides whether a recorded or simulated run is stable, from all available evidence.
 
-The commands of the program call this module, so that all of them decide alike. `certify_run`
-judges the log of a run by three kinds of evidence: the energy function V of the stability
-proof, repetitions of the run with small disturbances (twins), and the characteristic roots of
-the linearised control loop. `judge_virtual_run` judges a simulated run without a log, for
-example one run of a parameter sweep. To save computing time, it computes V only if V may change
-the decision.
+All commands of the program call this module and therefore reach the same decision.
+`certify_run` judges the log of a run by three kinds of evidence: the energy function V of the
+stability proof, repetitions of the run with small disturbances (twins), and the characteristic
+roots of the linearised control loop. `judge_virtual_run` judges a simulated run without a log,
+for example one run of a parameter sweep. To save computing time, it computes V only if V may
+change the decision.
 
 Invariant:
     - All commands decide by `analysis.stability_decision.decide_stability`, with roots from
@@ -24,7 +24,7 @@ from .blas_threads import limit_blas_threads
 from .certificate.certificate_result import Certificate
 from .certificate.observed_energy import find_energy_laws
 from .certificate.premises import find_missing_functionals
-from .certificate.stability_certificate import certify
+from .certificate.stability_certificate import certify_log
 from .decision_facts import LoopRoots, RunFindings, StabilityDecision
 from .delay_period import find_final_link
 from .run_end import RunEnd, RunTrace, Stability
@@ -38,14 +38,14 @@ from .twins.twin_growth import TwinGrowth
 def list_law_proofs(scenario: Scenario) -> list[str]:
     """Lists the stability conditions of control laws that prove that all motions die away.
 
-    They are evaluated for the delays and dominance factors (the weights with which arms follow
-    each other) at the end of the scenario.
+    The conditions are evaluated for the delays and dominance factors (the weights with which
+    arms follow each other) at the end of the scenario.
 
     Args:
         scenario: Description of the experiment.
 
     Returns:
-        A phrase per condition. Empty unless the condition of every site holds and proves it.
+        A phrase per condition. Empty unless the condition of every site holds and is a proof.
     """
     if any(change.dominance for change in scenario.timeline):
         return []
@@ -70,21 +70,22 @@ def certify_run(
 ) -> Certificate:
     """Certifies whether a recorded run was stable, with all available checks.
 
-    In addition to the checks of `certify`, the run is repeated with small pushes, to see
-    whether disturbances grow. The characteristic roots of the coupled arms are computed at the
-    end pose.
+    In addition to the checks of `certify_log`, the run is repeated with small pushes, which
+    shows whether disturbances grow. The characteristic roots of the coupled arms are computed
+    at the end pose.
 
     Args:
         log: The log of the run.
         min_coverage: Least fraction of the ticks (periods of the control loop) of each arm's
             process that must be recorded.
         own_laws: True if the code of users' control laws may be executed.
-        twins: Number of repeated runs with a push. None for one of every joint, 0 for none.
+        twins: Number of repeated runs with a push. `None` for one push of every joint, 0 for no
+            repetition.
 
     Raises:
-        LogError: A record cannot be read, or names a change that does not exist.
+        LogError: A record cannot be read, or contains a change that is not valid.
     """
-    certificate = certify(log, min_coverage=min_coverage, own_laws=own_laws)
+    certificate = certify_log(log, min_coverage=min_coverage, own_laws=own_laws)
 
     growth = None
     if twins != 0:
@@ -121,7 +122,8 @@ class _VirtualJudgement(NamedTuple):
     Attributes:
         end: How the motion ends.
         roots: Roots of the loop at the end of the run.
-        twins: How small pushes in repeated runs develop. None if the roots decide without them.
+        twins: How small pushes in repeated runs develop. `None` if the roots decide without
+            them.
         decision: The decision.
     """
 
@@ -145,7 +147,7 @@ def judge_virtual_run(
     Args:
         scenario: Scenario of the run. Its duration may be shorter than that of the run.
         run: The run in the fused loop.
-        end: How the motion ends. None to find it from the run.
+        end: How the motion ends. If `None`, this is determined from the run.
     """
     # the run may have been longer or shorter than its scenario states
     executed_scenario = scenario
@@ -176,7 +178,7 @@ def judge_virtual_run(
             log: Log = simulate_scenario(executed_scenario)
         else:
             log = simulate_columns(executed_scenario)
-        certificate_of_log = certify(log, own_laws=True)
+        certificate_of_log = certify_log(log, own_laws=True)
         certificate = replace(
             certificate_of_log,
             roots=findings.roots,

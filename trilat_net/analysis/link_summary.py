@@ -11,7 +11,7 @@ seed, the link and the number of the sample. Therefore `predict_delivery` can co
 again from the scenario, even for samples that never arrived.
 
 Invariant:
-    - A quantity that the log does not determine is None.
+    - A quantity that the log does not determine is `None`.
     - Estimates of clocks are reported as they were used while the session ran.
     - Every record of a tick names the samples that arrived. If a record is missing, its samples
       count neither as arrived nor as lost.
@@ -31,10 +31,10 @@ from .timeline import StatedModel, list_changes, list_stated_models
 
 
 class _PredictedDelivery(NamedTuple):
-    """Fate of the first M samples of a link, as the delay model of the link predicts it.
+    """Delivery of the first M samples of a link, as the delay model of the link predicts it.
 
     A sample is the state that a site publishes in one tick. The delay model of the scenario
-    makes the network late, lossy or out of order in a repeatable way, so that the prediction
+    emulates delays, losses and changes of order in a repeatable way. Therefore the prediction
     can be compared with the records. Times are in ns after the start of the session.
 
     Attributes:
@@ -58,7 +58,7 @@ class _PredictedDelivery(NamedTuple):
     def lost(self) -> Bools:
         """Marks the samples that the delay model of the link loses on purpose, shape (M,).
 
-        A receiver must not expect these samples, so that they do not count as missing.
+        A receiver does not expect these samples, and they do not count as missing.
         """
         lost: Bools = self.due_ns == LOST
         return lost
@@ -68,7 +68,8 @@ class _PredictedDelivery(NamedTuple):
         """Delays that the delay model of the scenario adds to the samples, in ms.
 
         Samples that the model loses, and samples that have only the delay of the real network,
-        are left out. Duplicates, reordering and the play-out buffer do not count.
+        are left out. The effects of duplicates, reordering and the play-out buffer are not
+        included.
         """
         delivered = ~self.lost & ~self.measured
         return (self.drawn_ns[delivered] - self.stamp_ns[delivered]) / 1e6
@@ -95,7 +96,7 @@ def predict_delivery(
     site: str,
     count: int,
 ) -> _PredictedDelivery:
-    """Computes when each message of another arm comes into use, as the scenario defines.
+    """Computes when each message of another arm comes into use, as defined by the scenario.
 
     The scenario delays the messages (samples) in a repeatable way to emulate a network.
 
@@ -164,9 +165,9 @@ class _Arrivals(NamedTuple):
     def first(self) -> "_Arrivals":
         """These arrivals without duplicates: only the first arrival of each sample is kept.
 
-        A site uses only the first one, so that statistics of delays must not count a sample
-        twice. The result is ordered by the number of the sample, which the sender counts from
-        0.
+        A site uses only the first arrival of a sample. Statistics of delays must not count a
+        sample twice. The result is ordered by the number of the sample, which the sender counts
+        from 0.
         """
         sample, rows = np.unique(self.sample, return_index=True)
         return _Arrivals(self.tick[rows], sample, self.delay_us[rows], self.refused)
@@ -175,7 +176,8 @@ class _Arrivals(NamedTuple):
 def _read_arrivals(log: Log, site: str) -> dict[str, _Arrivals]:
     """Reads from a log which messages of other arms arrived at an arm, and when.
 
-    Such a message, called a sample, has the state that an arm sends in every control period.
+    Such a message, called a sample, contains the state that an arm sends in every control
+    period.
 
     Args:
         log: The log of the run.
@@ -211,7 +213,7 @@ def _read_arrivals(log: Log, site: str) -> dict[str, _Arrivals]:
 
 
 def _count_sent(log: Log, peer: str, newest_sample: int) -> int:
-    """Returns how many messages with its state an arm has sent, as far as the log shows.
+    """Returns how many messages with its state an arm has sent, according to the log.
 
     Args:
         log: The log of the run.
@@ -233,7 +235,7 @@ def _mark_judged_samples(
     stamp_ns: Ints,
     arrivals: _Arrivals,
 ) -> Bools:
-    """Finds the samples of which the log shows whether they arrived. They are "judged".
+    """Finds the judged samples, those for which the log shows whether they arrived.
 
     A sample that did not arrive counts as lost only if it could have arrived before the end of
     the run: it is older than the newest arrival, or it was sent so early that the slowest
@@ -306,14 +308,14 @@ class ValueStatistics(NamedTuple):
 
 
 class _AgeHistogram(NamedTuple):
-    """Number of control periods (ticks) by the age of the other arm's state that was used.
+    """Histogram of the ages of another arm's states that were used in control periods (ticks).
 
     The bins have equal width.
 
     Attributes:
         first_ms: Lower edge of the first bin, in ms.
         width_ms: Width of a bin, in ms.
-        ticks: Number of ticks in each bin.
+        ticks: Number of ticks with an age in each bin.
     """
 
     first_ms: float
@@ -330,13 +332,13 @@ class ClockSummary(NamedTuple):
     Attributes:
         offset_us: Last estimate of the sender's clock minus the receiver's, in microseconds.
         offset_first_us: First estimate.
-        drift_ppm: Rate of the sender's clock against the receiver's, minus 1. None without an
+        drift_ppm: Rate of the sender's clock against the receiver's, minus 1. `None` without an
             estimate.
-        drift_bound_ppm: Largest possible error of the drift. None without an estimate.
+        drift_bound_ppm: Largest possible error of the drift. `None` without an estimate.
         bound_us: Largest possible error of the last estimate of the offset.
         bound_p50_us: Median of this error over the run.
         bound_max_us: Maximum of this error over the run.
-        rtt_min_us: Shortest round trip of a query for the clock. None without a reply.
+        rtt_min_us: Shortest round trip of a query for the clock. `None` without a reply.
         faults: Number of detected steps of a clock.
     """
 
@@ -360,9 +362,9 @@ class ClockSummary(NamedTuple):
 
 
 def summarise_clock(log: Log, peer: str, site: str) -> ClockSummary | None:
-    """Returns how far the clocks of two arms differ, as one of them estimated in a session.
+    """Returns the difference between the clocks of two arms, as one of the arms estimated it.
 
-    The age of a message is known only as well as this difference.
+    The age of a message is known only as accurately as this difference.
 
     Args:
         log: The log of the run.
@@ -370,7 +372,7 @@ def summarise_clock(log: Log, peer: str, site: str) -> ClockSummary | None:
         site: Name of the site that estimated the clock.
 
     Returns:
-        The estimates. None in virtual time, or if the site published none.
+        The estimates. `None` in virtual time, or if the site published no estimates.
     """
     stats = [report for report in log.link_stats(site) if peer in report.offset_us]
     if not stats:
@@ -400,14 +402,14 @@ def summarise_clock(log: Log, peer: str, site: str) -> ClockSummary | None:
 
 
 class SampleCounts(NamedTuple):
-    """Numbers of sent, used, lost and late messages of a network link, from the receiver's log.
+    """Counts of sent, used, lost and late messages of a network link, from the receiver's log.
 
-    Such a message, called a sample, has the state of an arm in one control period.
-    docs/reference/metrics.md defines the numbers under `samples.*`.
+    Such a message, called a sample, contains the state of an arm in one control period.
+    docs/reference/metrics.md defines these counts under `samples.*`.
 
     Attributes:
         sent: Samples that the peer sent.
-        judged: Samples of which the log shows whether they arrived.
+        judged: Samples for which the log shows whether they arrived.
         arrived: Samples that arrived, each counted once.
         missing: Judged samples that did not arrive.
         lost: Samples that arrived, but were lost by the emulated network and therefore not
@@ -432,10 +434,10 @@ class SampleCounts(NamedTuple):
 
 
 class LinkSummary(NamedTuple):
-    """Summary of what a link did in a run: its delay, its losses and its counts.
+    """Summary of a network link in a run: its delay, its losses and its counts.
 
     A link is the directed connection from a peer to a site. docs/reference/metrics.md
-    ("Links") defines the quantities. A quantity that the log does not determine is None. The
+    ("Links") defines the quantities. A quantity that the log does not determine is `None`. The
     age of a sample is the time since the peer sent it. A sample is judged if the log shows
     whether it arrived.
 
@@ -451,7 +453,7 @@ class LinkSummary(NamedTuple):
         first_use_s: Time at which the first sample came into use, in s.
         ticks_without_new: Fraction of the ticks in which no new sample came into use.
         silence_ms: Longest time between two new samples in use, in ms.
-        counts: Numbers of samples.
+        counts: Counts of samples.
         loss: Fraction of the judged samples that could not come into use.
         burst: Mean number of successive samples that were lost together.
         one_way_us: Statistics of the measured one-way delays, in microseconds.
@@ -480,8 +482,8 @@ class LinkSummary(NamedTuple):
     def plain(self) -> bool:
         """True if the link only delayed every sample by one constant time.
 
-        No sample of such a link was late, missing or lost, so that a line of text says
-        everything about the link.
+        No sample of such a link was late, missing or lost, and a single line of text describes
+        it completely.
         """
         counts = self.counts
         is_as_stated = counts is None or not (counts.late or counts.missing)
@@ -565,7 +567,7 @@ def compute_statistics(values: ArrayLike) -> ValueStatistics | None:
         values: The numbers.
 
     Returns:
-        The statistics. None if there are no numbers.
+        The statistics. `None` if there are no numbers.
     """
     numbers = np.asarray(values, dtype=np.float64)
     if not numbers.size:
@@ -593,7 +595,7 @@ def bin_ages(age_ns: Ints) -> _AgeHistogram | None:
         age_ns: Ages, shape (K,), in ns.
 
     Returns:
-        The histogram. None without ages.
+        The histogram. `None` without ages.
     """
     if not len(age_ns):
         return None
@@ -709,7 +711,7 @@ def _count_samples(
         delivery: Predicted delivery of all samples.
         arrivals: Arrivals over the link.
         sent: Number of samples that the peer sent.
-        judged: Number of samples of which it is known whether they arrived.
+        judged: Number of samples for which the log shows whether they arrived.
     """
     first = arrivals.first
     release_tick = delivery.release(site_log.rate_hz)[first.sample]
@@ -740,8 +742,8 @@ def _count_samples(
 class DelayDistribution(NamedTuple):
     """Delays and ages of all messages (samples) on one network link, for a histogram.
 
-    The delay is the time from sending to the first use. The age is the time since a state was
-    measured, at a later tick at which it is still used.
+    The delay of a sample is the time from sending to its first use. The age is measured at each
+    tick at which a sample is in use: it is the time since the sample was sent.
 
     Attributes:
         peer: Name of the sender.

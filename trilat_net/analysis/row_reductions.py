@@ -1,8 +1,8 @@
-"""Sums, maxima and tests over the few numbers in each row of a long array.
+"""Computes sums, maxima and truth tests over the few entries in each row of a long array.
 
-The records of a run are arrays with ten thousands of rows and one column per joint. NumPy
-reduces each row of such an array in a loop of its own, which takes about ten times as long as
-to combine whole columns.
+The records of a run are arrays with tens of thousands of rows and one column per joint. NumPy
+reduces each row of such an array in a separate loop, which takes about ten times as long as
+combining whole columns.
 
 Invariant:
     - The results have the same bits as those of NumPy's reductions along the last axis.
@@ -14,7 +14,9 @@ from numpy.typing import NDArray
 from ..core import Array
 
 _SEQUENTIAL_COLUMNS = 7
-"""Largest number of columns that NumPy adds one after the other. It adds more in pairs."""
+"""Largest number of columns that NumPy adds one after the other. NumPy adds more columns in
+pairs.
+"""
 
 
 def sum_rows(values: Array) -> Array:

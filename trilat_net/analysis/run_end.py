@@ -1,8 +1,8 @@
 """Judges by the motion at the end of a run whether it is stable, not stable, or open.
 
-A site is the process that runs one arm. The judgement uses the error e of each site (the
-difference between its motion and the motion that it follows) and the joint velocities qd. It
-uses no theory. The largest |e| and |qd| of each joint in intervals of 50 ms are called
+A site is the process that runs one arm. The judgement rests on the error e of each site (the
+difference between its motion and the motion that it follows) and on the joint velocities qd,
+and not on any theory. The largest |e| and |qd| of each joint in intervals of 50 ms are called
 envelopes. Their trends over the second half of the run, which `envelope_trend` determines,
 decide whether the joint converges, decays, oscillates, drifts or grows. If the record does not
 decide this, the joint is undecided, and the judgement is open.
@@ -69,24 +69,26 @@ undecided.
 """
 
 FORCE_NM = 1e-3
-"""Least torque of an operator or environment at the end that may hold sites apart, in N m."""
+"""Smallest torque of an operator or environment at the end that may hold sites apart, in N m.
+"""
 HELD_SHARE = 0.02
-"""Least error of sites that a torque holds apart, as a share of the distance of the sites."""
+"""Smallest error of sites that are held apart by a torque, as a share of their distance."""
 
 LEAST_JUDGED_S = 2.0
 """Shortest time after the last action or change that is judged by itself, in s."""
 LEAST_JUDGED_SHARE = 0.1
-"""Shortest such time as a share of the run.
+"""Shortest time after the last action or change that is judged by itself, as a share of the
+run.
 
 If the time is shorter, the second half is judged, although it contains the action or change.
 """
 
 MIN_SIGN_CHANGES = 6
-"""Least number of changes of sign in the second half of a run that show an oscillation."""
+"""Smallest number of sign changes in the second half of a run that shows an oscillation."""
 
 
 class Stability(StrEnum):
-    """The four judgements of a run. The value of each member is the word for people.
+    """The four judgements of a run. The value of each member is the word that users read.
 
     STABLE needs a proof that the run does not contradict. SETTLED means that the motion became
     slow or decays, without a proof. OPEN means that the findings do not decide.
@@ -101,15 +103,15 @@ class Stability(StrEnum):
 class EndBehaviour(StrEnum):
     """How the arms move at the end of a run, from the best to the worst behaviour.
 
-    The order matters: the worst joint decides about the run. `stability` translates the
-    behaviour to a judgement. The value of each member is a phrase for the user.
+    The order matters, because the worst joint decides the judgement of the run. `stability`
+    translates the behaviour to a judgement. The value of each member is a phrase for the user.
     """
 
     CONVERGED = "converged"
     DECAYS = "decaying"
     HARDLY = "hardly decaying"
     UNDECIDED = "undecided (record longer)"
-    COASTS = "coasting, as nobody holds the arm, and it follows nobody or what coasts too"
+    COASTS = "coasting, because neither an operator nor a followed arm holds the arm"
     BOUNDED = "bounded oscillation"
     DRIFTS = "drifting"
     GROWS = "growing"
@@ -120,8 +122,8 @@ class EndBehaviour(StrEnum):
         """The judgement that the motion at the end alone suggests.
 
         Arms at rest or with decaying motion give SETTLED, motion without a clear trend gives
-        OPEN, and oscillating, drifting or growing motion gives NOT_STABLE. Other knowledge,
-        such as proofs, may change it in `stability_decision`.
+        OPEN, and oscillating, drifting or growing motion gives NOT_STABLE. In
+        `stability_decision` other knowledge, such as proofs, may change the judgement.
         """
         if self in (EndBehaviour.CONVERGED, EndBehaviour.DECAYS):
             return Stability.SETTLED
@@ -135,17 +137,18 @@ _FALLING = (EnvelopeTrend.DECAYS, EnvelopeTrend.HARDLY)
 
 
 class EndDoubt(NamedTuple):
-    """Finding at the end of a run because of which its motion alone does not show stability.
+    """Finding that leaves open whether a run is stable although its motion dies away.
 
     Attributes:
         name: Name of the finding. "sites apart": coupled sites do not agree, although nothing
             holds them apart. "arms fell": arms hang down at the end, but did not at the start.
-            "arm thrown": an arm ends far away from every start pose, although nobody pushed.
-            "loop changes": the control loop changes within the judged part. "operator acts":
-            an operator changes its action within the judged part.
-        sites: Names of the sites concerned. Of sites apart, those with the smallest and the
-            largest angle.
-        distance_rad: Distance between sites apart, or of a thrown arm from the start poses.
+            "arm thrown": an arm ends far away from every start pose, although no operator
+            pushed. "loop changes": the control loop changes within the judged part. "operator
+            acts": an operator changes its action within the judged part.
+        sites: Names of the sites concerned. For "sites apart", the sites with the smallest and
+            the largest angle.
+        distance_rad: Distance between the sites that are apart, or distance of the thrown arm
+            from the start poses.
         until_s: Time of the last change or action, in s.
     """
 
@@ -166,24 +169,25 @@ class RunEnd(NamedTuple):
         behaviour: Behaviour of the worst joint, such as settled or growing.
         error: Trend of that joint's |e|.
         speed: Trend of that joint's |qd|.
-        end_error_rad: Largest |e| of the last second, of all joints.
-        end_speed_rad_s: Largest |qd| of the last second, of all joints.
-        end_error_where: Name of the joint, or axis of the end effector, with that |e|. Empty if
-            it is not known.
-        end_speed_where: Name of the joint with that |qd|. Empty if it is not known.
+        end_error_rad: Largest |e| of all joints in the last second.
+        end_speed_rad_s: Largest |qd| of all joints in the last second.
+        end_error_where: Name of the joint, or of the axis of the end effector, with this |e|.
+            Empty if the joint is not known.
+        end_speed_where: Name of the joint with this |qd|. Empty if the joint is not known.
         where: Name of the worst joint. Empty if there are no records.
-        doubts: Findings because of which the stability of the run remains open. Empty if it is
+        doubts: Findings that leave the stability of the run open. Empty if the stability is
             decided.
         operator_acts: True if an operator changes its action in the judged part, instead of
             only holding an arm.
-        diverged_at_s: Time at which the first site exceeded its limits, in s. None if no site
+        diverged_at_s: Time at which the first site exceeded its limits, in s. `None` if no site
             did.
-        divergence: Which joint exceeded its limit, and when. Empty if no log says so.
-        frequency_hz: Frequency of a bounded oscillation. None if there is none.
+        divergence: Phrase that names the joint that exceeded its limit, and the time. Empty if
+            no log contains this information.
+        frequency_hz: Frequency of a bounded oscillation. `None` if there is none.
         missing_sites: Sites without any record, which leave the run undecided.
         error_unit: Unit of |e|: "rad", or "m" if the sites follow positions in task space.
-        counts_from_s: Time from which the run counts, in s. The second half of the time after
-            it is the judged part.
+        counts_from_s: Time after which the run is considered, in s. The second half of the time
+            after it is the judged part.
         quiet_from_s: Time from which no operator acts and the control loop does not change, in
             s.
         lasts_s: Length of the record, in s.
@@ -213,8 +217,8 @@ class RunEnd(NamedTuple):
         """The judgement of the run by its end: stable, not stable, or open.
 
         A run that looks stable is open if there are `doubts`. A run that does not look stable
-        is open if an operator acts, who may have caused the motion. If the motion exceeded the
-        limits of an arm, it is not stable in any case.
+        is open if an operator acts, because the operator may have caused the motion. If the
+        motion exceeded the limits of an arm, the run is not stable in any case.
         """
         stability = self.behaviour.stability
         if stability is not Stability.NOT_STABLE:
@@ -228,7 +232,7 @@ class RunEnd(NamedTuple):
     def text(self) -> str:
         """A sentence for the user on how the motion ends, with the numbers that show it.
 
-        The sentence also has the reasons why the run cannot be called stable. The package
+        The sentence also contains the reasons why the run cannot be called stable. The package
         `presentation` writes it.
         """
         return str(find_hook("describe a finding")(self))
@@ -237,7 +241,7 @@ class RunEnd(NamedTuple):
     def reasons(self) -> tuple[str, ...]:
         """Sentences that say why the stability of the run remains open, one for each doubt.
 
-        Empty if it is decided. The package `presentation` writes the sentences.
+        Empty if the stability is decided. The package `presentation` writes the sentences.
         """
         return tuple(find_hook("list the sentences of a finding")(self))
 
@@ -276,12 +280,12 @@ class RunTrace(NamedTuple):
             than the site has. The last interval may be incomplete, and no trend uses it.
         tau_x: For each site, the torque of operator and environment at the last record, shape
             (n,), in N m.
-        diverged_at_s: Time at which the first site exceeded its limits, in s. None if no site
+        diverged_at_s: Time at which the first site exceeded its limits, in s. `None` if no site
             did.
-        pushed_until_s: Last time at which an operator pushed whose action is not part of the
-            scenario, in s. 0 if none did.
-        changed_until_s: Last time at which a command changed the control loop, in s. 0 if none
-            did.
+        pushed_until_s: Last time, in s, at which an operator whose action is not part of the
+            scenario pushed an arm. 0 if no such operator pushed.
+        changed_until_s: Last time at which a command changed the control loop, in s. 0 if no
+            command did.
     """
 
     buckets: Sequence[Array]
@@ -293,9 +297,9 @@ class RunTrace(NamedTuple):
     def classify_end(self, scenario: Scenario) -> RunEnd:
         """Judges from reduced data whether the motion died away at the end of a run.
 
-        The worst joint of all sites decides. A run that is stable by the trends of its joints
-        is left open if its sites do not agree, if arms fell, or if the control loop changed
-        until shortly before the end.
+        The worst joint of all sites decides. A run whose joints have stable trends is left open
+        if its sites do not agree, if arms fell, or if the control loop changed until shortly
+        before the end.
 
         Args:
             scenario: The description of the experiment.
@@ -447,10 +451,10 @@ def trace_log(log: Log) -> RunTrace:
 
 
 def _find_unscripted_push_s(log: Log, site_log: SiteLog) -> float:
-    """Returns the last time at which an operator outside the scenario pushed a site, in s.
+    """Returns the last time at which an operator outside the scenario pushed an arm, in s.
 
-    The motion after this time is not caused by that operator. Such operators move an arm that
-    is not simulated, or act live. The result is 0 if none of them pushed.
+    That operator does not cause the motion after this time. Operators outside the scenario move
+    an arm that is not simulated, or act live. The result is 0 if no such operator pushed.
 
     Args:
         log: Log of the run.
@@ -467,9 +471,9 @@ def _find_unscripted_push_s(log: Log, site_log: SiteLog) -> float:
 def _split_buckets(scenario: Scenario, trace: RunTrace) -> list[Array]:
     """Returns |e|, |qd| and q of each arm in every 50 ms interval, shape (K, 3, n) each.
 
-    They are error, joint velocity and joint angle. `RunTrace.buckets` stores these side by side
-    in one row, and may have columns for more joints than the arm has. These columns are
-    removed.
+    Here e is the error, qd the joint velocity and q the joint angle. `RunTrace.buckets` stores
+    the three side by side in one row, and may have columns for more joints than the arm has.
+    These columns are removed.
     """
     sites = []
     for arm, buckets in zip(scenario.arms.values(), trace.buckets, strict=True):
@@ -485,8 +489,8 @@ def _split_buckets(scenario: Scenario, trace: RunTrace) -> list[Array]:
 def _choose_judged_part(t_s: Array, acted_s: float) -> tuple[int, bool]:
     """Chooses the part of a run whose second half is judged.
 
-    Normally this is the whole run. An action in its second half moves the start of the part to
-    a later time, such that the judged half begins after the action. If too little time follows
+    Normally the whole run is used. If an operator acts in the second half of the run, the part
+    starts later, so that the judged half begins after the action. If too little time follows
     the action, the whole run is judged nevertheless.
 
     Args:
@@ -520,8 +524,9 @@ def _find_worst_joint(
 ) -> RunEnd:
     """Returns how the motion of the joint with the worst behaviour ends.
 
-    Growing is worse than oscillating, for example. Of several such joints the fastest one is
-    returned. The largest |e| and |qd| of the last second are those of all joints.
+    For example, growing is worse than oscillating. If several joints have the worst behaviour,
+    the fastest of them is returned. The largest |e| and |qd| of the last second are those of
+    all joints.
 
     Args:
         scenario: Scenario of the run.
@@ -631,7 +636,7 @@ def _judge_joint(
 def _find_fed_joints(
     joints: Sequence[RunEnd], site_of_joint: Ints, group: Sequence[int]
 ) -> list[int]:
-    """Finds joints with a steady motion that a faster, decaying joint may keep in motion.
+    """Finds steadily moving joints that a faster, decaying joint may keep in motion.
 
     Modes that decay at several frequencies exchange energy (they beat). A joint may therefore
     be steady for a while although all modes decay, and must not count as a lasting oscillation.
@@ -663,7 +668,8 @@ def _find_coasting_joints(
 
     An arm is free if no operator and no environment acts on it at the end. Nothing brakes the
     sites if the law of a free arm has no spring to a peer, since the other sites follow this
-    arm. The same holds if all arms are free, and all laws take energy from the links only.
+    arm. Nothing brakes them either if all arms are free and all laws dissipate energy in the
+    links only.
 
     Args:
         scenario: Scenario of the run.
@@ -682,7 +688,7 @@ def _find_coasting_joints(
         if not any(actor.start_s <= end_s < actor.end_s for actor in actors):
             free_laws.append(spec.control)
 
-    # without damping, a law that takes energy from the links only brakes nothing
+    # without damping, a law that dissipates energy in the links only does not brake the arms
     brakeless = []
     all_have_springs = True
     for law in free_laws:
@@ -714,8 +720,8 @@ def _classify_joint(
 ) -> EndBehaviour:
     """Returns the behaviour of a joint according to the trends of its |e| and |qd|.
 
-    - A speed that grows is growth even without an error, because arms that swing in unison have
-      no error.
+    - A growing speed counts as growth even without an error, because arms that swing in unison
+      have no error.
     - Errors that grow while the joint gets no faster are undecided: a drift may start, or the
       errors follow from an operator's last action.
     - The speed of a joint that hardly moves has no meaningful trend.
@@ -764,15 +770,15 @@ def _refine_by_motion(
     """Refines the behaviour of a joint by the direction of its motion.
 
     - A joint drifts if it moves in one direction in each quarter of the judged half, by at
-      least an eighth of the whole way each. Its mean speed must be at least half of its largest
-      speed: a joint that swings on its way does not drift.
+      least an eighth of the whole way in each quarter. Its mean speed must be at least half of
+      its largest speed: a joint that swings on its way does not drift.
     - A bounded oscillation must change its sign often enough, and is undecided otherwise.
     - A joint that is slow enough to be at rest, but moves in one direction, is undecided.
 
     Args:
         behaviour: Behaviour according to the trends.
         q: Joint angle, shape (K,), in rad.
-        speed: Largest |qd| since the time before, shape (K,), in rad/s.
+        speed: Largest |qd| since the previous time, shape (K,), in rad/s.
         t_s: Times, shape (K,), in s.
         is_still: True if the speed decays, or is at the floor of its rounding errors.
     """
@@ -908,7 +914,8 @@ def _find_held_sites(
 
     A source of torque holds an arm if it has a stiffness. An operator does so even if its
     torque is zero, because the arm is then at the operator's target. An environment holds an
-    arm only while the arm touches it. Sources that a user wrote are assumed to hold.
+    arm only while the arm touches the environment. Sources that a user wrote are assumed to
+    hold the arm.
 
     Args:
         scenario: Scenario of the run.
@@ -936,9 +943,9 @@ def _find_held_sites(
 
 
 def _find_odd_pose(scenario: Scenario, sites: Sequence[Array]) -> Iterable[EndDoubt]:
-    """Yields a doubt if arms end in a pose that no good controller should cause.
+    """Yields a doubt if arms end in a pose to which a working controller would not bring them.
 
-    Such arms hang down, or are far from every start pose although nobody pushed.
+    Such arms hang down, or are far from every start pose although no operator pushed them.
 
     Args:
         scenario: Scenario of the run.
@@ -992,8 +999,9 @@ def find_hanging_sites(scenario: Scenario, ends: Mapping[str, Array]) -> list[st
 def _find_last_operator_action(scenario: Scenario, span_s: float) -> float:
     """Returns the last time before `span_s` at which an operator changed its action, in s.
 
-    The action is known from the scenario, which states what each operator does over time.
-    Operators who act live are not part of it. An operator who only holds an arm does not act.
+    The actions are known from the scenario, which states the action of each operator over time.
+    Operators who act live are not part of the scenario. An operator who only holds an arm does
+    not act.
 
     Args:
         scenario: Scenario of the run.
@@ -1048,13 +1056,13 @@ def _find_last_change(scenario: Scenario, span_s: float) -> float:
 
 
 def _find_frequency_hz(site_logs: list[SiteLog]) -> float | None:
-    """Estimates how fast the arms oscillate, from the changes of sign of the fastest joint.
+    """Estimates the frequency at which the arms oscillate, from the fastest joint.
 
-    Args:
-        site_logs: Logs of all sites. The second half of each is used.
+    Args: site_logs: Logs of all sites. The second half of each is used.
 
     Returns:
-        The frequency in Hz. None if the joint changes its sign too rarely.
+        The frequency in Hz, from the sign changes of the joint's velocity. `None` if they are
+        too few.
     """
 
     def find_speeds(site_log: SiteLog) -> Array:

@@ -4,14 +4,15 @@ For example, a run may be stable although a motor was at its torque limit for 2 
 circumstance does not change the judgement, but shows that the arms or the computers were at
 their limits. The circumstances are:
 
-- a motor was at its torque limit, so that the control law did not act in full;
+- a motor was at its torque limit and did not apply the full torque of the control law;
 - an operator or a wall pushed with a large share of the torque limit;
-- ticks (periods of the control loop) began late by a whole period or more;
-- samples in use were clearly younger or older than the delay that their link states;
-- a program of the user moved an arm, or failed while it did.
+- ticks (periods of the control loop) began a whole period or more too late;
+- samples in use were clearly younger or older than the delay that the scenario states for their
+  link;
+- a program of the user moved an arm, or failed while moving an arm.
 
 Invariant:
-    - There is a number for each arm that is named.
+    - Each arm that is named has a number that shows the circumstance.
     - The package `presentation` writes a remark for each circumstance that occurred.
 """
 
@@ -29,19 +30,20 @@ from .site_signals import external_torques
 from .timeline import list_effective_commands
 
 LARGE_PUSH_SHARE = 0.5
-"""Least torque of operators and walls that is remarked, as a share of the torque limit."""
+"""Smallest torque of operators and walls that gives a remark, as a share of the torque limit.
+"""
 
 
 _LARGE_AGE_SHARE = 0.05
-"""Least remarked difference of the mean age in use from the stated delay, as its share."""
+"""Smallest relative difference between mean age and stated delay that gives a remark."""
 
 
 class _LargePush(NamedTuple):
-    """Largest torque of operators and walls at one site, as a part of the torque limit.
+    """Largest torque of operators and walls at one site, with the torque limit.
 
     Attributes:
         site: Name of the site.
-        joint: Number of the joint, from 1 on.
+        joint: Number of the joint, counted from 1.
         torque_nm: The torque.
         limit_nm: Torque limit of the joint.
     """
@@ -53,14 +55,15 @@ class _LargePush(NamedTuple):
 
 
 class _OddAge(NamedTuple):
-    """Mean age of the samples in use on a link that states another mean delay.
+    """Mean age of the samples in use on a link, if it differs from the stated mean delay.
 
-    Under jitter the newest sample that arrived counts, so that the samples in use are younger
-    than the mean delay. Lost samples, and samples that wait for older ones, make them older.
+    Under jitter the newest sample that has arrived is used. The samples in use are therefore
+    younger than the mean delay. Lost samples, and samples that wait for older ones, increase
+    the age.
 
     Attributes:
         link: Name of the link, such as "m->s".
-        age_ms: Mean age in use.
+        age_ms: Mean age of the samples in use.
         stated_ms: Stated mean delay.
     """
 
@@ -72,14 +75,15 @@ class _OddAge(NamedTuple):
 class RunCircumstances(NamedTuple):
     """Circumstances of a run that may explain why it was judged stable or not.
 
-    `RunCircumstances.of_log` finds them. Without arguments, nothing occurred.
+    `RunCircumstances.of_log` finds them. An object that is created without arguments means that
+    none occurred.
 
     Attributes:
         at_limit_s: How long the motors of each site were at their torque limit, in s, by site.
         large_pushes: The largest push at each site where it was a large share of the limit.
         late_ticks: Number of ticks that began late by a period or more, by site.
         odd_age: Age of the samples in use on the link where it differs most from the stated
-            delay. None if every link agrees.
+            delay. `None` if every link agrees.
         program_sites: Sites whose arms a program of the user moved. The judgement ignores how
             the program reacts to the arms.
         failures: Sentences of the log on programs that failed.
@@ -137,7 +141,7 @@ def _measure_time_at_limit(log: Log) -> dict[str, float]:
 def _find_large_pushes(log: Log) -> tuple[_LargePush, ...]:
     """Finds the sites where operators or walls pushed with a large part of the torque limit.
 
-    Motors that work near their limit cannot follow the control law any more.
+    Motors near their limit may no longer be able to apply the torque of the control law.
     """
     pushes = []
     for site in log.sites:
@@ -153,9 +157,9 @@ def _find_large_pushes(log: Log) -> tuple[_LargePush, ...]:
 
 
 def _count_late_ticks(log: Log) -> dict[str, int]:
-    """Counts the control periods (ticks) of each site that began late by a period or more.
+    """Counts the control periods (ticks) of each site that began a period or more too late.
 
-    Such periods occur on a busy machine. Sites without any are left out.
+    Late periods occur on a busy machine. Sites without late periods are left out.
     """
     counts = {}
     for site in log.sites:
@@ -167,12 +171,12 @@ def _count_late_ticks(log: Log) -> dict[str, int]:
 
 
 def _find_odd_age(log: Log) -> _OddAge | None:
-    """Finds how old the samples in use were, if a drawn delay states another age.
+    """Finds the age of the samples in use, if it differs from the mean of a random delay.
 
     Links that change during the run are left out.
 
     Returns:
-        The age on the link with the largest difference. None if every link agrees.
+        The age on the link with the largest difference. `None` if every link agrees.
     """
     changed = {change.link for change in log.scenario.timeline}
     changed |= {change.link for change in list_effective_commands(log)}

@@ -2,7 +2,7 @@
 
 A metric is a number that describes a run, such as the largest torque. Many metrics need the
 same data, for example the torques of operators on an arm, whose computation takes time.
-`RunView` computes such data when a metric first needs them, and keeps them for the other
+`RunView` computes shared data when a metric first needs them, and keeps them for the other
 metrics. `SiteRun` has the data of one arm: its records and the torques on it. `RunView` adds
 the weights with which the arms follow each other, the network links and the virtual walls.
 
@@ -48,7 +48,7 @@ class SiteRun(NamedTuple):
 
 
 class RunView:
-    """A recorded run, with quantities that several metrics need, each computed at most once.
+    """A recorded run, with quantities that several metrics share and that are computed once.
 
     Every metric receives this object and reads arms, network links and walls from it.
 
@@ -82,7 +82,7 @@ class RunView:
     def sites(self) -> dict[str, SiteRun]:
         """Motion and torques of every arm with records, by the name of its site (process).
 
-        Metrics of the other arms have a reason in place of a value.
+        Metrics of arms without records have a reason in place of a value.
         """
         runs = {}
         for site, records in align_records(self.log).items():

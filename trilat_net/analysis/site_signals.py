@@ -43,7 +43,8 @@ P is 5 for the planar arm and 10 n for a chain.
 def follows_in_task_space(log: Log) -> bool:
     """Returns True if the arms follow each other with their end effectors (tips).
 
-    Their errors are then measured along axes in space. Otherwise, they are joint angles.
+    Their errors are then measured along axes in space. Otherwise, the errors are differences
+    between joint angles.
 
     Args:
         log: The log of the run.
@@ -82,14 +83,14 @@ class JointError(NamedTuple):
     def find_largest(cls, site_log: SiteLog, from_s: float = -math.inf) -> "JointError | None":
         """Finds the largest tracking error of an arm.
 
-        If it occurs several times, the first counts.
+        If several records have this error, the first of them is returned.
 
         Args:
             site_log: Log of the site.
             from_s: Time after which records count, in s.
 
         Returns:
-            The error. None if no record has a finite error.
+            The error. `None` if no record has a finite error.
         """
         first = int(np.searchsorted(site_log.t_s, from_s, side="right"))
         errors = np.abs(joint_errors(site_log)[first:])
@@ -114,7 +115,7 @@ class JointError(NamedTuple):
             site_log: Log of the site.
 
         Returns:
-            The error. None if no record of that second has a finite error.
+            The error. `None` if no record of that second has a finite error.
         """
         if not len(site_log):
             return None
@@ -130,7 +131,7 @@ def find_last_error(log: Log) -> JointError | None:
         log: Log of the run.
 
     Returns:
-        The error. None if no record of that second has a finite error.
+        The error. `None` if no record of that second has a finite error.
     """
     errors = [JointError.find_in_last_second(log[site]) for site in log.sites]
     known = [error for error in errors if error is not None]
@@ -171,12 +172,12 @@ def largest_remaining_error(site_log: SiteLog) -> Array:
 
 
 def settling_time_s(site_log: SiteLog) -> float | None:
-    """Returns the time from which on the error of an arm stays small, its settling time, in s.
+    """Returns the time after which the error of an arm stays small (settling time), in s.
 
     This is the last time at which an error exceeded `SETTLED_ERROR_RAD`.
 
     Returns:
-        The time. 0 if no error ever exceeded the bound. None if the last record has an error
+        The time. 0 if no error ever exceeded the bound. `None` if the last record has an error
             that exceeds it, or if there are no records.
     """
     if not len(site_log):
@@ -198,11 +199,11 @@ def settling_time_of_all_s(times_s: Sequence[float | None]) -> float | None:
     give 3.4 s.
 
     Args:
-        times_s: Settling time of each site, from `settling_time_s`. None for a site that has
+        times_s: Settling time of each site, from `settling_time_s`. `None` for a site that has
             not settled.
 
     Returns:
-        The largest time. None if some site has not settled.
+        The largest time. `None` if some site has not settled.
     """
     settled_s = [time_s for time_s in times_s if time_s is not None]
     if len(settled_s) < len(times_s):

@@ -1,6 +1,6 @@
 """Decides whether a run is stable, settled, not stable, or open, for every command.
 
-The decision combines what is known about a run:
+The decision combines all evidence on a run:
 
 - how its motion ends, which `run_end` judges without any theory;
 - how small pushes in repeated runs (twins) develop, which `twin_growth` measures;
@@ -11,20 +11,22 @@ The words mean:
 
 - Stable: a proof exists for this loop, and the run does not contradict it.
 - Settled: the run became slow or its motion was decaying (`run_end` has the limits), and every
-  push died away, but nothing proves more.
+  push died away, but there is no proof.
 - Not stable: the run diverged, oscillates, drifts or grows, or its loop has an exact root with
-  a positive real part, and no proof says otherwise.
+  a positive real part, and no proof contradicts this.
 - Open: everything else.
 
 Invariant:
-    - Stable is said only with a proof. Without a proof and without twins, a run is open.
+    - A run is called stable only with a proof. Without a proof and without twins, a run is
+      open.
     - Roots count as a proof only if they are exact: delays are constant, or repeat after a
       known period over which the loop was analysed.
-    - Exact roots in the left half-plane exclude the word "not stable", except for a run that
-      left its limits. Numerical roots exclude it if the end of the run may be their slow decay.
-    - A decision names what it rests on.
-    - Twins never change a decision that `is_decided_by_roots` announces, so that a command may
-      save them.
+    - Exact roots in the left half-plane exclude the word "not stable", except for a run in
+      which an arm exceeded its limits. Roots from numerical derivatives exclude this word if
+      the motion at the end of the run may be their slow decay.
+    - A decision names the evidence on which it rests.
+    - Twins never change a decision for which `is_decided_by_roots` is true. A command may
+      therefore skip them.
 """
 
 import math
@@ -36,12 +38,13 @@ from .twins.envelope_trend import FLOOR_RAD, EnvelopeTrend
 from .twins.twin_growth import DOUBLES
 
 NEAR_REST_RAD = 0.02
-"""Largest distance of a run from a rest whose unstable roots refute the run, in rad.
+"""Largest distance of a run from a pose of rest at which unstable roots of that pose refute the
+run, in rad.
 
 A run that is further away may come to rest in another pose, whose roots may be stable.
 """
 LEAST_BURSTS = 100.0
-"""Number of bursts of lost samples from which on their mean effect decides how a run ends."""
+"""Number of bursts of lost samples above which their mean effect decides how a run ends."""
 _FALLING = (EnvelopeTrend.DECAYS, EnvelopeTrend.HARDLY)
 _LONGEST_ADVISED_S = 1e4
 """Length of the longest run that is advised, in s. The estimate of a longer one rests on a root
@@ -88,12 +91,12 @@ def decide_stability(run: RunFindings) -> StabilityDecision:
 
 
 def is_decided_by_roots(run: RunFindings) -> bool:
-    """Returns True if twins cannot change the decision, so that they need not be executed.
+    """Returns True if twins cannot change the decision and therefore need not be executed.
 
-    This is so if the run diverged, or if its exact roots and its end agree.
+    This is the case if the run diverged, or if its exact roots and its end agree.
 
     Args:
-        run: What is known about the run without twins.
+        run: The evidence on the run without twins.
     """
     return _decide_by_roots(run, _list_obstacles(run)) is not None
 
@@ -101,11 +104,11 @@ def is_decided_by_roots(run: RunFindings) -> bool:
 def _list_obstacles(run: RunFindings) -> tuple[Obstacle, ...]:
     """Lists the findings that prevent the judgements "stable" and "settled", in order.
 
-    They are the end of the run, missing records, runs with small pushes, doubts of other
-    analyses, and roots that show growth.
+    Such findings concern the end of the run, missing records, runs with small pushes, doubts of
+    other analyses, and roots that show growth.
 
     Args:
-        run: What the analyses found about the run.
+        run: Findings of the analyses on the run.
     """
     obstacles: list[Obstacle] = []
     if run.end.doubts:
@@ -141,7 +144,7 @@ def _decide_by_roots(
         obstacles: Names of the findings that prevent a stable run.
 
     Returns:
-        The decision. None if twins may change it.
+        The decision. `None` if twins may change it.
     """
     end = run.end
     if end.behaviour is EndBehaviour.DIVERGED:
@@ -166,12 +169,12 @@ def _decide_by_roots(
 
 
 def _find_refutation(run: RunFindings) -> Basis | None:
-    """Returns the evidence that small motions grow. None if there is none.
+    """Returns the evidence that small motions grow. `None` if there is no evidence.
 
-    Unstable exact roots of a distant rest are evidence if the run is shorter than the period of
-    its delays, because such a run cannot show by itself where it ends. The growth of pushes is
-    no evidence if the run slows down, because the run then approaches its twins, or if exact
-    roots are stable.
+    Unstable exact roots of a distant pose of rest are evidence if the run is shorter than the
+    period of its delays, because such a run does not show where its motion ends. The growth of
+    pushes is not evidence in two cases: if the run slows down, because the run then approaches
+    its twins, and if exact roots are stable.
     """
     end = run.end
     twins = run.twins
@@ -191,7 +194,7 @@ def _agrees_with_proof(run: RunFindings) -> bool:
     """Returns True if neither the end of a run nor its repetitions contradict a proof.
 
     A repetition, a twin, has a small push. A run that is shorter than the period of its delays
-    contradicts nothing: it may show a beat.
+    does not contradict a proof, because its motion may be part of a beat.
     """
     end = run.end
     twins = run.twins
@@ -209,8 +212,8 @@ def _confirms_slowest_root(run: RunFindings) -> bool:
     """Returns True if the slowest push decays at the rate that the slowest root predicts.
 
     A push is a small disturbance in a repetition of the run, and a root the growth rate of
-    small motions. A push that shows no clear trend then agrees with the roots: it merely decays
-    slowly.
+    small motions. In this case a push without a clear trend agrees with the roots: the push
+    merely decays slowly.
     """
     worst = None if run.twins is None else run.twins.worst
     if worst is None or run.roots is None or run.proven_by_roots != "stable":
@@ -219,16 +222,15 @@ def _confirms_slowest_root(run: RunFindings) -> bool:
 
 
 def _is_end_excused(run: RunFindings) -> bool:
-    """Returns True if pushes or roots show that an end that looks not stable is no evidence.
+    """Returns True if pushes or roots show that an unstable-looking end is no evidence.
 
     The cases are:
 
     - Stable roots by numerical derivatives: the end may be their slow decay.
     - All pushes die away.
-    - The judged part of the run is shorter than the period of its delays, so that it may show a
-      beat.
-    - No push grows clearly, and the judged part has few bursts of lost samples, so that it may
-      show the effect of the last burst.
+    - The judged part of the run is shorter than the period of its delays, and may show a beat.
+    - No push grows clearly, and the judged part has few bursts of lost samples. It may
+      therefore show the effect of the last burst.
     - The run seems to grow, but no push grows and the energy function V did not rise.
     """
     if run.roots is not None and run.roots.measure_decay_misfit(run.end) <= 1.0:
@@ -248,10 +250,10 @@ def _has_settled(run: RunFindings) -> bool:
     """Returns True if a run became slow, or was decaying, and every push died away.
 
     This judgement is weaker than stable: it rests on the recorded motion and on runs with small
-    pushes, but on no proof.
+    pushes, but not on a proof.
 
     Args:
-        run: What the analyses found about the run.
+        run: Findings of the analyses on the run.
     """
     end = run.end
     twins = run.twins
@@ -259,7 +261,7 @@ def _has_settled(run: RunFindings) -> bool:
         return False
     if end.stability is Stability.SETTLED:
         return True
-    # A run without a trend counts if its arms are too slow to get anywhere.
+    # A run without a trend counts as settled if its arms are too slow to move noticeably.
     judged_s = twins.to_s - twins.from_s
     travel_rad = end.end_speed_rad_s * judged_s
     return end.behaviour in _UNTREND_ENDS and travel_rad <= SETTLED_ERROR_RAD
@@ -268,11 +270,11 @@ def _has_settled(run: RunFindings) -> bool:
 def _explain_open(run: RunFindings) -> Obstacle:
     """Returns why the stability of a run stays open although nothing contradicts it.
 
-    Several names may apply. The first that applies is returned, from proofs that disagree with
-    the run to an end of the run that does not settle the question.
+    Several reasons may apply. The first of them is returned, in the order from proofs that
+    disagree with the run to an end of the run that does not decide.
 
     Args:
-        run: What the analyses found about the run.
+        run: Findings of the analyses on the run.
     """
     if run.has_proof:
         return "disputed proof"
@@ -290,10 +292,10 @@ def _explain_open(run: RunFindings) -> Obstacle:
 
 
 def _estimate_needed_s(run: RunFindings) -> float | None:
-    """Returns how long a run must be so that its slowest motion decays clearly, in s.
+    """Returns how long a run must be for its slowest motion to decay clearly, in s.
 
-    The motion decays by itself only after the last action of an operator and the last change of
-    a setting.
+    The motion decays freely only after the last action of an operator and the last change of a
+    setting.
     """
     roots = run.roots
     if roots is None or roots.rate_per_s is None or not roots.rate_per_s < 0.0:

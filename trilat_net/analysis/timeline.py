@@ -1,4 +1,4 @@
-"""Lists what happened in a run over time: commands, network delays, modes of the arms, alarms.
+"""Lists the events of a run over time: commands, network delays, modes of the arms, alarms.
 
 For example, a command may change a delay at 5 s, or stop all arms at 8 s. A reader of a figure
 or of a judgement needs these times. The mode of an arm is what its controller does: it follows
@@ -26,9 +26,9 @@ from ..scenario import Change, LinkBase, describe_event, find_requester
 def list_effective_commands(log: Log) -> list[Change]:
     """Lists the commands of a run that changed something.
 
-    A command that sets a link or the dominance factors of a site (the weights with which it
-    follows its peers) to what is in force already changes nothing and is left out. Orders to
-    sites, such as "stop", always count.
+    A command that sets a link, or the dominance factors of a site (the weights with which it
+    follows its peers), to their present values is left out. Orders to sites, such as "stop",
+    are always included.
 
     Args:
         log: The log of the run.
@@ -68,7 +68,7 @@ def list_effective_commands(log: Log) -> list[Change]:
 
 
 class _AppliedChange(NamedTuple):
-    """A change of a setting during the run, such as another network delay, at one arm.
+    """A change of a setting at one arm during the run, such as a new network delay.
 
     The scenario planned the change, or a command requested it.
 
@@ -76,9 +76,10 @@ class _AppliedChange(NamedTuple):
         change: The change of a link or of dominance factors, or the order to a site, with its
             time.
         site: The site that carried it out.
-        taken_at_tick: Tick of the record that names the change. None for a change that was
+        taken_at_tick: Tick of the record that names the change. `None` for a change that was
             planned in the scenario.
-        sentence: A sentence for people. It names whoever ordered the change, if known.
+        sentence: A sentence for users. The sentence names the person or program that ordered
+            the change, if known.
     """
 
     change: Change
@@ -88,7 +89,7 @@ class _AppliedChange(NamedTuple):
 
     @property
     def subject(self) -> str:
-        """What was changed: a link such as "m1->s", a site, or the shares of a site.
+        """The object that was changed: a link such as "m1->s", a site, or the shares of a site.
 
         The shares are the dominance factors with which the site follows its peers, for example
         "shares of s".
@@ -97,11 +98,11 @@ class _AppliedChange(NamedTuple):
 
     @property
     def text(self) -> str:
-        """A phrase for the user: what applies after the change.
+        """A phrase for the user that describes the state after the change.
 
-        For an order to a site, it is the order and its length, for example "hold, 500 ticks".
-        For a link, it describes the new delay, and for shares it lists the new shares with the
-        time of the transition, for example "m1 0.7, m2 0.3 within 2 s".
+        For an order to a site, the phrase is the order and its length, for example "hold, 500
+        ticks". For a link, it describes the new delay, and for shares it lists the new shares
+        with the time of the transition, for example "m1 0.7, m2 0.3 within 2 s".
         """
         change = self.change
         if change.order:
@@ -155,7 +156,7 @@ class StatedModel(NamedTuple):
 def list_changes(log: Log) -> list[_AppliedChange]:
     """Lists all changes before the end of a run, in the order in which they took effect.
 
-    The records also name ticks that a site had to skip. Such an entry is included only if the
+    The records also name ticks that a site had to skip. Skipped ticks are included only if the
     site skipped so many ticks that it held its position.
 
     Args:
@@ -285,7 +286,7 @@ class _RaisedAlarm(NamedTuple):
 def list_alarms(log: Log) -> list[_RaisedAlarm]:
     """Lists the alarms of all arms, in the order of their start.
 
-    If somebody ordered an arm to stop, the reason of the alarm names this person.
+    If a person ordered an arm to stop, the reason of the alarm names this person.
 
     Args:
         log: The log of the run.

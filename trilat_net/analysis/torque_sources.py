@@ -28,7 +28,7 @@ from .arm_rows import EndEffectorRows, build_arm_rows
 from .row_reductions import sum_rows
 
 SCRIPT_TORQUE_TOLERANCE = 1e-8
-"""Largest relative difference of a torque that agrees with the scenario."""
+"""Largest relative difference at which a torque agrees with the scenario."""
 
 
 def list_walls(spec: SiteSpec) -> list[TorqueSource]:
@@ -263,11 +263,11 @@ def compute_live_torque(
 
 
 class TorqueSplit(NamedTuple):
-    """The external torque on an arm, divided by who applies it, in N m.
+    """The external torque on an arm, divided into those of operator and environment, in N m.
 
     Each attribute has the shape (K, n) unless stated otherwise. Torques that follow the motion
-    continuously and torques that are computed once per tick do different work within a tick, so
-    that they are kept apart. The torque of the arm's mechanical stops is not included.
+    continuously and torques that are computed once per tick do different work within a tick.
+    Therefore they are kept separate. The torque of the arm's mechanical stops is not included.
 
     Attributes:
         end_effector: Motion of the end effector.
@@ -276,7 +276,7 @@ class TorqueSplit(NamedTuple):
         environment_now: Environment's torque that follows the motion continuously.
         environment_held: Environment's torque that is computed once per tick and held.
         script: The part of the operator's action that the scenario plans, see
-            `compute_operator_script`. None if not requested, or if the operator's torque does
+            `compute_operator_script`. `None` if not requested, or if the operator's torque does
             not agree with the scenario.
     """
 
@@ -289,7 +289,7 @@ class TorqueSplit(NamedTuple):
 
     @property
     def operator(self) -> Array:
-        """Whole torque of the operator on the arm, shape (K, n), in N m.
+        """Total torque of the operator on the arm, shape (K, n), in N m.
 
         It is the sum of a continuous torque and a torque that is held over a tick (control
         period).
@@ -308,15 +308,16 @@ class TorqueSplit(NamedTuple):
     def of_records(cls, records: AlignedRecords, scenario: Scenario) -> "TorqueSplit":
         """Splits the recorded external torque on an arm into those of operator and environment.
 
-        The environment's torque is computed from the scenario. The rest belongs to the
-        operator. Use `attribute_torque` to find also what the scenario plans for the operator.
+        The environment's torque is computed from the scenario. The remaining torque is
+        attributed to the operator. `attribute_torque` additionally finds the torque that the
+        scenario plans for the operator.
 
         Args:
             records: Records of the arm's site, the process that runs the arm.
             scenario: The description of the experiment.
 
         Returns:
-            The torques at every record. The attribute `script` is None.
+            The torques at every record. The attribute `script` is `None`.
         """
         spec = scenario.sites[records.site]
         t_s = records.nominal_s
@@ -375,8 +376,8 @@ class TorqueSplit(NamedTuple):
 def compute_operator_script(source: TorqueSource, t_s: Array, J: Array) -> Array:
     """Returns the plan of an operator as a torque that does not depend on the arm's motion.
 
-    Metrics use the plan to tell when the operator acts: it changes if and only if the operator
-    moves. Its definition depends on the kind of the operator:
+    Metrics use the plan to find out when the operator acts, because the plan changes if and
+    only if the operator moves. The definition of the plan depends on the kind of the operator:
 
     - Scripted torque (pulse, recorded, chirp, multisine): the torque itself.
     - Spring: K times the displacement of its target plus B times the target's speed. If the
@@ -409,7 +410,7 @@ def compute_operator_script(source: TorqueSource, t_s: Array, J: Array) -> Array
 
 
 def _evaluate_scripted_torque(source: TorqueSource, t_s: Array) -> Array:
-    """Returns a planned torque signal over time, without regard to its start and end times.
+    """Returns a planned torque signal over time, regardless of its start and end times.
 
     Args:
         source: A pulse, a recorded torque, a chirp or a multisine.
@@ -516,13 +517,13 @@ class WallEnergy(NamedTuple):
 
     The force F_k of a sampled wall is computed once per tick and held for the tick period h. It
     does the work F_k (x_{k+1} - x_k), where x is the depth. Together with the energy K x^2 / 2
-    of its spring, the wall generates K (x_{k+1} - x_k)^2 / 2 in every tick of a contact, less
+    of its spring, the wall generates K (x_{k+1} - x_k)^2 / 2 in every tick of a contact, minus
     the energy that its damping B dissipates. A damper b of the arm itself dissipates all of
     this energy if b > K h / 2 + B: Colgate and Schenkel, "Passivity of a class of sampled-data
     systems", J. Robotic Systems 14 (1997).
 
-    The condition is sufficient, if B acts on the speed at the tick, and the motion is straight
-    within a tick (docs/reference/certificate-premises.md). `trilat linear` shows whether the
+    The condition is sufficient if B acts on the speed at the tick, and if the motion within a
+    tick is straight (docs/reference/certificate-premises.md). `trilat linear` shows whether the
     loop is stable in contact.
 
     Attributes:
@@ -530,7 +531,7 @@ class WallEnergy(NamedTuple):
         generated_j: Largest energy that the wall supplied to the joint motion beyond the energy
             that its spring had stored.
         required_damping_n_s_m: K h / 2 + B.
-        arm_damping_n_s_m: The arm's own damping b along the normal, the least during contact.
+        arm_damping_n_s_m: Smallest damping b of the arm itself along the normal during contact.
     """
 
     site: str
@@ -556,8 +557,8 @@ def find_wall_energies(log: Log) -> list[WallEnergy]:
     """Computes the energy that each virtual wall of a run generated by itself.
 
     A real wall generates no energy. The force of a virtual wall is computed once per tick and
-    constant until the next tick. Therefore the wall may push back with more energy than it
-    received. Walls that follow the motion continuously are left out.
+    constant until the next tick. Therefore the wall may return more energy than it received.
+    Walls that follow the motion continuously are left out.
 
     Args:
         log: The log of the run.
@@ -599,8 +600,8 @@ def _find_generated_energy(
 ) -> float:
     """Returns the energy that a wall generated: the largest rise of its work and stored energy.
 
-    A passive wall never gives more energy than it received, so that the sum of its work and of
-    its spring's energy never rises. The result is in J.
+    A passive wall never returns more energy than it received. Therefore the sum of its work and
+    of its spring's energy never rises. The result is in J.
 
     Args:
         wall: The wall.
@@ -631,7 +632,7 @@ def _find_arm_damping(
     """Returns the arm's own least damping along a wall's normal in contact, in N s/m.
 
     The damping is 1 / (n'J D^-1 J'n), with the normal n, the Jacobian J and the damping D of
-    the joints. Only dampers that act continuously count.
+    the joints. Only dampers that act continuously are included.
 
     Args:
         spec: Site of the wall.

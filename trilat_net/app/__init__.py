@@ -1,4 +1,4 @@
-"""What users start: the command line, the Python interface, a demo, and checks of the machine.
+"""The parts that users start: the command line, the Python interface, a demo, and checks.
 
 `cli` contains the `trilat` command, and `api` the functions of the package trilat_net. Each
 parses its arguments and calls the packages that do the work.
@@ -13,7 +13,6 @@ __all__ = [
     "flag",
     "options",
     "run_and_report",
-    "run_in_own_folder",
     "seconds",
     "show_progress",
     "value",
@@ -40,7 +39,7 @@ if TYPE_CHECKING:
     from .api import AnyScenario, Overrides
     from .cli import options
     from .cli.options import flag, seconds, value
-    from .cli.run_progress import run_in_own_folder, show_progress
+    from .cli.run_progress import show_progress
     from .cli.sessions import run_and_report
     from .demo_session import SessionResult, compile_core, run_demo
     from .input_device import Device, DeviceState, Vector
@@ -53,7 +52,7 @@ else:
         {
             "api": "AnyScenario Overrides",
             "cli.options": "flag options seconds value",
-            "cli.run_progress": "run_in_own_folder show_progress",
+            "cli.run_progress": "show_progress",
             "cli.sessions": "run_and_report",
             "demo_session": "SessionResult compile_core run_demo",
             "input_device": "Device DeviceState Vector",

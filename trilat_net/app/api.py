@@ -1,7 +1,7 @@
-"""The functions of `import trilat_net` that need no network, one for each such command.
+"""The Python functions of the commands that need no network.
 
 For example, `trilat_net.simulate("paper")` does what `trilat sim paper` does, and returns the
-log of the run. A function accepts a scenario (the description of an experiment) in any form:
+log of the run. Each function accepts a scenario (the description of an experiment) in any form:
 the name of a shipped scenario, the path of a TOML file, a TOML text, its tables, or a
 `Scenario`. A log is the path of an MCAP file, or a `Log`. Functions that need a network are in
 other modules.
@@ -57,8 +57,8 @@ def simulate(
             a path, a TOML text, its tables, or a `Scenario`.
         set: Settings that replace those of the scenario ("overrides"), as in
             `{"control.Kd": 5}` or `["control.Kd=5"]`.
-        duration_s: Duration of the run, in s. By default that of the scenario.
-        seed: Seed of the random delays and losses of messages. By default that of the scenario.
+        duration_s: Duration of the run, in s. Default: the scenario's duration.
+        seed: Seed of the random delays and losses of messages. Default: the scenario's seed.
 
     Returns:
         The log, which contains one record per control period and site.
@@ -88,12 +88,13 @@ def export(
     'run.npz'
 
     Args:
-        log: The log, or its path. For lerobot also several logs, or a folder of logs.
+        log: The log, or its path. The format lerobot also accepts several logs, or a folder of
+            logs.
         to: Format: ros2, parquet, csv, npz, mat or lerobot.
         out: Path of the file, or of the folder for parquet, csv and lerobot.
         force: True to replace an existing file or folder.
-        settings: Settings of the format, as `fps=30`, `observations="plugin"` and
-            `task="grasp"` of lerobot (docs/studies/lerobot.md).
+        settings: Settings of the format, such as `fps=30`, `observations="plugin"` and
+            `task="grasp"` for lerobot (docs/studies/lerobot.md).
 
     Raises:
         UsageError: There is no such format or setting, a package is missing, or the path
@@ -131,7 +132,7 @@ def verify(
             compared for the check to pass.
         resume_every: Number of ticks after which the state of each site is restored from the
             log, again and again. This reveals state of a user's control law that the log lacks.
-            0 never restores.
+            If 0, the state is never restored.
 
     Returns:
         The result of the comparison. Its property `passed` is True if all numbers are equal, if
@@ -152,7 +153,7 @@ def certify(
     own_laws: bool = False,
     twins: int | None = None,
 ) -> Certificate:
-    """Judges if a recorded run is stable; the command is `trilat certify`.
+    """Judges whether a recorded run is stable; the command is `trilat certify`.
 
     The judgement is "stable", "not stable", or "open" if neither can be shown.
 
@@ -162,9 +163,9 @@ def certify(
     Args:
         log: The log, or its path.
         min_coverage: Smallest fraction of the ticks (control periods) of each site that must be
-            judged, so that the run can be called stable.
-        own_laws: True if the code of a user's control laws may be executed. It is needed to
-            check the energies that a law reports, and to repeat the run.
+            judged before the run can be called stable.
+        own_laws: True if the code of a user's control laws may be executed. The code is needed
+            to check the energies that a law reports, and to repeat the run.
         twins: Number of repetitions of the run with a small disturbance ("twins"). They show
             whether disturbances grow.
 
@@ -210,7 +211,7 @@ def choose_report_folder(log: Path) -> Path:
     For example, the report of "run.mcap" is in the folder "run".
 
     Args:
-        log: File of the log. If its name has no suffix, the folder ends in "-report".
+        log: File of the log. If its name has no suffix, the folder's name ends in "-report".
     """
     return log.with_suffix("") if log.suffix else log.with_name(f"{log.name}-report")
 
@@ -264,22 +265,22 @@ def linear(
 ) -> "LinearAnalysis":
     """Linearises the closed loop of all arms about its equilibrium, and analyses it.
 
-    The analysis has the characteristic roots, the margins to instability, and the passivity and
-    impedances that operators feel. The command is `trilat linear`.
+    The analysis contains the characteristic roots, the margins to instability, the passivity,
+    and the impedances that operators feel. The command is `trilat linear`.
 
     >>> tn.linear("p_d_margin", {"control.d": 0.9}, ports=False).verdict
     'unstable'
 
     Args:
         scenario: The scenario, which describes the experiment: the name of a shipped scenario,
-            a path, a TOML text, its tables, or a `Scenario`. Or a log, whose loop is analysed
-            as it was at the end of its run, after all commands.
+            a path, a TOML text, its tables, or a `Scenario`. For a log, the loop is analysed as
+            it was at the end of the run, after all commands.
         set: Settings that replace those of the scenario, as in `{"control.d": 0.9}`.
-        pose: Joint angles of all sites, in rad. By default those at the end of a run.
-        roots: Number of characteristic roots, the exponents of the loop's motions, that are
-            computed.
-        over: Ranges of settings in which edges of stability (values at which the stability
-            changes) are searched, as in `["control.d=0.1:3"]`.
+        pose: Joint angles of all sites, in rad. Default: the angles at the end of a run.
+        roots: Number of characteristic roots to compute. The roots are the exponents of the
+            loop's motions.
+        over: Ranges of settings in which to search for edges of stability (values at which the
+            stability changes), as in `["control.d=0.1:3"]`.
         ports: True to analyse passivity and the impedances that operators feel.
         operators: Files of measured operators, from `trilat identify hand --json`.
 
@@ -328,14 +329,14 @@ def view(
 
     Args:
         files: Path of the log, or paths of its parts.
-        full: True to show the record of every control period. False shows fewer, evenly spaced
-            ones.
+        full: True to show the record of every control period, False to show fewer, evenly
+            spaced records.
         save: Path of a Rerun file to write instead of opening the viewer.
         foxglove: True to write a layout for the viewers Foxglove and Lichtblick beside the log,
             as run.foxglove.json, instead of opening Rerun.
         rviz: True to write a configuration of RViz for the ROS 2 topics of the session beside
             the log, as run.rviz, instead of opening Rerun.
-        viewer: Name of a viewer that another package adds, which opens the log instead.
+        viewer: Name of a viewer, added by another package, that opens the log instead of Rerun.
 
     Raises:
         UsageError: Rerun is not installed, there is no display, a file exists, or there is no

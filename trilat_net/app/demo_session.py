@@ -7,8 +7,8 @@ Python programs.
 
 All processes are copies (forks) of one process, the starter, which has imported all modules and
 compiled the control code. A copy starts in a tenth of the time that a Python interpreter takes.
-The starter has no network connection, no threads of its own, and none of the user's code,
-because these cannot be copied safely.
+The starter has no network connection, no threads of its own and no code of the user, because
+these cannot be copied safely.
 
 Invariant:
     - The recorder always ends last, so that it receives the last messages of the sites.
@@ -61,9 +61,9 @@ JOIN_S = 60
 WAIT_S = 600
 """Longest wait of the sites if people decide when the session begins, in s."""
 END_TIMEOUT_NS = 45 * NS_PER_S
-"""Time after which a child is killed that has not ended after its signal, in ns.
+"""Time after its signal at which a child that has not ended is killed, in ns.
 
-A site waits 10 s for the recorder, and as long again after each query of a recorder that lacks
+A site waits 10 s for the recorder, and another 10 s after each query of a recorder that lacks
 messages.
 """
 RECORDER_NS = 2 * NS_PER_S
@@ -73,14 +73,14 @@ RECORDER_NS = 2 * NS_PER_S
 
 @dataclass(slots=True)
 class SessionResult:
-    """Outcome of a session that `run_demo` has run: its log, its problems and its exit code.
+    """Outcome of a session run by `run_demo`: the log, the problems and the exit code.
 
     Attributes:
         log: Path of the log. The file exists only if the session has begun.
-        problems: Sentences that say what failed, in the order of the failures.
+        problems: One sentence about each failure, in the order of the failures.
         interrupted: Number of the signal that ended the session. 0 if no signal did.
-        exit_code: Exit code for the command: that of a failed run, or of a disk that refused
-            the log.
+        exit_code: Exit code for the command. It states whether the run failed, or whether the
+            log could not be written to the disk.
     """
 
     log: Path
@@ -90,16 +90,16 @@ class SessionResult:
 
 
 class SessionProcess:
-    """State of one process of a session: of an arm, the recorder or an operator program.
+    """State of one process of a session: a site, the recorder or an operator program.
 
     `ProcessStarter` creates this object, and updates it with the reports of the starter
     process.
 
     Attributes:
-        name: Name of the process, which is that of its site or "recorder".
+        name: Name of the process: the name of its site, or "recorder".
         output: File with everything that the process prints.
-        pid: Process number. None before the process has started.
-        code: Exit code. None before the process has ended.
+        pid: Process number. `None` before the process has started.
+        code: Exit code. `None` before the process has ended.
     """
 
     def __init__(self, starter: "ProcessStarter", name: str, output: Path) -> None:
@@ -127,7 +127,7 @@ class SessionProcess:
 
         Returns:
             A sentence with the exit code or signal, and the last line that the process printed.
-            None if the process has not failed: it is running, it ended with code 0, or it was
+            `None` if the process has not failed: it is running, it ended with code 0, or it was
             ended by a signal of this process.
         """
         exit_code = self.code
@@ -154,15 +154,15 @@ class SessionProcess:
 def create_file(path: Path) -> BinaryIO:
     """Creates the file to which a process of a session writes its output.
 
-    The user finds the errors of the process there. The file is not buffered, so that nothing is
-    lost in a crash. An earlier file of that name is deleted.
+    The user finds the errors of the process in this file. The file is not buffered, so that
+    nothing is lost in a crash. An earlier file of that name is deleted.
 
     Args:
         path: Path of the file.
 
     Raises:
         UsageError: The path is a symbolic link.
-        OSError: The file cannot be made.
+        OSError: The file cannot be created.
     """
     refuse_link(path)
     path.unlink(missing_ok=True)
@@ -201,11 +201,11 @@ class ProcessStarter:
     def start(self, name: str, arguments: Sequence[str]) -> SessionProcess:
         """Requests the start of a command of `trilat` as a child process.
 
-        The starter is a process that has imported all modules already, so that its copies start
+        The starter is a process that has already imported all modules, so its copies start
         quickly.
 
         Args:
-            name: Name of the process, which no other process of the session has.
+            name: Name of the process, unique in the session.
             arguments: The command and its arguments, without `trilat`.
 
         Returns:
@@ -256,8 +256,8 @@ class ProcessStarter:
         """Receives from the starter process which processes have started or ended.
 
         Each process object is updated with its process number or its exit code. If the starter
-        itself has failed, its processes are told to end. They then count as ended with the exit
-        code of the starter.
+        itself has failed, its processes are signalled to end. They then count as ended with the
+        exit code of the starter.
         """
         try:
             while self._pipe.poll():
@@ -279,8 +279,8 @@ class ProcessStarter:
     def close(self) -> None:
         """Ends the starter, the child process that starts all other processes of the session.
 
-        The method must be called after all other processes have ended, because nobody could
-        signal them any more.
+        The method must be called after all other processes have ended, because without the
+        starter they cannot be signalled.
         """
         self._pipe.close()
         self._starter.send_signal(signal.SIGINT)
@@ -316,17 +316,18 @@ def run_demo(
         folder: Folder for the log and for the output of the processes.
         console: Terminal of the user.
         attend: Function that watches the session, for example to serve a web page, and may end
-            it. None if there is no such function.
+            the session. `None` if the session is not watched.
         begins: Function that returns True once the session may begin. Until then, for at most
             `WAIT_S`, the sites wait for the recorder. The session begins a second or two later.
-            None lets it begin at once.
+            If `None`, the session begins at once.
 
     Returns:
         The outcome of the session. If the session has begun, the log is valid.
 
     Raises:
         ScenarioError: The scenario lacks the limits of an external arm.
-        UsageError: A user is a program of its own, and the package trilat-people is missing.
+        UsageError: The scenario has an operator that runs as a program of its own, and the
+            package trilat-people is missing.
     """
     check_outside_arms(scenario)
     if any(_needs_hand_process(scenario, name) for name in scenario.names):
@@ -406,11 +407,11 @@ def compile_core(scenario: Scenario, say: Callable[[str], None], interrupt: Inte
         say: Function that tells the user that the code is being compiled.
         interrupt: Handler of the signals.
     """
-    # The code depends only on the numbers of joints and links, so that one site of each kind
-    # of arm suffices.
+    # The code depends only on the numbers of joints and links, so one site of each kind of arm
+    # suffices.
     sites_by_counts = {arm.counts: name for name, arm in scenario.arms.items()}
     has_chains = any(arm.chain is not None for arm in scenario.arms.values())
-    # The cached code may be for chains with another number of joints.
+    # The cached code may have been compiled for chains with another number of joints.
     if has_chains or not is_core_cached():
         compiling_notice.report = say
         # Loading the scenario may have compiled, and announced, a small part of the code. The
@@ -505,7 +506,7 @@ def _needs_hand_process(scenario: Scenario, site: str) -> bool:
 def _is_over(children: list[SessionProcess], result: SessionResult) -> bool:
     """Returns True if the session is over: a process has failed, or all processes have ended.
 
-    If one process fails, the other ones are not left running.
+    If one process fails, the others are not left running.
 
     Args:
         children: The processes.
@@ -577,7 +578,8 @@ def _end_group(
 ) -> None:
     """Sends the processes of a session a signal to end, and waits until all have ended.
 
-    A process that does not end within `END_TIMEOUT_NS` is killed, so that none is left running.
+    A process that does not end within `END_TIMEOUT_NS` is killed, so that no process is left
+    running.
 
     Args:
         starter: Starter of the processes.
@@ -613,7 +615,7 @@ def _end_group(
 def run_starter(number: int, scenario_file: str) -> list[str] | None:
     """Runs the starter process, which creates the processes of a session as copies of itself.
 
-    A copy has all modules imported and all code compiled, so that it starts quickly. As with
+    A copy starts quickly, because all modules are imported and all code is compiled. As with
     `os.fork`, the function returns in every process: in each copy, which then runs its command,
     and finally in the starter, after the requesting process has disappeared.
 
@@ -622,7 +624,7 @@ def run_starter(number: int, scenario_file: str) -> list[str] | None:
         scenario_file: Scenario of the session.
 
     Returns:
-        In a copy, the command and arguments that the copy has to run. In the starter, None.
+        In a copy, the command and arguments that the copy has to run. In the starter, `None`.
     """
     # Until all modules are imported, the signal simply ends this process.
     signal.signal(signal.SIGINT, signal.SIG_DFL)
@@ -666,7 +668,7 @@ class _StarterProcess:
 
         Returns:
             The command and its arguments, if the method returns in a copy, which must now
-            execute the command. None, if it returns in the starter, after the requesting
+            execute the command. `None`, if it returns in the starter, after the requesting
             process has disappeared and all copies have ended.
         """
         arguments: list[str]
@@ -781,9 +783,9 @@ def run(
         scenario: The name of a shipped scenario, a path, a TOML text, the tables of a scenario,
             or a scenario.
         set: Settings that replace those of the scenario, as in `{"control.Kd": 5}`.
-        duration_s: Duration of the run in s. None keeps that of the scenario.
-        seed: Seed of the random numbers. None keeps that of the scenario.
-        out: Folder of the log. None uses the next free folder runs/NAME-N.
+        duration_s: Duration of the run in s. If `None`, the scenario's duration is kept.
+        seed: Seed of the random numbers. If `None`, the scenario's seed is kept.
+        out: Folder of the log. If `None`, the next free folder runs/NAME-N is used.
         force: True if the folder may contain files already.
         quiet: True if nothing is printed during the run.
 
@@ -798,7 +800,7 @@ def run(
     result = run_demo(loaded_scenario, folder, Console(quiet=quiet))
     problems = ["interrupted"] if result.interrupted else result.problems
     if problems:
-        log_note = f"; {result.log} holds what there was" if result.log.exists() else ""
+        log_note = f"; {result.log} holds the records so far" if result.log.exists() else ""
         raise RunFailed("; ".join(problems) + log_note)
 
     log = open_log(result.log)

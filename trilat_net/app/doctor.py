@@ -62,13 +62,13 @@ LOW_FREE_BYTES = 2 << 30
 CLOCK_TEST_NS = 100_000_000
 """Time for which the monotonic clock and the time of day are compared, in ns."""
 MAX_CLOCK_STEP_NS = 1_000_000
-"""Largest change of the difference between the clocks in that time, in ns."""
+"""Largest permitted change of the difference between the clocks in `CLOCK_TEST_NS`, in ns."""
 MAX_BOUND_US = 1_000
 """Largest error bound of a clock offset without a warning, in us."""
 PINGS = 20
 """Number of pings to each member of a session."""
 RATES_HZ = (1000, 500, 200, 100)
-"""Tick rates that are tried, in Hz, until one of them is achieved."""
+"""Tick rates in Hz, which are tried in this order until one of them is achieved."""
 REHEARSAL_S = 1.0
 """Duration of the trial of each rate, in s."""
 MAX_LATE_PERIODS = 0.5
@@ -84,7 +84,7 @@ class DoctorFinding(NamedTuple):
 
     Attributes:
         check: Subject of the check, such as "keys" or "disk".
-        state: "ok", "warn" for a possible problem, or "fail" for a certain one.
+        state: "ok", "warn" for a possible problem, or "fail" for a certain problem.
         text: Sentence about the result and, if there is a problem, its remedy.
     """
 
@@ -104,13 +104,13 @@ def examine_machine(
 ) -> Iterator[DoctorFinding]:
     """Checks whether this machine can run a session, and yields each result at once.
 
-    Some checks take seconds, so that the user sees progress.
+    Some checks take seconds. The user sees each result as soon as it is known.
 
     Args:
         connection: Endpoints at which this machine would listen, or to which it would connect.
-        keys: Folder of a member's keys. None if there is none.
+        keys: Folder of a member's keys. `None` if there are no keys.
         folder: Folder where results would be stored.
-        session: Name of a running session with whose members the clocks are compared. None if
+        session: Name of a running session with whose members the clocks are compared. `None` if
             the comparison is not made.
         clock: Clock of this process.
         insecure: True to permit connections without keys, because everybody on the network is
@@ -132,22 +132,22 @@ def examine_machine(
 
 
 def examine_keys(folder: Path | None) -> Generator[DoctorFinding, None, MemberKeys | None]:
-    """Checks if a member's keys are valid, for how long, and if other users can read them.
+    """Checks whether a member's keys are valid, for how long, and whether others can read them.
 
-    Keys encrypt the connections of a session, and prove which process a message comes from.
+    Keys encrypt the connections of a session, and prove which process has sent a message.
 
     Args:
-        folder: Folder of a member's keys. None if there is none.
+        folder: Folder of a member's keys. `None` if there are no keys.
 
     Returns:
-        The keys. None if there are no keys, or if they cannot be used.
+        The keys. `None` if there are no keys, or if they cannot be used.
 
     Yields:
         The findings about the keys.
     """
     if folder is None:
         yield DoctorFinding(
-            "keys", "ok", "none given: without --keys a member listens on this machine alone"
+            "keys", "ok", "no keys given: without --keys a member listens only on this machine"
         )
         return None
 
@@ -159,25 +159,29 @@ def examine_keys(folder: Path | None) -> Generator[DoctorFinding, None, MemberKe
 
     names = ", ".join(member_keys.members)
     description = (
-        f"{member_keys.member} of {names}, until {member_keys.ends:%Y-%m-%d %H:%M} UTC"
+        f"keys of {member_keys.member} for {names}, "
+        f"valid until {member_keys.ends:%Y-%m-%d %H:%M} UTC"
     )
     if member_keys.ends - datetime.now(UTC) < ENDS_SOON:
         yield DoctorFinding(
-            "keys", "warn", f"{description}: soon; renew them with trilat keys renew"
+            "keys",
+            "warn",
+            f"{description}: they expire soon; renew them with trilat keys renew",
         )
     else:
         yield DoctorFinding("keys", "ok", description)
 
     if read_foreign_permissions(folder):
         yield DoctorFinding(
-            "keys", "warn", f"others can look into {folder}: chmod 700 {folder}"
+            "keys", "warn", f"other users can read {folder}; run: chmod 700 {folder}"
         )
 
-    # With the key of the authority, anybody could create keys for further members.
+    # Anybody who has the key of the authority could create keys for further members.
     authority = folder.resolve().parent / "authority" / PRIVATE_KEY
     if authority.exists():
         description = (
-            f"{authority} lies here too: with it anybody makes keys; keep it elsewhere"
+            f"the authority's key {authority} should not be on this machine, because it "
+            "can create keys for anybody; keep it elsewhere"
         )
         yield DoctorFinding("keys", "warn", description)
     return member_keys
@@ -190,20 +194,20 @@ def examine_links(
     *,
     insecure: bool,
 ) -> Iterator[DoctorFinding]:
-    """Checks if each network endpoint can be opened or reached, and if it is encrypted.
+    """Checks whether each network endpoint can be opened or reached, and is encrypted.
 
     An endpoint is an address with a protocol, such as "tls/[::1]:7447".
 
     Args:
         connection: Endpoints to listen at and to connect to.
-        folder: Folder of a member's keys. None if there is none.
-        member_keys: The keys. None if there are no keys, or if they cannot be used.
+        folder: Folder of a member's keys. `None` if there are no keys.
+        member_keys: The keys. `None` if there are no keys, or if they cannot be used.
         insecure: True to permit connections without keys, because everybody on the network is
             trusted.
 
     Yields:
-        The findings about the endpoints. There is a single one if no endpoint can be used at
-        all.
+        The findings about the endpoints. There is a single finding if no endpoint can be used
+        at all.
     """
     try:
         secured = connection.secure(member_keys, insecure=insecure)
@@ -229,18 +233,20 @@ def examine_links(
 
     if not secured.listen and not secured.connect:
         yield DoctorFinding(
-            "links", "ok", "no endpoints given: --listen and --connect are tried if given"
+            "links",
+            "ok",
+            "no endpoints given; --listen and --connect are tried if they are given",
         )
 
 
 def _describe_untried(endpoint: str) -> DoctorFinding:
     """Returns the finding about an endpoint of a kind that this module cannot check."""
-    text = f"{endpoint} was not tried: not an address of TCP or QUIC"
+    text = f"{endpoint} was not tried, because it is not an address of TCP or QUIC"
     return DoctorFinding("links", "warn", text)
 
 
 def _examine_listening(endpoint: str, address: tuple[str, int]) -> DoctorFinding:
-    """Checks if this machine can listen at a network endpoint, by listening for a moment.
+    """Checks whether this machine can listen at a network endpoint, by listening for a moment.
 
     The port may be in use already. An endpoint without encryption causes a warning.
 
@@ -274,7 +280,7 @@ def _examine_listening(endpoint: str, address: tuple[str, int]) -> DoctorFinding
 def _examine_reaching(
     endpoint: str, address: tuple[str, int], folder: Path | None
 ) -> DoctorFinding:
-    """Checks if another process of a session answers at a TCP or TLS endpoint.
+    """Checks whether another process of a session answers at a TCP or TLS endpoint.
 
     The user learns before a session whether its processes can reach each other, and whether the
     connection is encrypted.
@@ -282,8 +288,8 @@ def _examine_reaching(
     Args:
         endpoint: The endpoint.
         address: Its host and port.
-        folder: Folder of this member's keys. None if they cannot be used: then only the
-            connection is tried, and not the certificate.
+        folder: Folder of this member's keys. `None` if they cannot be used. Only the connection
+            is then tried, and not the certificate.
     """
     try:
         with socket.create_connection(address, CONNECT_S) as tcp_link:
@@ -309,18 +315,21 @@ def _examine_reaching(
 
 
 def _examine_quic(endpoint: str, member_keys: MemberKeys | None) -> DoctorFinding:
-    """Checks if another member of the session answers over QUIC, by connecting to it.
+    """Checks whether another member of the session answers over QUIC, by connecting to it.
 
     Python has no QUIC client in its standard library. Therefore the connection uses Zenoh, the
     network library of the sessions.
 
     Args:
         endpoint: The endpoint.
-        member_keys: Keys of this member. None if there are no keys, or if they cannot be used.
+        member_keys: Keys of this member. `None` if there are no keys, or if they cannot be
+            used.
     """
     if member_keys is None:
         return DoctorFinding(
-            "links", "warn", f"{endpoint} was not tried: QUIC asks for the keys of a member"
+            "links",
+            "warn",
+            f"{endpoint} was not tried, because QUIC needs the keys of a member",
         )
 
     try:
@@ -337,7 +346,7 @@ def _tls_context(folder: Path | None) -> ssl.SSLContext:
     """Returns the settings of an encrypted (TLS) test connection to another machine.
 
     Args:
-        folder: Folder of this member's keys. None accepts any certificate.
+        folder: Folder of this member's keys. If `None`, any certificate is accepted.
     """
     if folder is None:
         # Only the connection is tried. No data is sent.
@@ -358,7 +367,7 @@ def _split_address(endpoint: str) -> tuple[str, int] | None:
         endpoint: The endpoint, such as "tls/[::1]:7447".
 
     Returns:
-        The host and the port. None for other endpoints, such as socket files.
+        The host and the port. `None` for other endpoints, such as socket files.
     """
     # protocol / host or [IPv6 address] : port, with optional Zenoh settings after ? or #
     pattern = r"(?:tcp|tls|quic)/(\[[^\]]+\]|[^:/]+):(\d{1,5})(?:[?#].*)?"
@@ -373,7 +382,7 @@ def _split_address(endpoint: str) -> tuple[str, int] | None:
 
 
 def examine_clock(clock: Clock) -> Iterator[DoctorFinding]:
-    """Checks for `CLOCK_TEST_NS` if the clocks of this machine run steadily.
+    """Checks for `CLOCK_TEST_NS` whether the clocks of this machine run steadily.
 
     The monotonic clock must not go back. The time of day must not step relative to the
     monotonic clock. The finding also states the longest time between two readings, which shows
@@ -419,7 +428,7 @@ def _examine_offsets(
 ) -> Iterator[DoctorFinding]:
     """Compares the clock of this machine with the clocks of a session's other processes.
 
-    Measured delays of messages are only as accurate as the offset between the clocks is known.
+    Measured delays of messages are only as accurate as the known offset between the clocks.
 
     Args:
         connection: Endpoints of the session, and keys.
@@ -451,7 +460,9 @@ def _examine_offsets(
         else:
             offset_s = member_row["offset_ns"] / 1e9
             bound_us = member_row["bound_us"]
-            text = f"{member} is {offset_s:+.6f} s, known to {bound_us:.0f} us"
+            text = (
+                f"the clock of {member} is {offset_s:+.6f} s ahead, known to {bound_us:.0f} us"
+            )
             state: FindingState = "ok" if bound_us <= MAX_BOUND_US else "warn"
             yield DoctorFinding("clock", state, text)
 
@@ -459,7 +470,8 @@ def _examine_offsets(
 def _run_in_process(code: str) -> Any:
     """Runs Python code in a new process, and returns the value that it prints.
 
-    Some checks change the settings of their process, and must therefore not run in this one.
+    Some checks change the settings of their process, and must therefore not run in this
+    process.
 
     Args:
         code: The code.
@@ -487,22 +499,22 @@ def _run_in_process(code: str) -> Any:
 _RIGHTS_CODE = (
     "import json; from sites.realtime import prepare; print(json.dumps(prepare(None)))"
 )
-"""Program that requests the real-time settings of a site, and prints the obtained ones."""
+"""Program that requests the real-time settings of a site, and prints the granted settings."""
 
 
 def examine_rights() -> Iterator[DoctorFinding]:
     """Checks which real-time settings the operating system grants to a site.
 
-    A site needs for example a high priority, so that its control loop is not interrupted by
+    For example, a site needs a high priority, so that its control loop is not interrupted by
     other programs.
 
     Yields:
-        One finding per setting. A single warning if the settings could not be tried.
+        One finding per setting, or a single warning if the settings could not be tried.
     """
     try:
         obtained_settings: dict[str, str] = _run_in_process(_RIGHTS_CODE)
     except ChildProcessError as error:
-        text = f"could not be tried, the process that tries them failed ({error})"
+        text = f"the settings could not be tried: the process that tries them failed ({error})"
         yield DoctorFinding("rights", "warn", text)
         return
 
@@ -520,15 +532,16 @@ def examine_system() -> DoctorFinding:
     """Reports which parts of the program work on this operating system.
 
     Returns:
-        A single finding. It is "ok" on Linux. On other systems, it names what is missing.
+        A single finding. It is "ok" on Linux. On other systems, it names the missing parts.
     """
     name = {"Darwin": "macOS"}.get(platform.system(), platform.system())
     if name == "Linux":
         return DoctorFinding(
-            "system", "ok", "Linux: live sessions and studies are both promised"
+            "system", "ok", "on Linux, live sessions and studies are both supported"
         )
     text = (
-        f"live sessions are promised on Linux alone; on {name} simulation, logs and studies are"
+        f"live sessions are supported only on Linux; on {name}, only simulation, logs and "
+        "studies are supported"
     )
     return DoctorFinding("system", "warn", text)
 
@@ -561,7 +574,7 @@ def rehearse_rates(clock: Clock) -> list[tuple[int, int, int]]:
 
 
 def is_held(rate_hz: int, late_us: int) -> bool:
-    """Returns True if a machine achieves a control rate, judged by how late its periods begin.
+    """Returns True if a machine achieves a tick rate, judged by how late its ticks begin.
 
     The rate is achieved if the lateness is at most `MAX_LATE_PERIODS` periods of the rate.
 
@@ -584,18 +597,20 @@ _RATES_CODE = (
 def examine_rate() -> DoctorFinding:
     """Measures the highest rate at which a control loop is punctual on this machine.
 
-    Each rate of `RATES_HZ` is tried for `REHEARSAL_S`, until the loop begins its periods on
-    time. An example is 1000 Hz.
+    Each rate of `RATES_HZ`, such as 1000 Hz, is tried for `REHEARSAL_S`. The trials end with
+    the first rate at which the loop begins its periods on time.
     """
     if not is_core_cached():
         return DoctorFinding(
-            "rate", "warn", "not measured: the core is not yet compiled, see below"
+            "rate",
+            "warn",
+            "the rate was not measured, because the core is not compiled yet; see below",
         )
 
     try:
         results: list[tuple[int, int, int]] = _run_in_process(_RATES_CODE)
     except ChildProcessError as error:
-        text = f"could not be measured, the process that measures it failed ({error})"
+        text = f"the rate could not be measured: the process that measures it failed ({error})"
         return DoctorFinding("rate", "warn", text)
 
     # All rates before the last one were not achieved.
@@ -608,13 +623,16 @@ def examine_rate() -> DoctorFinding:
     )
 
     if not is_held(rate_hz, late_us):
-        text = f"a site alone holds not even {rate_hz} Hz: {text}; end other programs"
+        text = f"a single site does not even achieve {rate_hz} Hz: {text}; end other programs"
         return DoctorFinding("rate", "fail", text)
 
-    text = f"a site alone holds {rate_hz} Hz: {text} ({share_text} must within half a period)"
+    text = (
+        f"a single site achieves {rate_hz} Hz: {text} ({share_text} must begin within half a "
+        "period)"
+    )
     if missed_rates:
         missed_hz, missed_us, _ = missed_rates[-1]
-        text += f"; at {missed_hz} Hz within {missed_us / 1e3:.2f} ms: lower rate_hz"
+        text += f"; at {missed_hz} Hz, within {missed_us / 1e3:.2f} ms: lower rate_hz"
     return DoctorFinding("rate", "warn" if missed_rates else "ok", text)
 
 
@@ -671,7 +689,7 @@ class DoctorReport(Result):
     findings: list[DoctorFinding]
 
     def headline(self) -> str:
-        """Returns the numbers of checks by result, for example "0 fail, 2 warn, 9 ok"."""
+        """Returns the number of checks with each result, for example "0 fail, 2 warn, 9 ok"."""
         states = [finding.state for finding in self.findings]
         return (
             f"{states.count('fail')} fail, {states.count('warn')} warn, {states.count('ok')} ok"
@@ -694,8 +712,8 @@ class DoctorReport(Result):
     def blocks(self) -> Iterator[Any]:
         """Returns the lines that `trilat doctor` prints, one per finding with its mark.
 
-        The module that composes the lines is imported inside this method, because its import is
-        of no use to a program that only reads the findings.
+        The module that composes the lines is imported inside this method, because a program
+        that only reads the findings does not need it.
         """
         from ..presentation import compose_doctor
 
@@ -721,7 +739,7 @@ def doctor(
         listen: Endpoints at which this machine would listen.
         connect: Endpoints to which this machine would connect.
         router: Endpoints of routers that this machine would connect to.
-        keys: Folder of a member's keys. None if there is none.
+        keys: Folder of a member's keys. `None` if there are no keys.
         session: Name of a running session with whose members the clocks are compared.
         folder: Folder where results would be stored.
         insecure: True to permit connections without keys, because everybody on the network is

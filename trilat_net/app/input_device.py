@@ -1,6 +1,6 @@
-"""Defines the interface of input devices, with which a person moves an arm and feels its force.
+"""Defines the interface of input devices, which move an arm and let a person feel its force.
 
-A program that supports another device has a class with the methods of `Device`, and gives an
+To support another device, a program defines a class with the methods of `Device`, and passes an
 object of the class to `RunningSession.lead`.
 
 Invariant:
@@ -56,7 +56,7 @@ class Device(Protocol):
         """
 
     def __exit__(self, *_: object) -> None:
-        """Ends the force of the input device, and closes the connection to the device."""
+        """Sets the device's force to zero, and closes the connection to the device."""
 
     def read(self) -> DeviceState:
         """Returns the newest motion of the device's handle and the state of its buttons.
@@ -64,14 +64,14 @@ class Device(Protocol):
         The method is called `rate_hz` times a second.
 
         Raises:
-            OSError: The device is silent or gone. The caller then leaves the `with` block of
-                the device, and connects again.
+            OSError: The device does not respond, or was disconnected. The caller then leaves
+                the `with` block of the device, and connects again.
         """
 
     def render(self, force_n: Vector) -> None:
         """Applies a force with the device's motors to the person who holds the handle.
 
-        A device without motors does nothing.
+        The method of a device without motors does nothing.
 
         Args:
             force_n: Coordinates x, y and z of the force, in N.

@@ -72,15 +72,16 @@ class StatusRow(dict[str, str]):
     ) -> "StatusRow":
         """Composes the row of one arm: mode, joint angles, torque and so on.
 
-        The texts follow from the newest record and statistics of the arm's process, its site.
+        The texts are composed from the newest record and statistics of the arm's process, its
+        site.
 
         Args:
             scenario: Scenario of the session.
             name: Name of the site.
-            record: Result of the site's newest tick. None if none has arrived.
-            stats: Newest statistics of the site. None if none have arrived.
+            record: Result of the site's newest tick. `None` if no record has arrived.
+            stats: Newest statistics of the site. `None` if no statistics have arrived.
             ended: True if the site has published its end.
-            silent_s: Time since a message of the site arrived, in s. 0 if one has just arrived.
+            silent_s: Time since the last message of the site arrived, in s.
         """
         row = cls(dict.fromkeys(_HEADINGS, ""), site=name, mode="braked")
         if stats is not None:
@@ -143,7 +144,7 @@ class StatusRow(dict[str, str]):
 
 
 def _describe_record(scenario: Scenario, name: str, record: State) -> dict[str, str]:
-    """Returns the texts of an arm's table row that follow from its newest record.
+    """Returns those texts of an arm's table row that describe its newest record.
 
     The display of `trilat demo` and `trilat watch` has one row per arm.
 
@@ -179,10 +180,10 @@ def _describe_record(scenario: Scenario, name: str, record: State) -> dict[str, 
 def _describe_hold(hand: HandInForce | None) -> str:
     """Returns the table text that says whether a person or a program moves the arm.
 
-    It stands in the column "held".
+    The text stands in the column "held".
 
     Args:
-        hand: State of the operator in the record. None if nobody may move the arm during the
+        hand: State of the operator in the record. `None` if nobody may move the arm during the
             run.
 
     Returns:
@@ -255,8 +256,8 @@ class SessionDisplay:
     def due(self) -> bool:
         """True if enough time has passed since the last update of the display.
 
-        A table in a terminal is updated more often than lines in a file. Drawing takes time,
-        and no reader could follow faster changes.
+        A table in a terminal is updated more often than lines in a file. The rate is limited,
+        because drawing takes time and no reader could follow faster changes.
         """
         period_ns = TABLE_NS if self._live else LINES_NS
         return self._clock.monotonic_ns() - self._updated_ns >= period_ns
@@ -264,7 +265,7 @@ class SessionDisplay:
     def say(self, text: str) -> None:
         """Prints a line, such as an event, that stays in the terminal above the table of arms.
 
-        The table below is refreshed all the time.
+        The table below the line is refreshed repeatedly.
 
         Args:
             text: The line.
@@ -337,7 +338,7 @@ class SessionMonitor:
         self._display = display
         self._links = bus.inbox(topics.key(session, "*", topics.LINK), 256)
         self._events = bus.inbox(topics.key(session, "*", topics.EVENT), 256)
-        # Only the newest record of a site is shown, so that an inbox holds a single message.
+        # Only the newest record of a site is shown, so an inbox for a single message suffices.
         self._states = {}
         for name in scenario.names:
             self._states[name] = bus.inbox(topics.key(session, name, topics.STATE), 1)

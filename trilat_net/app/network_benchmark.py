@@ -7,8 +7,9 @@ that the scenario tolerates. The command is `trilat ping --benchmark`. The two p
 called the near end and the far end.
 
 Invariant:
-    - The benchmark measures what a session would experience. Its messages have the size, rate,
-      priority and network settings of samples, the states that the arms send to each other.
+    - The benchmark measures the network as a session would use it. Its messages have the size,
+      rate, priority and network settings of samples, the states that the arms send to each
+      other.
     - The benchmark disturbs no session, because it uses a session name of its own.
 """
 
@@ -54,7 +55,7 @@ from ..net import (
 )
 
 SESSION = "benchmark"
-"""Name of the session under whose keys the messages of the benchmark travel."""
+"""Name of the session in whose key space the messages of the benchmark are published."""
 NEAR = "near"
 FAR = "far"
 """Names of the near end and the far end if they have no keys with a member's name."""
@@ -81,7 +82,7 @@ ns, and a byte that is 1 in a reply.
 
 
 def _parse_header(payload: bytes) -> tuple[int, ...] | None:
-    """Returns the fields of a message's header, or None if the message is too short."""
+    """Returns the fields of a message's header, or `None` if the message is too short."""
     return _HEADER.unpack_from(payload) if len(payload) >= _HEADER.size else None
 
 
@@ -115,7 +116,7 @@ def answer_benchmarks(bus: Bus, member: str) -> None:
 class NearEnd:
     """Sends messages to the far end, and measures when they come back.
 
-    The far end sends each message back at once, so that the near end measures round trip times
+    The far end sends each message back at once, so the near end can measure round trip times
     with its own clock.
 
     Args:
@@ -172,7 +173,7 @@ class NearEnd:
     def measure(self, size_bytes: int, rate_hz: float, duration_s: float) -> Array:
         """Sends messages at a constant rate, and measures their round trips.
 
-        The message rate does not depend on the replies, so that the load is that of a real
+        The message rate does not depend on the replies, so the load equals that of a real
         session.
 
         Args:
@@ -237,8 +238,8 @@ def _open(
         The connection, and the name of the end: that of its keys, otherwise "near" or "far".
 
     Raises:
-        UsageError: The endpoint is encrypted, and there are no keys or they are not those of a
-            site.
+        UsageError: The endpoint is encrypted, but there are no keys, or the keys do not belong
+            to a site.
     """
     is_encrypted = endpoint.startswith(ENCRYPTED)
     if is_encrypted and keys is None:
@@ -338,23 +339,24 @@ def _run_local_far_end(duration_s: float) -> Iterator[tuple[list[str], Path]]:
             child.wait()
 
 
-class _ScenarioNeeds(NamedTuple):
-    """What a scenario demands of the network: message size, rate, and largest delay.
+class NetworkNeeds(NamedTuple):
+    """Demands of a scenario on the network: message size, message rate and largest delay.
 
-    The demands follow from the rate of the control loops, and from the delays for which they
-    are stable.
+    The demands are computed from the rate of the control loops, and from the delays for which
+    they are stable.
 
     Attributes:
         sample_bytes: Size of a sample of the largest arm, in bytes.
         rate_hz: Largest tick rate of a site, in 1/s.
         playout_ms: Smallest play-out delay of the links. A play-out delay holds each sample
-            until it has a fixed age, and so replaces varying network delays by a constant one.
+            until it has a fixed age, and so replaces varying network delays with a constant
+            delay.
         held_ms: Shortest time for which a link holds its samples, by a play-out delay or by the
             constant delay that the scenario prescribes.
-        in_use_ms: Age of the samples that the sites use, as far as the scenario's links cause
-            it. None if the linear theory does not cover the scenario.
+        in_use_ms: Part of the age of the samples in use that the scenario's links cause. `None`
+            if the linear theory does not cover the scenario.
         stable_ms: Intervals of the delay of all links for which the control loop is stable.
-            None if the linear theory does not cover the scenario.
+            `None` if the linear theory does not cover the scenario.
         words: Sentence for the user about these intervals, or the reason why the theory does
             not cover the scenario.
     """
@@ -367,57 +369,107 @@ class _ScenarioNeeds(NamedTuple):
     stable_ms: list[list[float]] | None
     words: str
 
+    @classmethod
+    def of_scenario(cls, scenario: Scenario) -> "NetworkNeeds":
+        """Computes the delay, message size and message rate that a scenario demands.
 
-def find_needs(scenario: Scenario) -> _ScenarioNeeds:
-    """Computes the delay, the message size and the rate that a scenario needs of the network.
+        The delays for which the control loop is stable are computed by its linear analysis,
+        which takes as long as the command `trilat linear`.
 
-    The delays for which the control loop is stable come from its linear analysis, which takes
-    as long as the command `trilat linear`.
+        Args:
+            scenario: The scenario, which describes the arms, their links and the run.
+        """
+        links = list(scenario.links.values())
+        held_ms = [max(link.playout_ms, link.constant_delay_ms or 0.0) for link in links]
+        rates_hz = [site.rate_hz for site in scenario.sites.values()]
+        # Links whose delay the benchmark measures are analysed with a delay of 1 ms: their
+        # actual delay is the result of the benchmark.
+        overrides = ["link.model=constant", "link.delay_ms=1"] if scenario.measured else []
 
-    Args:
-        scenario: The scenario, which describes the arms, their links and the run.
-    """
-    links = list(scenario.links.values())
-    held_ms = [max(link.playout_ms, link.constant_delay_ms or 0.0) for link in links]
-    rates_hz = [site.rate_hz for site in scenario.sites.values()]
-    # Links whose delay the benchmark measures are analysed with a delay of 1 ms: their actual
-    # delay is the result of the benchmark.
-    overrides = ["link.model=constant", "link.delay_ms=1"] if scenario.measured else []
+        in_use_ms: float | None = None
+        stable_ms: list[list[float]] | None = None
+        try:
+            require_libraries("scipy")
+            # Imported here because the far end does not need SciPy.
+            from ..analysis import analyse_linear_loop
 
-    in_use_ms: float | None = None
-    stable_ms: list[list[float]] | None = None
-    try:
-        require_libraries("scipy")
-        # Imported here because the far end does not need SciPy.
-        from ..analysis import analyse_linear_loop
+            loop = analyse_linear_loop(load_scenario(scenario, overrides))
+        except (ScenarioError, RunFailed, UsageError) as error:
+            description = f"the linear theory does not cover its delay margin: {error}"
+        else:
+            description = loop.margin.description
+            stable_ms = [
+                [1e3 * interval.low_s, 1e3 * interval.high_s]
+                for interval in loop.margin.intervals
+            ]
+            if not overrides:
+                in_use_ms = 1e3 * float(loop.conditions.age_s.max())
 
-        loop = analyse_linear_loop(load_scenario(scenario, overrides))
-    except (ScenarioError, RunFailed, UsageError) as error:
-        description = f"theory does not know its delay margin: {error}"
-    else:
-        description = loop.margin.description
-        stable_ms = [
-            [1e3 * interval.low_s, 1e3 * interval.high_s] for interval in loop.margin.intervals
-        ]
-        if not overrides:
-            in_use_ms = 1e3 * float(loop.conditions.age_s.max())
+        return cls(
+            sample_bytes=_measure_sample(scenario),
+            rate_hz=max(rates_hz),
+            playout_ms=min((link.playout_ms for link in links), default=0.0),
+            held_ms=min(held_ms, default=0.0),
+            in_use_ms=in_use_ms,
+            stable_ms=stable_ms,
+            words=description,
+        )
 
-    return _ScenarioNeeds(
-        sample_bytes=_measure_sample(scenario),
-        rate_hz=max(rates_hz),
-        playout_ms=min((link.playout_ms for link in links), default=0.0),
-        held_ms=min(held_ms, default=0.0),
-        in_use_ms=in_use_ms,
-        stable_ms=stable_ms,
-        words=description,
-    )
+    def judge(self, row: Mapping[str, Any]) -> dict[str, Any]:
+        """Judges whether a network is good enough for a scenario.
+
+        A sample is the state that a site publishes in each tick, a period of its control loop.
+        The receiver uses it from its first tick after the sample has arrived. Samples therefore
+        have an age of whole ticks. The 99th percentile of the network delay counts. It has no
+        effect if it is shorter than the time for which the scenario itself holds samples. The
+        network is good if the loop is stable at that age, and if at most `MAX_LOST` of the
+        samples are lost.
+
+        Args:
+            row: Measurement at the scenario's own message size and rate.
+
+        Returns:
+            The fields of a verdict, as `trilat ping --benchmark --json` prints them. Times are
+            `None` if no message came back.
+        """
+        fields = {
+            "transport": row["transport"],
+            "good": False,
+            "lost_share": row["lost"] / row["sent"],
+        }
+
+        one_way_us = row["one_way_us"]
+        if one_way_us is None:
+            unknown = dict.fromkeys(("p99_ms", "age_ms", "spare_ms", "playout_ms"))
+
+            return {**fields, "hidden": False, **unknown}
+
+        period_ms = 1e3 / self.rate_hz
+        p99_ms = one_way_us["p99"] / 1e3
+        # 1e-9 absorbs the rounding error of a delay of exactly a whole number of ticks.
+        arrival_ms = max(p99_ms, self.held_ms)
+        age_ticks = max(1, math.ceil(arrival_ms / period_ms - 1e-9))
+        age_ms = max(period_ms * age_ticks, self.in_use_ms or 0.0)
+        is_hidden = p99_ms <= self.held_ms
+        # Upper end of the stable interval that contains the age, if there is one.
+        limits_ms = [high for low, high in self.stable_ms or [] if low <= age_ms <= high]
+        is_tolerated = is_hidden if self.stable_ms is None else bool(limits_ms)
+        return {
+            **fields,
+            "good": is_tolerated and fields["lost_share"] <= MAX_LOST,
+            "hidden": is_hidden,
+            "p99_ms": p99_ms,
+            "age_ms": age_ms,
+            "spare_ms": limits_ms[0] - age_ms if limits_ms else None,
+            "playout_ms": math.ceil(one_way_us["max"] / 1e3),
+        }
 
 
 def _measure_sample(scenario: Scenario) -> int:
     """Returns the size in bytes of an encoded sample of the scenario's largest arm.
 
-    Larger integers take more bytes. The sample therefore contains large values, as late in a
-    long session.
+    Larger integers take more bytes. The encoded sample therefore contains values as large as
+    those late in a long session.
 
     Args:
         scenario: The scenario.
@@ -436,57 +488,6 @@ def _measure_sample(scenario: Scenario) -> int:
     return len(msgspec.msgpack.encode(sample))
 
 
-def judge_network(needs: _ScenarioNeeds, row: Mapping[str, Any]) -> dict[str, Any]:
-    """Judges whether a network is good enough for a scenario.
-
-    A sample is the state that a site publishes in each tick, a period of its control loop. The
-    receiver uses it from its first tick after the sample has arrived. Samples therefore have an
-    age of whole ticks. The delay of the network that counts is its 99th percentile. It has no
-    effect if it is shorter than the time for which the scenario itself holds samples. The
-    network is good if the loop is stable at that age, and if at most `MAX_LOST` of the samples
-    are lost.
-
-    Args:
-        needs: Requirements of the scenario.
-        row: Measurement at the scenario's own message size and rate.
-
-    Returns:
-        The fields of a verdict, as `trilat ping --benchmark --json` prints them. Times are None
-        if no message came back.
-    """
-    fields = {
-        "transport": row["transport"],
-        "good": False,
-        "lost_share": row["lost"] / row["sent"],
-    }
-
-    one_way_us = row["one_way_us"]
-    if one_way_us is None:
-        unknown = dict.fromkeys(("p99_ms", "age_ms", "spare_ms", "playout_ms"))
-
-        return {**fields, "hidden": False, **unknown}
-
-    period_ms = 1e3 / needs.rate_hz
-    p99_ms = one_way_us["p99"] / 1e3
-    # 1e-9 absorbs the rounding error of a delay of exactly a whole number of ticks.
-    arrival_ms = max(p99_ms, needs.held_ms)
-    age_ticks = max(1, math.ceil(arrival_ms / period_ms - 1e-9))
-    age_ms = max(period_ms * age_ticks, needs.in_use_ms or 0.0)
-    is_hidden = p99_ms <= needs.held_ms
-    # Upper end of the stable interval that contains the age, if there is one.
-    limits_ms = [high for low, high in needs.stable_ms or [] if low <= age_ms <= high]
-    is_tolerated = is_hidden if needs.stable_ms is None else bool(limits_ms)
-    return {
-        **fields,
-        "good": is_tolerated and fields["lost_share"] <= MAX_LOST,
-        "hidden": is_hidden,
-        "p99_ms": p99_ms,
-        "age_ms": age_ms,
-        "spare_ms": limits_ms[0] - age_ms if limits_ms else None,
-        "playout_ms": math.ceil(one_way_us["max"] / 1e3),
-    }
-
-
 @dataclass(frozen=True, repr=False)
 class NetworkBenchmark(Result):
     """Result of measuring whether the network is good enough for a scenario.
@@ -499,14 +500,15 @@ class NetworkBenchmark(Result):
         duration_s: Duration of all cases together, in s.
         needs: Requirements of the scenario.
         rows: Measurements, one row per message size, message rate and transport.
-        judged: Verdict for each transport, whether it is good enough, see `judge_network`.
+        judged: Verdict for each transport on whether it is good enough, see
+            `NetworkNeeds.judge`.
         connect: Endpoints of the far end on another machine. Empty if both ends ran on this
-            machine, so that no network was measured.
+            machine, and no network was measured.
     """
 
     scenario: str
     duration_s: float
-    needs: _ScenarioNeeds
+    needs: NetworkNeeds
     rows: list[dict[str, Any]]
     judged: list[dict[str, Any]]
     connect: tuple[str, ...] = ()
@@ -516,7 +518,7 @@ class NetworkBenchmark(Result):
         """True if the network is good enough for the scenario with every measured transport.
 
         Transports are TCP, TLS and QUIC. The exit code of `trilat ping --benchmark` depends on
-        it.
+        this property.
         """
         return all(verdict["good"] for verdict in self.judged)
 
@@ -539,7 +541,7 @@ class NetworkBenchmark(Result):
     def to_rows(self) -> list[dict[str, Any]]:
         """Returns one table row per message size, message rate and transport, with times in us.
 
-        The one-way times are in the columns "p50_us", "p99_us" and "max_us". They are None if
+        The one-way times are in the columns "p50_us", "p99_us" and "max_us". They are `None` if
         no message came back.
         """
         flat_rows = []
@@ -553,8 +555,8 @@ class NetworkBenchmark(Result):
     def blocks(self) -> Iterator[Any]:
         """Returns the table and the verdicts that `trilat ping --benchmark` prints.
 
-        The module that composes the texts is imported inside this method, because its import is
-        of no use to a program that only reads the numbers.
+        The module that composes the texts is imported inside this method, because a program
+        that only reads the numbers does not need it.
         """
         from ..presentation import compose_benchmark
 
@@ -580,8 +582,8 @@ def ping_benchmark(
             or a scenario.
         set: Settings that replace those of the scenario, as in `{"link.model": "measured"}`.
         duration_s: Duration of all cases together, in s.
-        connect: Endpoints at which `trilat ping --answer` runs. None starts a far end on this
-            machine, for TCP, TLS and QUIC.
+        connect: Endpoints at which `trilat ping --answer` runs. If `None`, a far end is started
+            on this machine, for TCP, TLS and QUIC.
         keys: Folder with the keys of a site, for encrypted endpoints.
 
     Returns:
@@ -593,7 +595,7 @@ def ping_benchmark(
         RunFailed: No far end replies at an endpoint.
     """
     loaded_scenario = load_scenario(scenario, set)
-    needs = find_needs(loaded_scenario)
+    needs = NetworkNeeds.of_scenario(loaded_scenario)
     far_endpoints = tuple(connect or ())
     with ExitStack() as stack:
         if not connect:
@@ -610,7 +612,7 @@ def ping_benchmark(
     for row in rows:
         row_case = (row["bytes"], row["rate_hz"])
         if row_case == scenario_case:
-            verdicts.append(judge_network(needs, row))
+            verdicts.append(needs.judge(row))
     return NetworkBenchmark(
         loaded_scenario.name, duration_s, needs, rows, verdicts, far_endpoints
     )
@@ -619,7 +621,7 @@ def ping_benchmark(
 def _measure_endpoint(
     endpoint: str,
     keys: MemberKeys | None,
-    needs: _ScenarioNeeds,
+    needs: NetworkNeeds,
     case_s: float,
 ) -> Iterator[dict[str, Any]]:
     """Measures round trips to another machine, with all message sizes and rates.
@@ -628,7 +630,7 @@ def _measure_endpoint(
 
     Args:
         endpoint: Endpoint of the far end.
-        keys: Keys of this end. None if the endpoint is not encrypted.
+        keys: Keys of this end. `None` if the endpoint is not encrypted.
         needs: Requirements of the scenario, which determine the sizes and rates.
         case_s: Duration of each measurement, in s.
 
@@ -673,7 +675,7 @@ def _summarise_trips(trips_s: Array) -> dict[str, float] | None:
         trips_s: Round trip times in s, NaN for lost messages.
 
     Returns:
-        The three values. None if all messages were lost.
+        The three values. `None` if all messages were lost.
     """
     arrived_s = trips_s[np.isfinite(trips_s)]
     one_way_us = arrived_s / 2 * 1e6

@@ -18,8 +18,8 @@ def make_scenario_reader(views_hz: float = 0.0) -> ReadScenario:
     A scenario is the TOML text that describes the arms, their control laws and the network.
 
     Args:
-        views_hz: Rate of the messages for viewers in the log, in Hz, see
-            `log.view_rates`. With 0, the log contains none.
+        views_hz: Rate of the messages for viewers in the log, in Hz, see `log.view_rates`. With
+            0, the log contains no such messages.
     """
 
     def read_scenario(text: str, source: str) -> tuple[Scenario, Any]:

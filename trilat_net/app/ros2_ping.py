@@ -1,7 +1,7 @@
 """Measures the delays of the messages on a ROS 2 topic, for `trilat ping --ros2`.
 
-ROS 2 is the Robot Operating System. Each message of its programs carries the time at which it
-was sent, so that the delay is known on arrival.
+ROS 2 is the Robot Operating System. Each message of its programs contains the time at which it
+was sent, so the delay is known on arrival.
 
 Invariant:
     - The measurement does not disturb the publishers. This process only receives.
@@ -37,7 +37,7 @@ def ping_topic(
 
     Args:
         topic: Name of the topic.
-        routers: Endpoints of the Zenoh router of ROS. The first one that answers is used.
+        routers: Endpoints of the Zenoh router of ROS. The first endpoint that answers is used.
         domain: Number of the ROS domain.
         lasts_s: Duration of the measurement, in s.
         report: Function that receives a sentence about messages that could not be used.
@@ -45,7 +45,7 @@ def ping_topic(
     Raises:
         UsageError: The name of the topic is not valid.
         RouterSilent: No router answers.
-        RunFailed: Nobody has published on the topic.
+        RunFailed: No program has published on the topic.
     """
     name = check_ros_name(topic, "topic")
     clock = SystemClock()
@@ -67,7 +67,7 @@ def ping_topic(
 
 @dataclass(frozen=True, repr=False)
 class TopicDelays(Result):
-    """Delays of the messages on a ROS 2 topic, for each program that publishes them.
+    """Delays of the messages on a ROS 2 topic, for each program that publishes on the topic.
 
     A delay is the time from the time stamp with which a message was sent to its arrival at this
     process. Between two machines it contains the offset of their clocks.
@@ -92,8 +92,8 @@ class TopicDelays(Result):
     def blocks(self) -> Iterator[Any]:
         """Returns the table of delays that `trilat ping --ros2` prints.
 
-        The module that composes the texts is imported inside this method, because its import is
-        of no use to a program that only reads the numbers.
+        The module that composes the texts is imported inside this method, because a program
+        that only reads the numbers does not need it.
         """
         from ..presentation import compose_topic_delays
 
@@ -120,7 +120,7 @@ def measure_topic_delays(
         stopped: Function that returns True to end the measurement earlier.
 
     Raises:
-        RunFailed: Nobody has published on the topic.
+        RunFailed: No program has published on the topic.
     """
     # Number and delay of each message, and the type of the messages, by publisher.
     samples: dict[bytes, list[tuple[int, int]]] = {}

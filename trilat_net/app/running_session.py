@@ -52,7 +52,7 @@ from .input_device import Device
 from .session_ping import PingReport, ping_session
 
 GATHERING_NS = 500_000_000
-"""Time that further sites have to reply after the first one, in ns.
+"""Time that further sites have to reply after the first reply, in ns.
 
 It applies to sessions that sites may leave, in which some sites may never reply.
 """
@@ -61,7 +61,7 @@ RETRY_NS = 50_000_000
 STATES_KEPT = 4096
 """Number of records that `RunningSession.records` and `states` keep.
 
-A peer's sample that is in use is found among them by its tick.
+The record of a peer's sample in use is found among them by its tick.
 """
 AHEAD_S = 0.5
 """Time from the newest known tick of any site to the tick at which a session is ended, in s.
@@ -75,16 +75,16 @@ SOURCE = "the operator"
 
 
 def _never_stopped() -> bool:
-    """Returns False: the function `stopped` for calls that nothing but a time limit ends."""
+    """Returns False. It is the function `stopped` for calls that only a time limit ends."""
     return False
 
 
 class ShareHistory:
-    """Weights with which an arm follows the others, over the time of a session.
+    """Weights with which an arm follows the others, as functions of the time in a session.
 
-    Such a weight is called a dominance factor. The scenario states the factors at the start,
-    and planned changes. Users request further changes during the session. Each change is a
-    linear ramp from the present factors to other ones.
+    Such a weight is called a dominance factor. The scenario states the initial factors and
+    planned changes. Users request further changes during the session. Each change is a linear
+    ramp from the present factors to new factors.
     """
 
     def __init__(self, scenario: Scenario, site: str) -> None:
@@ -104,14 +104,14 @@ class ShareHistory:
         """
         with suppress(ScenarioError):  # raised if the text is not a change
             ramp = parse_core_change(self._scenario, self._site, change).ramp
-            # A ramp that starts before the present one was added earlier, from another event.
+            # A ramp that starts before the present ramp was added earlier, from another event.
             if ramp is not None and ramp.start_ns >= self._ramp.start_ns:
                 self._later_ramps.append(ramp)
 
     def advance_to(self, t_ns: int) -> tuple[float, ...]:
         """Computes the dominance factors of an arm at a given time of the session.
 
-        A dominance factor is the weight, from 0 to 1, with which the arm follows another one.
+        A dominance factor is the weight, from 0 to 1, with which the arm follows another arm.
 
         Args:
             t_ns: The time, in ns after the start of the session. It must not be earlier than in
@@ -121,7 +121,7 @@ class ShareHistory:
             One factor per peer, in the order of the site's peers.
         """
         started_ramps = sorted(ramp for ramp in self._later_ramps if ramp.start_ns <= t_ns)
-        # A ramp starts from the factors that the previous one had reached by then.
+        # A ramp starts from the factors that the previous ramp had reached by then.
         for ramp in started_ramps:
             self._shares_before = self._interpolate(ramp.start_ns)
             self._ramp = ramp
@@ -148,9 +148,9 @@ class RunningSession:
 
     Args:
         name: Name of the session.
-        connection: Endpoints of the session and keys of the member whose name is used.
-        bus: An open network connection to the session. None opens a connection in each call.
-        clock: Clock of this process. None creates one.
+        connection: Endpoints of the session and keys of a member.
+        bus: An open network connection to the session. If `None`, each call opens a connection.
+        clock: Clock of this process. If `None`, a clock is created.
     """
 
     def __init__(
@@ -197,8 +197,8 @@ class RunningSession:
 
         Args:
             member: Name of the member under which the requests will be sent. If this object has
-                keys, they must be those of that member. If empty, the keys of any member are
-                accepted.
+                keys, they must be the keys of that member. If `member` is empty, the keys of
+                any member are accepted.
             timeout_s: Longest wait for the reply of a site, in s.
 
         Yields:
@@ -207,7 +207,7 @@ class RunningSession:
 
         Raises:
             SessionError: No site replies in time.
-            UsageError: The keys are those of another member.
+            UsageError: The keys belong to another member.
         """
         if self._bus is not None:
             yield self._bus
@@ -219,7 +219,7 @@ class RunningSession:
             self._connection,
             self._clock,
             self.name,
-            # The names of the sites are read from the scenario that a site replies with.
+            # The names of the sites are read from the scenario in a site's reply.
             embedded_names_reader(self.name),
             stopped=_never_stopped,
             timeout_s=timeout_s,
@@ -320,10 +320,11 @@ class RunningSession:
         The command `trilat stop` does the same.
 
         Args:
-            *sites: Names of the sites whose arms are stopped. All sites if no name is given.
+            *sites: Names of the sites whose arms are stopped. If no name is given, all arms
+                stop.
 
         Returns:
-            One sentence per site: its reply, in the order of the sites.
+            The reply of each site as a sentence, in the order of the sites.
         """
         return _read_replies(self.send_order(sites, "stop"))
 
@@ -351,19 +352,19 @@ class RunningSession:
             *sites: Names of the sites. All sites if no name is given.
 
         Returns:
-            One sentence per site: its reply, in the order of the sites.
+            The reply of each site as a sentence, in the order of the sites.
         """
         return _read_replies(self.send_order(sites, "reset"))
 
     def send_order(self, sites: Sequence[str], order: OrderName) -> list[ChangeReply]:
         """Sends an order such as "stop" to some sites, and waits for their replies.
 
-        A site is the process that controls one robot arm. No order is sent if one of the sites
-        does not run, so that the user learns of a misspelled name before any arm reacts.
+        A site is the process that controls one robot arm. If one of the sites does not run, no
+        order is sent. The user thus learns of a misspelled name before any arm reacts.
 
         Args:
-            sites: Names of the sites. Empty addresses all sites, or all that are present if the
-                scenario allows sites to leave.
+            sites: Names of the sites. If empty, the order is sent to all sites, or to all sites
+                that are present if the scenario allows sites to leave.
             order: The order: "stop", "enable" or "reset".
 
         Returns:
@@ -410,11 +411,10 @@ class RunningSession:
     def end(self) -> list[str]:
         """Ends the session for all arms at the same time, as `trilat stop --end` does.
 
-        This time is about half a second from now, so that all processes receive the request
-        before.
+        The end is about half a second ahead, so that all processes receive the request in time.
 
         Returns:
-            One sentence per site: its reply, in the order of the sites.
+            The reply of each site as a sentence, in the order of the sites.
 
         Raises:
             SessionError: The session has not begun, or a site does not reply.
@@ -485,7 +485,7 @@ class RunningSession:
         return scenario, infos
 
     def _find_members(self, bus: Bus) -> Iterator[Info]:
-        """Asks all processes of the session who they are, and yields their replies.
+        """Asks all processes of the session for their identities, and yields their replies.
 
         A process may reply several times. The replies end after `REPLY_TIMEOUT_S`.
         """
@@ -496,7 +496,7 @@ class RunningSession:
         """Waits for the reply of one site, and checks that the site runs.
 
         All members of the session are asked. The reply of any site contains the scenario, which
-        tells whether the name of the wanted site is misspelled.
+        shows whether the name of the wanted site is misspelled.
 
         Args:
             bus: Network connection that reaches the session.
@@ -549,8 +549,8 @@ class RunningSession:
     def set_dominance(self, site: str, shares: Mapping[str, float], ramp_s: float = 1.0) -> str:
         """Changes the weights with which an arm follows the other arms.
 
-        With other weights, another operator leads the arm. For example, a trainer hands over to
-        a trainee. The command `trilat set dominance` does the same.
+        The change can pass the lead of the arm from one operator to another, for example from a
+        trainer to a trainee. The command `trilat set dominance` does the same.
 
         Args:
             site: Name of the site.
@@ -629,8 +629,8 @@ class RunningSession:
             def receive() -> list[State]:
                 """Returns the records of all arms that have arrived since the last call.
 
-                A record contains what was measured and computed in one period of a control
-                loop. The list is empty if none has arrived.
+                A record contains the measurements and results of one period of a control loop.
+                The list is empty if no record has arrived.
                 """
                 return [record for inbox in inboxes for record in read_records(inbox)]
 
@@ -641,17 +641,18 @@ class RunningSession:
         """Subscribes to the newest record of each site, as a context manager.
 
         A record is the result of one tick, a period of a site's control loop. With `as_site`,
-        the records are those that the user of that site sees. These are the newest record of
-        the site itself, and of each peer the record of the sample that the site uses at
-        present. That sample is older than the newest one, because the link delays it, or
-        because the scenario delays the picture (`[sites.NAME.view]`). A peer is missing if that
-        record was made before the subscription, or more than `STATES_KEPT` ticks ago.
+        the records are those that the user of that site sees. They are the newest record of the
+        site itself and, for each peer, the record of the sample that the site uses at present.
+        That sample is older than the newest sample, because the link delays it, or because the
+        scenario delays the picture (`[sites.NAME.view]`). A peer is missing if this record was
+        published before the subscription, or more than `STATES_KEPT` ticks ago.
 
         >>> with tn.session("paper").states(as_site="m1") as find:  # doctest: +SKIP
         ...     find()["s"].q
 
         Args:
-            as_site: Name of the site whose view is returned. Empty returns the newest records.
+            as_site: Name of the site whose view is returned. If empty, the newest records are
+                returned.
 
         Yields:
             A function that returns one record of each site, by the name of the site.
@@ -668,10 +669,10 @@ class RunningSession:
                 result of one tick (period of a control loop). The dictionary is empty until the
                 first record has arrived.
 
-                With `as_site`, the states are those that the user of that site sees. This may
-                be an older pose, because the scenario may delay the user's picture.
-                `picture_delay` computes which tick of each arm the user sees, and
-                `latest_records` keeps the records that arrive from `inbox`.
+                With `as_site`, the states are those that the user of that site sees. They may
+                be older, because the scenario may delay the user's picture. `picture_delay`
+                computes which tick of each arm the user sees, and `latest_records` keeps the
+                records that arrive from `inbox`.
                 """
                 nonlocal picture_delay
                 for record in read_records(inbox):
@@ -704,7 +705,7 @@ class RunningSession:
             yield find
 
     def mark(self, text: str) -> str:
-        """Stores a text in the log, as a mark of the present moment.
+        """Stores a text in the log to mark the present moment.
 
         For example, a user marks when something remarkable happens, and finds the moment in the
         log later. The first site of the scenario that is present publishes the mark as an
@@ -837,8 +838,8 @@ def session(
 
     Args:
         name: Name of the session.
-        connect: Endpoints of the session, as for --connect. None uses the session's own
-            endpoint on this machine.
+        connect: Endpoints of the session, as for --connect. If `None`, the session's own
+            endpoint on this machine is used.
         router: Endpoints of routers to connect through instead, as for --router.
         keys: Folder with the keys of the operator, as for --keys. To stop arms and to ping, the
             keys of any member suffice.
@@ -889,10 +890,10 @@ def hand(
     ...     hand.force, hand.pose
 
     Args:
-        session: Name of the session, by default that of the scenario.
+        session: Name of the session. A session is named after its scenario by default.
         site: Site of the arm. Its scenario must have an operator of kind "live".
-        connect: Endpoints of the session, as for --connect. None uses the session's own
-            endpoint on this machine.
+        connect: Endpoints of the session, as for --connect. If `None`, the session's own
+            endpoint on this machine is used.
         router: Endpoints of routers to connect through instead, as for --router.
         keys: Folder with the keys of the operator, as for --keys.
         source: Name of the program or person, which events of the session mention.
@@ -903,8 +904,8 @@ def hand(
 
     Raises:
         SessionError: There is no such session, or it does not begin.
-        UsageError: The scenario permits no live operator at that arm, or an endpoint cannot be
-            used.
+        UsageError: The scenario does not permit a live operator at that arm, or an endpoint
+            cannot be used.
     """
     connection = Connection.of_member(None, connect, router).secure(keys, insecure=False)
     with (
@@ -943,10 +944,10 @@ def open_hand(
         scenario: Scenario of the session.
         source: Name of the program or person, which events of the session mention.
         repeats: True if a thread repeats the last message regularly, so that the site knows
-            that the program is still there, see `Hand`.
+            that the program is still running, see `Hand`.
 
     Raises:
-        UsageError: The scenario permits no live operator at that arm.
+        UsageError: The scenario does not permit a live operator at that arm.
     """
     scenario.find_site(site)
     live = scenario.sites[site].find_live_hand(is_open=True)
@@ -972,7 +973,7 @@ def open_hand(
 
 
 def _read_replies(replies: Sequence[ChangeReply]) -> list[str]:
-    """Returns the texts of the arms' replies, if all of them have accepted a request.
+    """Returns the texts of the sites' replies, if all sites have accepted a request.
 
     Args:
         replies: Reply of each site, the process that controls an arm.
@@ -981,7 +982,7 @@ def _read_replies(replies: Sequence[ChangeReply]) -> list[str]:
         The text of each reply.
 
     Raises:
-        RunFailed: A site has refused. The message lists the refusals first.
+        RunFailed: A site has refused the request. The message lists the refusals first.
     """
     accepted = [reply.text for reply in replies if reply.accepted]
     refused = [reply.text for reply in replies if not reply.accepted]

@@ -38,7 +38,7 @@ from ..net import (
 POLL_NS = 1_000_000
 """Longest pause between two polls, in ns."""
 GATHERING_NS = 600_000_000
-"""Time that further members have to reply after the first one, in ns."""
+"""Time that further members have to reply after the first reply, in ns."""
 PATIENCE_NS = 3_000_000_000
 """Time after which missing replies to pings are given up, counted from when they are due, in
 ns.
@@ -71,8 +71,8 @@ class PingReport(Result):
     def blocks(self) -> Iterator[Any]:
         """Returns the tables of round trips that `trilat ping` prints.
 
-        The module that composes the texts is imported inside this method, because its import is
-        of no use to a program that only reads the numbers.
+        The module that composes the texts is imported inside this method, because a program
+        that only reads the numbers does not need it.
         """
         from ..presentation import compose_ping
 
@@ -83,9 +83,9 @@ class SessionPing:
     """Measures once the round trip times to a session's processes, and its link delays.
 
     The caller calls `poll` repeatedly until `is_over` returns True, and then `report`. The
-    measurement takes part in no control loop. It learns the members from their replies to a
-    query, measures the round trips to them by pings, and reads the delays of the links from the
-    statistics that the sites publish.
+    measurement does not take part in any control loop. It finds the members by their replies to
+    a query, measures the round trips to them by pings, and reads the delays of the links from
+    the statistics that the sites publish.
 
     Args:
         bus: Network connection that reaches the session.
@@ -142,8 +142,8 @@ class SessionPing:
         """Returns True once the pings to every member are complete, or have been given up.
 
         The measurement lasts at least `GATHERING_NS` after the first reply of a member, because
-        further members may reply in this time. It is given up `PATIENCE_NS` after all pings
-        should have been sent.
+        further members may reply in this time. The measurement is given up `PATIENCE_NS` after
+        all pings should have been sent.
 
         Args:
             timeout_ns: Longest wait for the first reply, in ns.
@@ -252,7 +252,7 @@ def ping_session(
         stopped: Function that returns True to end the measurement.
 
     Returns:
-        The results. None if `stopped` returned True.
+        The results. `None` if `stopped` returned True.
 
     Raises:
         RunFailed: No member replied.

@@ -27,7 +27,7 @@ __all__ = [
     "Rerun",
     "check_log_files",
     "rerun",
-    "verify",
+    "verify_log",
     # Twins
     "LEAST_PUSH",
     "MOST_PUSH",
@@ -43,7 +43,7 @@ if TYPE_CHECKING:
     from .log_checks import LogCheckReport, check_log_files
     from .twins import LEAST_PUSH, MOST_PUSH, PUSH_RAD, SMALLEST, Push, TwinPath, Twins
     from .unwritten_run import simulate_columns
-    from .verification import verify
+    from .verification import verify_log
     from .virtual import (
         SimulatedLog,
         check_virtual,
@@ -61,7 +61,7 @@ else:
             "log_checks": "LogCheckReport check_log_files",
             "twins": "LEAST_PUSH MOST_PUSH PUSH_RAD Push SMALLEST TwinPath Twins",
             "unwritten_run": "simulate_columns",
-            "verification": "verify",
+            "verification": "verify_log",
             "virtual": (
                 "SimulatedLog check_virtual execute_virtual record_virtual simulate_scenario"
             ),

@@ -1,13 +1,13 @@
 """Simulates an experiment about 1000 times faster than real time, without writing a log.
 
-All arms of the experiment are simulated in one compiled loop. It does not store every tick
-(period of the control loop), but the largest values of every interval of 50 ms, and sums over
-the run. Parameter sweeps use this module, and so does the repetition of runs with a small
-disturbance, which shows whether they are stable.
+All arms of the experiment are simulated in one compiled loop. The loop does not store every
+tick (period of the control loop). It stores the largest values of every interval of 50 ms, and
+sums over the run. Parameter sweeps use this module, and so does the repetition of runs with a
+small disturbance, which shows whether they are stable.
 
 Invariant:
     - The results equal the results of `execution.virtual` with its default network, bit for
-      bit. Scenarios that the compiled loop cannot execute are refused.
+      bit. Scenarios that the compiled loop cannot execute are rejected.
     - A run with the inputs of a log (arrived states and applied changes) equals the recorded
       run, bit for bit. The state that a site receives may carry a time stamp in the future,
       because the clocks of two computers may differ. It is then delivered in the first tick
@@ -42,7 +42,7 @@ def check_fusable(scenario: Scenario, plants: Collection[str] = ()) -> None:
     Args:
         scenario: Description of the experiment.
         plants: Names of the sites for which the caller provides a user's program that computes
-            the motion of the arm. By default, there are none.
+            the motion of the arm. By default, there are no such sites.
 
     Raises:
         ScenarioError: Another arm is external, or the tick rates differ so much that too many
@@ -52,7 +52,7 @@ def check_fusable(scenario: Scenario, plants: Collection[str] = ()) -> None:
     ratio = _find_largest_ratio(scenario)
     if ratio > MAX_ARRIVALS:
         raise ScenarioError(
-            f"the fastest site makes {count_nouns(ratio, 'tick')} within one tick of the "
+            f"the fastest site executes {count_nouns(ratio, 'tick')} within one tick of the "
             f"slowest, but at most {MAX_ARRIVALS} samples can arrive in a tick; choose tick "
             "rates that differ less",
             path="rate_hz",
@@ -128,15 +128,15 @@ class FusedRun(CompiledRun):
 
         A sample is the state that a peer, another site, sent in one of its ticks. The samples
         follow from the delays of the links alone, so they are computed again and not stored.
-        The run must not be one that repeats a log, whose samples arrived as recorded.
+        The run must not repeat a log, because its samples would then arrive as recorded.
 
         Args:
             i: Index of the site.
             count: Number of ticks, at most the number of executed ticks.
 
         Returns:
-            For each tick the tick in which each peer sent the sample. It is -1 before the first
-            sample.
+            For each tick of the site, the ticks in which the peers sent the samples. -1 before
+            the first sample of a peer.
         """
         stop = self.ticks[i]
         if i not in self._used or len(self._used[i]) < stop:
@@ -213,7 +213,7 @@ def read_run_inputs(log: Log) -> RunInputs:
 
 
 def _read_changes(log: Log) -> list[tuple[int, int, CoreChange]]:
-    """Returns the changes of all sites in the order of time, in the form of `RunInputs`."""
+    """Returns the changes of all sites in order of time, in the form of `RunInputs`."""
     timed_changes = []
     for i, name in enumerate(log.scenario.names):
         rate_hz = log[name].rate_hz

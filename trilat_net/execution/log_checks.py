@@ -5,10 +5,10 @@ computed again. The checks answer these questions:
 
 - Are records missing, and is the file as it was written?
 - Does the scenario, the description of the experiment, have the hash that the log states?
-- Which control laws of users does it name?
+- Which control laws of users does the scenario name?
 - Does a repeated execution give the same records?
 - Does a simulation of the whole session, without clocks and network, give the same records?
-- Was an arm moved by something outside of this program, such as a real robot?
+- Was an arm moved by something outside this program, such as a real robot?
 
 Invariant:
     - Every finding about an execution is based on an execution in this process.
@@ -30,7 +30,7 @@ from ..log import (
     open_log,
 )
 from ..own_code import CodeConsents, allowed_code, find_user_laws
-from .verification import VerifyResult, verify
+from .verification import VerifyResult, verify_log
 from .virtual_comparison import RecordComparison, compare_with_virtual
 
 _MAX_GAPS_NAMED = 60
@@ -120,12 +120,12 @@ class LogCheckReport(CheckReport):
             virtual: If True, the log is also compared with a simulation of its scenario in
                 virtual time, as `compare_with_virtual` does.
             progress: Function that is called now and then with the amount of work done and the
-                total. None if nobody wants to know.
+                total. None if progress is not reported.
             min_coverage: Smallest fraction of the ticks (control periods) of every site (arm
                 controller) that must be compared. A log with a smaller fraction fails even if
                 all compared records agree.
-            resume_every: Every how many ticks a site is restored from the records, see
-                `verify`. 0 means never.
+            resume_every: Interval, in ticks, at which a site is restored from the records, see
+                `verify_log`. 0 means never.
 
         Returns:
             The findings of all checks.
@@ -134,7 +134,7 @@ class LogCheckReport(CheckReport):
             LogError: A record cannot be read.
             ScenarioError: A user's control law that may run cannot be created.
         """
-        result = verify(log, progress, min_coverage=min_coverage, resume_every=resume_every)
+        result = verify_log(log, progress, min_coverage=min_coverage, resume_every=resume_every)
         findings = list(_check_log(log, result, virtual=virtual, progress=progress))
         if not resume_every:
             findings = [_add_memory_advice(finding, log, result) for finding in findings]
@@ -160,7 +160,7 @@ def check_log_files(
         sources: Paths of the files that the log consists of.
         min_coverage: Smallest fraction of the ticks (control periods) of every site that must
             be compared.
-        allowed: Permissions to run code of users, which are added to those of this process.
+        allowed: Permissions to run users' code, in addition to the permissions of this process.
 
     Returns:
         One finding for each check.
@@ -203,12 +203,12 @@ def _check_log(
         arms = " and ".join(log.scenario.external)
         yield Finding(
             "plant",
-            f"the motion of {arms} was measured and is not judged, its control is",
+            f"the motion of {arms} was measured and is not judged, but its control is",
             True,
         )
     if log.session.get("scenario_sha256") != log.scenario_sha256:
         yield Finding(
-            "scenario", "is not the one whose hash the log names: it was changed", False
+            "scenario", "does not have the hash that the log states: it was changed", False
         )
 
     if not virtual:
@@ -241,14 +241,14 @@ def _check_virtual_time(
       All records must be equal, up to the first gap of the log.
     - "plain virtual time": each sample arrives at once. The records must be equal up to the
       first sample that the real network delivered too late or lost. This simulation is left out
-      if the run differs from it by its nature, for example because an arm was external. The log
-      is not to blame for that, so the finding passes.
+      if the run differs from it by its nature, for example because an arm was external. This is
+      not a fault of the log, so the finding passes.
 
     Args:
         log: The log.
         result: Result of executing the log again.
-        progress: Function that reports the progress of the comparison. None if nobody wants to
-            know.
+        progress: Function that reports the progress of the comparison. None if progress is not
+            reported.
     """
     comparison = compare_with_virtual(log, progress)
     # The arrivals in a gap are unknown, so a difference after the first gap is excused.
@@ -297,7 +297,7 @@ def _check_coverage(log: Log, result: VerifyResult) -> Finding:
             coverage.describe(result.min_coverage),
         ]
     else:
-        # No site may be executed, so no number of records is expected of any.
+        # If no site may be executed, the expected number of records is unknown.
         clauses = [f"{sum(map(len, log.values()))} in the file"]
     if result.withheld:
         clauses.append(f"{', '.join(result.withheld)} not judged")
@@ -343,20 +343,20 @@ def _check_execution(result: VerifyResult, recorded: str) -> Finding:
         method = "whole runs, bit for bit"
     else:
         # Another platform rounds differently, so numbers agree only within a tolerance.
-        method = "tick by tick to 1e-9: another platform made it"
+        method = "tick by tick to 1e-9: another platform wrote it"
     text = f"{result.identical}/{count_nouns(result.records, 'record')} identical ({method})"
     if result.gaps:
         text += f"; no records of {_describe_gaps(result.gaps)}"
     if result.absences:
-        text += f"; not made, between two starts: {_describe_gaps(result.absences)}"
+        text += f"; not executed, between two starts: {_describe_gaps(result.absences)}"
     if recorded:
         text += f"; {recorded} as recorded"
         # Copied records can only be judged with the log from which they were copied.
         source_is_missing = result.coverage.share < result.min_coverage
         if source_is_missing:
-            text += ", not judged: the log that the rerun was made of is not beside it"
+            text += ", not judged: the source log of the rerun is not in the same folder"
     if result.unjudged:
-        text += f"; {result.unjudged} behind gaps could not be judged"
+        text += f"; {result.unjudged} after gaps could not be judged"
     if withheld:
         text += f"; {withheld}"
     if result.first:
@@ -368,9 +368,9 @@ def _add_memory_advice(finding: Finding, log: Log, result: VerifyResult) -> Find
     """Adds advice about user-defined control laws with hidden state to a finding.
 
     A law may store something outside of the records (results of control periods), such as an
-    attribute of its object. A run that is executed again as a whole repeats this hidden state,
+    attribute of its object. If an entire run is executed again, it repeats this hidden state,
     so that all records agree. Only a site (arm controller) that is restored from its records
-    lacks it, which the advised command tests.
+    lacks the hidden state. The advised command tests this.
 
     Args:
         finding: Finding of a check.
@@ -389,18 +389,20 @@ def _add_memory_advice(finding: Finding, log: Log, result: VerifyResult) -> Find
     for file in files:
         arguments += ["--law", file]
     command = join_arguments([*arguments, "--resume-every", "100"])
-    advice = f"memory of your law that the records lack would not show here, but by: {command}"
+    advice = (
+        f"this check cannot find memory of your law outside the records; to find it: {command}"
+    )
     return replace(finding, text=f"{finding.text}; {advice}")
 
 
 def _join_names(names: Sequence[str]) -> str:
-    """Returns names of sites as a list in a sentence, such as "m1, m2 and s"."""
+    """Returns the names of sites as a list for a sentence, such as "m1, m2 and s"."""
     *before, last = names
     return f"{', '.join(before)} and {last}" if before else last
 
 
 def _describe_gaps(gaps: Sequence[tuple[str, int, int]]) -> str:
-    """Returns the ranges of control periods (ticks) of each site that a log lacks, as text.
+    """Returns the ranges of missing control periods (ticks) of each site as text.
 
     An example is "m1 3-7, 12; s 5". At most `_MAX_GAPS_NAMED` ranges are listed. Further ones
     are counted.
@@ -428,7 +430,7 @@ def _describe_gaps(gaps: Sequence[tuple[str, int, int]]) -> str:
 def _check_comparison(
     label: str, comparison: RecordComparison, excused_from: int | None
 ) -> Finding:
-    """Returns whether a log equals another execution of its run, with the number of records.
+    """Returns the finding that states whether a log equals another execution of its run.
 
     Args:
         label: Name of the check.

@@ -84,7 +84,7 @@ def _find_samples(
     counts: IntArray, entries: IntArray, peers: IntArray, rows: IntArray, arrivals: IntArray,
     is_complete: NDArray[np.bool_],
 ) -> None:  # fmt: skip
-    """Finds out for which ticks the log contains the content of all samples that arrived.
+    """Determines the ticks for which the log contains the content of all arrived samples.
 
     A sample is the state that another site (arm controller), a peer, sent. The record of a tick
     (control period) lists only the senders of the samples and the ticks in which they were
@@ -125,10 +125,10 @@ class PlainRows:
 
     Args:
         site_log: Records of the site (arm controller).
-        indexed: The same records with the places of their values.
+        indexed: The same records with the positions of their values.
         samples: Samples of all sites.
-        resume_every: Every how many ticks a record does not count as plain, because the site is
-            restored from its records there. 0 means never.
+        resume_every: Interval, in ticks, at which the site is restored from its records. The
+            record there does not count as plain. 0 means never.
     """
 
     def __init__(
@@ -156,16 +156,16 @@ class PlainRows:
     def count_plain(self, row: int, before_tick: int | None) -> int:
         """Counts the records that compiled code can execute next in one block.
 
-        The caller makes sure that the first of them belongs to the present start of the site's
-        process, and to the next tick (control period). A block has at most `BLOCK_ROWS`
-        records (results of control periods).
+        The caller makes sure that the first record is from the present start of the site's
+        process, and is the record of the next tick (control period). A block has at most
+        `BLOCK_ROWS` records (results of control periods).
 
         Args:
             row: Index of the first record.
-            before_tick: Tick before which the records end. None for no such tick.
+            before_tick: Tick before which the records end. None if there is no such limit.
         """
         # `_stops` has the indices of the records that are not plain. The block ends before the
-        # next one of them.
+        # next of these records.
         stops = self._stops
         index = int(np.searchsorted(stops, row))
         is_plain = index == len(stops) or stops[index] > row
@@ -182,7 +182,8 @@ class PlainRows:
     def _is_first_of_run(self, row: int) -> bool:
         """True if a record is complete although it does not follow the record before it.
 
-        Compiled code can execute a series of recorded control periods from such a record on.
+        Compiled code can execute a series of recorded control periods that starts at such a
+        record.
         """
         return bool(self._is_complete[row])
 
@@ -234,7 +235,7 @@ class PlainRows:
         return _sum_before(counts), bits
 
     def read_rows(self, first: int, count: int) -> RecordedRows:
-        """Reads some records as arrays, to execute their control periods by compiled code.
+        """Reads consecutive records as arrays, to execute their ticks in compiled code.
 
         Args:
             first: Index of the first record (result of a control period).
@@ -259,16 +260,16 @@ class PlainRows:
         )
 
     def repeat(self, repeater: TickRepeater, first: int, count: int, *, external: bool) -> int:
-        """Executes control periods of some records again in compiled code, to verify them.
+        """Executes the control periods of records again in compiled code, to verify them.
 
         Args:
             repeater: Executes the ticks (control periods) of the site (arm controller).
             first: Index of the first record.
             count: Number of records, all of which must be plain (see `PlainRows`).
-            external: True if the motion of the arm was measured, as that of a real robot is.
+            external: True if the motion of the arm was measured, as with a real robot.
 
         Returns:
-            The number of records before the first one that differs from its execution.
+            The number of records before the first record that differs from its execution.
         """
         rows = self.read_rows(first, count)
         if external:

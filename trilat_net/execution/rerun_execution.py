@@ -1,8 +1,8 @@
-"""Executes arms of a log again with changed settings, and refuses changes without effect.
+"""Executes arms of a log again with changed settings, and rejects changes without effect.
 
 A log has one record per control period (tick) for each arm. `what_if` uses this module to
 compute some or all arms again, for example with another gain at the slave. A setting that
-concerns only arms that are not executed is refused, because it would have no effect. A setting
+concerns only arms that are not executed is rejected, because it would have no effect. A setting
 that concerns both kinds of arms changes only the executed ones, and the result reports this.
 
 Below, a site is the control process of an arm, and a sample is the state that a site sends to
@@ -193,9 +193,9 @@ class RerunRequest:
 
 
 def _refuse_external_sites(original: Scenario, replaced: Sequence[str]) -> None:
-    """Refuses to repeat the run of a site whose arm is a real robot or a user's program.
+    """Rejects the repetition of a site whose arm is a real robot or a user's program.
 
-    How this arm would have reacted to other torques is not known.
+    The log does not show how such an arm would have reacted to other torques.
 
     Raises:
         ScenarioError: A site that is to be executed again has such an arm.
@@ -204,8 +204,7 @@ def _refuse_external_sites(original: Scenario, replaced: Sequence[str]) -> None:
         if name not in replaced:
             continue
         problem = (
-            "is external: how this arm would have moved otherwise is not known; execute other "
-            "sites"
+            "is external: the log does not show how it would have moved; execute other sites"
         )
         others = [other for other in original.names if other not in original.external]
         if others:
@@ -214,7 +213,7 @@ def _refuse_external_sites(original: Scenario, replaced: Sequence[str]) -> None:
 
 
 def _check_key(key: str, replaced: Sequence[str], recorded: Sequence[str]) -> None:
-    """Refuses a changed setting that cannot have an effect in a rerun.
+    """Rejects a changed setting that cannot have an effect in a rerun.
 
     A rerun executes some sites (arm controllers) of a log again, and copies the records
     (results of control periods) of the others. For example, a setting of a site whose records
@@ -254,10 +253,10 @@ def _check_key(key: str, replaced: Sequence[str], recorded: Sequence[str]) -> No
 def _check_recorded_limits(
     original: Scenario, requested: Scenario, recorded: Sequence[str]
 ) -> None:
-    """Refuses changes of a rerun that the recorded arrivals of samples do not cover.
+    """Rejects changes of a rerun that the recorded arrivals of samples do not cover.
 
-    These are other sites (arm controllers), a longer duration, and other tick rates if some
-    sites are not executed.
+    Such changes are other sites (arm controllers), a longer duration, and other tick rates if
+    some sites are not executed.
 
     Args:
         original: Scenario of the log.
@@ -271,7 +270,7 @@ def _check_recorded_limits(
         )
     if requested.duration_s > original.duration_s:
         raise ScenarioError(
-            f"the experiment in the log lasts {original.duration_s:g} s: how the network would "
+            f"the experiment in the log lasts {original.duration_s:g} s; how the network would "
             f"behave from then until {requested.duration_s:g} s is not known",
             path="duration_s",
         )
@@ -338,8 +337,8 @@ def _describe_changes(request: RerunRequest) -> Iterator[tuple[str, str, str]]:
 
     The keys of changed values have the form group.owner.key, for example "sites.m1.control.Kd",
     "links.m1->s.delay_ms" or "dominance.s.m1". Keys without an owner, such as "duration_s",
-    concern the whole scenario. If another link model or control law replaces the one of the
-    log, several values of the same owner differ. They are described together, once.
+    concern the whole scenario. If another link model or control law replaces that of the log,
+    several values of the same owner differ. They are described together, once.
 
     Yields:
         The subject ("link" or the name of a key), its owner (a link or site, or empty for the
@@ -364,10 +363,10 @@ def _describe_changes(request: RerunRequest) -> Iterator[tuple[str, str, str]]:
 def _describe_replacement(
     request: RerunRequest, group: str, owner: str, key: str
 ) -> tuple[str, str, str] | None:
-    """Describes a change that replaces a link or a control law as a whole.
+    """Describes a change that replaces an entire link or control law.
 
-    A link is described as a whole if its short description differs, and a law if its kind
-    differs.
+    The entire link is described if its short description differs, and the entire law if its
+    kind differs.
 
     Args:
         request: The request.
@@ -455,7 +454,7 @@ class RerunSite:
         k: Number of the next tick.
         output: Record of the last tick.
         deliveries: The ticks in which samples of other sites arrive at this one.
-        first: First difference from the records of the log. None if there is none so far.
+        first: First difference from the records of the log. None if no record differs so far.
         lacking: Number of samples that arrived, but whose content is missing from the log.
         diverged: True after the arm of the site has left its limits.
     """
@@ -565,7 +564,7 @@ class RerunSite:
         return tick
 
     def _skip_gap(self) -> None:
-        """Continues at the next record of an incomplete log, as earlier inputs are unknown.
+        """Continues at the next record of an incomplete log, without the unknown ticks before.
 
         If there is no further record, the site (arm controller) is done.
         """
@@ -578,8 +577,8 @@ class RerunSite:
     def _execute(self, row: int | None) -> RerunTick:
         """Executes the next tick (control period), and compares it with the record of the log.
 
-        Its inputs are the samples that arrive according to `deliveries`, and the changes and
-        the operator's actions in the log.
+        The inputs of the tick are the samples that arrive according to `deliveries`, and the
+        changes and the operator's actions in the log.
 
         Args:
             row: Index of the record. None if the log does not contain a record of the tick.
@@ -752,13 +751,13 @@ class RerunExecution:
         """Executes all ticks of the requested sites, and yields the result of each tick.
 
         A site is a simulated process that runs one arm, and a tick is a period of its control
-        loop. Ticks are executed in the order of time, but a site waits for the data that it
-        receives. A site stops when its arm leaves its limits. If settings were changed, all
-        sites stop at this time.
+        loop. Ticks are executed in order of time, but a site waits until the data that it
+        receives exists. A site stops when its arm leaves its limits. If settings were changed,
+        all sites stop at this time.
 
         Args:
             progress: Function that is called now and then with the number of executed ticks,
-                and an upper bound of their total. None for no calls.
+                and an upper bound on their total. None if progress is not reported.
 
         Yields:
             The result of each tick.
@@ -789,7 +788,7 @@ class RerunExecution:
     def _keep_sample(self, site: RerunSite) -> None:
         """Stores the newest state of an executed site, which its peers will receive.
 
-        A state that is so old that it cannot arrive any more is removed.
+        States that are too old to arrive are removed.
         """
         output = site.output
         recent = self._recent[site.name]
@@ -802,9 +801,9 @@ class RerunExecution:
 
         A tick (control period) can be executed once all samples that arrive in it are known.
         The earliest such tick is chosen. If no tick is ready, because each site (arm
-        controller) waits for a sample of another one, the earliest tick is chosen all the same:
-        the execution must go on, and the missing samples then count as not contained in the
-        log.
+        controller) waits for a sample of another site, the earliest tick is chosen
+        nevertheless, because the execution must continue. The missing samples then count as not
+        contained in the log.
 
         Args:
             pending: Next tick of each executed site that has not finished, as (time in ns,

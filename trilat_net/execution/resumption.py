@@ -1,4 +1,4 @@
-"""Restores the state of an arm in the middle of a log, to execute the run from there.
+"""Restores the state of an arm in the middle of a log, to execute the rest of the run.
 
 A log has a record for each control period (tick), with the state of the arm and with the
 samples (states of other arms) that arrived. If records are missing, the ticks of this gap
@@ -9,7 +9,7 @@ Invariant (L3):
       suffice to restore the state of the arm and its controller.
     - If records are missing, it is not known which samples arrived in these ticks. A sample
       that was sent, but is missing from all records of the receiver, is assumed to have arrived
-      there.
+      in such a tick.
 """
 
 from bisect import bisect_left
@@ -25,7 +25,7 @@ from ..net import MODES, RESTING_MODES, State
 from ..records import NS_PER_S, Arrival, TickRecord
 
 _LOOK_BACK = 100
-"""Number of records before a gap in which the newest arrived sample is searched."""
+"""Number of records before a gap that are searched for the newest arrived sample."""
 
 Change = TypeVar("Change")
 
@@ -43,7 +43,7 @@ def read_output(state: State, peers: tuple[str, ...]) -> TickRecord:
 
     A tick is one period of the control loop, and a record is its stored result. The object can
     be compared with the result of executing the tick again by `Site.step`. Most fields are the
-    same in both forms, and are explained there. Three fields differ:
+    same in both forms, and are explained in `TickRecord`. Three fields differ:
 
     - The mode is a word in the log. An unknown word, as in the log of another version, becomes
       "diverged".
@@ -124,7 +124,7 @@ def select_peer_channels(
 ) -> list[Arrival]:
     """Returns copies of arrivals that contain only what one receiver gets.
 
-    A control law may send different numbers to different receivers. Those for the other
+    A control law may send different numbers to different receivers. The numbers for other
     receivers are removed.
 
     Args:
@@ -158,7 +158,7 @@ def find_recorded_hand(site_log: SiteLog, site: Site, k: int) -> list[float]:
 
     Returns:
         The operator's grip, target and velocity, in the order of `HandInForce`. Empty if the
-        site had no operator with a live connection.
+        site had no live operator.
     """
     if not site_log.layout.hand:
         return []
@@ -171,7 +171,7 @@ def find_recorded_hand(site_log: SiteLog, site: Site, k: int) -> list[float]:
 
 
 class RecordedInputs(Generic[Change]):
-    """Everything that one site received according to a log: samples and changes of settings.
+    """All inputs of one site according to a log: received samples and changes of settings.
 
     With these inputs, the site (arm controller) can be executed again. A sample is the state
     that another site (a peer) published in one tick (control period).
@@ -182,7 +182,7 @@ class RecordedInputs(Generic[Change]):
         ends: Last tick of each site.
         changes: Changes that took effect at the site, by tick.
         links: Links over which the site receives, in the order of its peers.
-        states: Records of the site, if they are not to be decoded as those of `site_log` are.
+        states: Records of the site, if they differ from the decoded records of `site_log`.
 
     Attributes:
         samples: Samples of each peer, by the tick in which the peer published them.
@@ -230,8 +230,8 @@ class RecordedInputs(Generic[Change]):
             tick: Last tick whose changes are returned.
 
         Returns:
-            Pairs of the tick of a change and the change, in the order of time. Empty if there
-            are no further changes.
+            Pairs of the tick of a change and the change, in order of time. Empty if there are
+            no further changes.
         """
         popped: list[tuple[int, Change]] = []
         while self._changes and self._changes[-1][0] <= tick:
@@ -286,9 +286,9 @@ class RecordedInputs(Generic[Change]):
         A site is a process that runs one arm, and a record contains the results of one tick
         (period of its control loop). There are two conditions:
 
-        - The records of the two ticks before must exist. The last one contains the state of the
-          arm and of the control law. The control torque of the tick before it is needed too,
-          because it is part of the state of the control loop.
+        - The records of the two ticks before must exist. The second record contains the state
+          of the arm and of the control law. The first record contains a control torque that is
+          part of the state of the control loop.
         - The log must contain the samples (states of other sites) that the site used in the
           last tick, because it may use them again. This does not matter for a site that rests
           at a position of its own, because such a site ignores the samples.
@@ -321,8 +321,8 @@ class RecordedInputs(Generic[Change]):
 
         A site is a process that runs one arm, and a record contains the results of one tick
         (period of its control loop). The state before a tick is restored from the records of
-        the two ticks before it. `can_resume` tells whether these and all other needed data
-        exist.
+        the two ticks before it. `can_resume` states whether these records and all other
+        required data exist.
 
         Args:
             site: The site, executed again. Its state is replaced.
@@ -342,7 +342,7 @@ class RecordedInputs(Generic[Change]):
         waiting_samples: list[Arrival] = []
         for peer, used_tick in enumerate(last.used):
             samples_in_use.append(self._find_in_use(peer, used_tick, len(last.q_des)))
-            # A sample that is older than the one in use is never used again.
+            # A sample that is older than the sample in use is never used again.
             self.lacking[peer] = {tick for tick in self.lacking[peer] if tick >= used_tick}
 
             rate_hz = site.peer_rate_hz(peer)
@@ -427,8 +427,8 @@ class RecordedInputs(Generic[Change]):
 
         Returns:
             Ticks of the samples that certainly arrived, because an earlier record lists them,
-            and ticks of samples that probably arrived. No record lists the latter, and they are
-            older than the record or than the first sample that a later record lists.
+            and ticks of samples that probably arrived. The second kind is in no record, and is
+            older than the given record or than the first sample that a later record lists.
         """
         states = self._states
         t_ns = states[row].t_ns
@@ -476,7 +476,7 @@ class RecordedInputs(Generic[Change]):
 
     @cached_property
     def _listings(self) -> "list[_PeerListing]":
-        """For each peer (site that sends samples), which records list samples from it.
+        """Index of the records that list samples from each peer (site that sends samples).
 
         The record of a tick (control period) lists the samples (sent states) that arrived in
         this tick. The index answers two questions quickly: in which record is a sample listed

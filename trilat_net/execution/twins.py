@@ -80,12 +80,13 @@ class Push(NamedTuple):
     def parse(
         cls, scenario: Scenario, target: str, size: float = PUSH_RAD, at_s: float = 0.0
     ) -> "Push":
-        """Converts a user's description of a push to the push.
+        """Converts a user's description of a push to a `Push` object.
 
         A push is a small displacement of the state of a twin, which is a second execution of
         the run. Examples of descriptions are "m1.q1" (joint 1 of site m1), "s.qd2" (velocity of
         joint 2), "m2.theta3" (estimate 3) and "m1.q". Without a number, all joints or estimates
-        of the site are pushed in a random direction. Without a site, those of all sites are.
+        of the site are pushed in a random direction. Without a site, the joints or estimates of
+        all sites are pushed.
 
         The twin is pushed only once. A push that is itself larger than `LARGEST` is never
         scaled down.
@@ -154,8 +155,8 @@ class Push(NamedTuple):
 
         Args:
             scenario: Description of the experiment.
-            count: Number of pushes. None for one push of each joint and the others above, up to
-                `MAX_PUSHES`.
+            count: Number of pushes. If None, each joint is pushed, in addition to the other
+                pushes above, up to `MAX_PUSHES` in total.
         """
         # The target of "m1 joint 1" is "m1.q1".
         joint_targets = [joint.replace(" joint ", ".q") for joint in _list_joints(scenario)]
@@ -219,7 +220,7 @@ class Twins(NamedTuple):
     object.
 
     Attributes:
-        paths: Course of the difference of each twin from the run.
+        paths: Difference between each twin and the run, over time.
         joints: Names of the joints of all sites (arm controllers), for example "m1 joint 1".
         speed: Largest speed of each joint of the run in each interval of 50 ms, in rad/s, shape
             (K, J). The differences can be compared with it.
@@ -301,7 +302,7 @@ def _list_joints(scenario: Scenario) -> tuple[str, ...]:
 def _push_in_random_direction(scenario: Scenario, number: int) -> Push:
     """Returns a small displacement of all joints in a random direction.
 
-    It is applied to a copy of the run, to see whether the difference grows.
+    The displacement is applied to a copy of the run, to see whether the difference grows.
 
     Args:
         scenario: Description of the experiment.
@@ -363,7 +364,7 @@ def _describe_targets(scenario: Scenario, target: str) -> str:
     )
     all_descriptions = ", ".join(descriptions)
     return (
-        f"--push {target}: there is no such number; name a number as in {examples}, or q; "
+        f"--push {target}: the state has no such number; name a number as in {examples}, or q; "
         f"the sites are {all_descriptions}"
     )
 
@@ -371,7 +372,8 @@ def _describe_targets(scenario: Scenario, target: str) -> str:
 LANE_SITE_TICKS = 100_000_000
 """Number of site ticks from which the code for twins side by side is compiled.
 
-The compilation takes some ten seconds. Code that exists is used for any number.
+The compilation takes about ten seconds. Code that has been compiled already is used for any
+number of ticks.
 """
 
 
@@ -394,7 +396,7 @@ def _run_twins(
         inputs: Inputs of a recorded run that is repeated. None for a new run.
         log: Log of the recorded run, with which the repeated run is compared.
     """
-    # Imported late, so that programs that need no twins do not load this code.
+    # Imported here, so that programs that need no twins do not load this code.
     from ..core import LaneEndedError, suits_twins
 
     run = FusedRun(scenario, inputs=inputs)
@@ -560,9 +562,9 @@ class _TwinRuns:
                 self._push(twin_index, end_s)
 
     def _push(self, twin_index: int, at_s: float) -> None:
-        """Displaces the state of a copy of the run (twin) a little, and notes the time.
+        """Displaces the state of a copy of the run (twin) slightly, and stores the time.
 
-        The further course of the difference shows whether the system is stable.
+        The later growth or decay of the difference shows whether the system is stable.
 
         Args:
             twin_index: Index of the twin.
@@ -576,7 +578,7 @@ class _TwinRuns:
     def _compare_with_log(self, log: Log, records: Sequence[tuple[Ints, Array]]) -> None:
         """Checks that the repeated run equals its log, up to rounding errors.
 
-        Otherwise the twins would tell something about another run than that of the log.
+        Otherwise the twins would not describe the run in the log.
 
         Args:
             log: The log.
@@ -642,7 +644,7 @@ class _TwinRuns:
         records: Sequence[tuple[Ints, Array]],
         twin_records: Sequence[tuple[Ints, Array]],
     ) -> None:
-        """Stores how the difference between a twin and the run developed in one window.
+        """Stores the difference between a twin and the run in one window of time.
 
         A twin is a copy of the run that was slightly displaced. A window is a part of the run
         after which the difference may be scaled down. The largest differences are stored as
@@ -700,10 +702,10 @@ class _TwinRuns:
             self._scale[n] -= math.log(factor)
 
     def _find_recent_peak(self, n: int, end_s: float) -> float:
-        """Returns how far apart a run and its displaced copy were in the last second.
+        """Returns the distance between a run and its displaced copy in the last second.
 
-        It is the logarithm of the largest difference of velocities. Positions do not show a
-        decay, because the copy (twin) may come to rest at another position.
+        The distance is the logarithm of the largest difference of velocities. Positions do not
+        show a decay, because the copy (twin) may come to rest at another position.
 
         Args:
             n: Index of the twin, a displaced copy of the run.
@@ -716,9 +718,9 @@ class _TwinRuns:
         return float(last_second.max(initial=-np.inf) - self._scale[n])
 
     def _end_path(self, n: int) -> None:
-        """Notes that the difference between a displaced copy (twin) and the run has decayed.
+        """Stores that the difference between a displaced copy (twin) and the run has decayed.
 
-        What is left of the difference are rounding errors.
+        Only rounding errors are left of the difference.
 
         Args:
             n: Index of the twin, a displaced copy of the run.
@@ -787,7 +789,7 @@ class _LaneTwinRuns(_TwinRuns):
                 self._push(n, end_s)
 
     def _measure_window(self, measured: Sequence[int]) -> None:
-        """Stores the course of the run and of the differences in one interval of time.
+        """Stores the speeds of the run and the differences of the twins in a window of time.
 
         Args:
             measured: Indices of the twins that are measured.

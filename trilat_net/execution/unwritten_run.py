@@ -26,8 +26,9 @@ def simulate_columns(scenario: Scenario) -> Log:
     """Simulates an experiment, and returns a log with the columns of its records.
 
     The log has the columns that the simulation computes: times, modes, motions, torques,
-    estimates, sent numbers, and the samples in use. If these columns do not describe the run
-    completely (see `_is_described_by_columns`), or if it ends early, an ordinary log results.
+    estimates, sent values, and the samples in use. If these columns do not describe the run
+    completely (see `_is_described_by_columns`), or if the run ends early, the result is an
+    ordinary log.
 
     Args:
         scenario: Description of the experiment.

@@ -173,7 +173,7 @@ def find_first_difference(
     equal: NumberEquality,
     channel: LawChannel = LawChannel(),  # noqa: B008
 ) -> RecordDifference | None:
-    """Finds the first field of a record that a repeated control period computes otherwise.
+    """Finds the first field of a record that differs from a repeated control period.
 
     Args:
         logged: Record of a tick (control period), as the log contains it.
@@ -181,7 +181,7 @@ def find_first_difference(
         peers: Names of the other sites (arm controllers), in the order of the scenario.
         equal: Function that decides whether two numbers count as equal.
         channel: Layout of the vectors that the site's control law sends, with their names. By
-            default, the law sends none.
+            default, the law sends no vectors.
 
     Returns:
         The difference. None if all computed fields agree.
@@ -227,7 +227,7 @@ def _compare_fields(
         logged_count = len(logged_numbers)
         computed_count = len(computed_numbers)
         if logged_count != computed_count:
-            yield f"{vector} (how many numbers)", logged_count, computed_count, False
+            yield f"{vector} (number of values)", logged_count, computed_count, False
             continue
         names = [f"{vector}[{n}]" for n in range(logged_count)]
         if vector == "ch":
@@ -263,7 +263,7 @@ class VerifyResult:
             ticks were executed, and numbers were compared within a tolerance.
         coverage: For each site, the number of judged ticks and the number of ticks of the run.
         min_coverage: Smallest fraction of the ticks of every site that must be judged.
-        integrity: Whether the log is unchanged since it was written.
+        integrity: States whether the log is unchanged since it was written.
         records: Number of records that were examined.
         identical: Number of records in which every computed field agrees with the execution.
         unjudged: Number of records after gaps that could not be judged.
@@ -293,7 +293,7 @@ class VerifyResult:
     def agreed(self) -> bool:
         """True if no record of the log differs from a repeated execution of its control period.
 
-        It is also true if only few records, or none, could be compared.
+        The result is also True if few records or no records could be compared.
         """
         return self.first is None
 
@@ -314,8 +314,8 @@ class VerifyResult:
         contains some sites that were copied from an older log. They are checked with that log,
         which gives a separate result.
 
-        Numbers are added, and lists are joined. The sum is a whole run, or intact, only if both
-        results are.
+        Numbers are added, and lists are joined. The sum counts as a whole run, or as intact,
+        only if both results do.
 
         Args:
             other: Result for the further sites. It does not change.
@@ -327,7 +327,7 @@ class VerifyResult:
         self.gaps = self.gaps + other.gaps
         self.absences = self.absences + other.absences
         self.withheld = self.withheld + other.withheld
-        # No ticks are expected of sites that may not be executed.
+        # No ticks are expected from sites that may not be executed.
         for name in other.withheld:
             self.coverage.expected.pop(name, None)
         self.whole_run &= other.whole_run
@@ -341,13 +341,14 @@ class VerifyResult:
         """Counts one more record that differs from the repetition of its control period.
 
         Args:
-            difference: The difference. It is stored as `first` if it is the earliest one.
+            difference: The difference. It is stored as `first` if it is the earliest
+                difference.
         """
         self.differing += 1
         self._keep_first(difference)
 
     def _keep_first(self, difference: RecordDifference | None) -> None:
-        """Stores a difference as the first one, if it is in the earliest tick so far."""
+        """Stores a difference as `first`, if it is in the earliest tick so far."""
         if difference is not None and (self.first is None or difference.tick < self.first.tick):
             self.first = difference
 
@@ -366,9 +367,9 @@ class _SiteVerifier:
     the log does not contain. Two consecutive records make it certain again.
 
     The log does not say which samples arrived during a gap. A sample that no record lists is
-    assumed to have arrived there. While a sample with an assumed arrival is in use, a record
-    that differs does not count as different, but as impossible to judge. The same holds for a
-    sample that arrived, but whose content is missing from the log.
+    assumed to have arrived during the gap. While a sample with an assumed arrival is in use, a
+    record that differs does not count as different, but as impossible to judge. The same
+    applies to a sample that arrived, but whose content is missing from the log.
 
     Most records are plain: their state is certain, and all of their inputs are in the log. A
     compiled loop executes their ticks (control periods). It ends before the first record that
@@ -379,8 +380,8 @@ class _SiteVerifier:
         site: Name of the site.
         samples: Samples of all sites for the compiled loop. None if it cannot be used.
         result: Object to which the counts and differences are added.
-        resume_every: Every how many ticks the site is restored from the records, see `verify`.
-            0 means never.
+        resume_every: Interval, in ticks, at which the site is restored from the records, see
+            `verify_log`. 0 means never.
     """
 
     def __init__(
@@ -443,7 +444,7 @@ class _SiteVerifier:
 
         Args:
             report: Function that is called now and then with the number of examined records of
-                all sites. None for no calls.
+                all sites. None if progress is not reported.
         """
         result = self._result
         name = self._log.name
@@ -474,7 +475,7 @@ class _SiteVerifier:
             result.gaps.append((name, next_tick, self._last_tick))
 
     def _repeat_plain(self, row: int, next_tick: int) -> int:
-        """Executes the control periods of some records again by compiled code, which is fast.
+        """Executes the control periods of records again in compiled code, which is fast.
 
         This is possible for a record if the state before it is known, and the log contains all
         of its inputs (a plain record). The execution ends before the first record that differs.
@@ -518,7 +519,7 @@ class _SiteVerifier:
         return repeated_count
 
     def _examine_record(self, row: int, next_tick: int) -> int:
-        """Checks one record: whether it has the expected tick, and repeats with equal results.
+        """Checks that one record has the expected tick, and that its results can be repeated.
 
         A tick is a control period. Gaps and differences are added to the result.
 
@@ -527,7 +528,7 @@ class _SiteVerifier:
             next_tick: Tick (control period) whose record is expected next.
 
         Returns:
-            Tick whose record is expected after this one.
+            Tick whose record is expected after this record.
         """
         result = self._result
         state = self._states[row]
@@ -568,7 +569,7 @@ class _SiteVerifier:
         """
         result = self._result
         try:
-            # On request, the site is replaced now and then, to find state outside of records.
+            # If requested, the site is replaced regularly, to find state outside the records.
             if self._resume_every and state.tick % self._resume_every == 0:
                 self._replace_site(row, state)
             if not self._certain and self._can_resume(row):
@@ -600,7 +601,7 @@ class _SiteVerifier:
             result.add_difference(difference)
 
     def _can_resume(self, row: int) -> bool:
-        """True if the records before a given one suffice to restore the state of the site."""
+        """True if the records before the given row suffice to restore the state of the site."""
         if self._law_failed or row - 2 < self._start_row:
             return False
         return self._inputs.can_resume(row, detached=self._detached)
@@ -657,19 +658,19 @@ class _SiteVerifier:
         return self._states[row].boot
 
     def _set_site(self, site: Site) -> None:
-        """Replaces the executed site by another one."""
+        """Replaces the executed site by another site."""
         self._site = site
         self._repeater = None
 
     def _replace_site(self, row: int, state: State) -> None:
-        """Replaces the simulated site by a new one, to find control laws with hidden state.
+        """Replaces the simulated site by a new site, to find control laws with hidden state.
 
         A control law must keep all its state in its `memory`, which the records contain. Any
         other state is lost by the replacement, so that the following records differ and the
         fault is found.
 
-        This method only marks the state as uncertain. The caller then restores it from the two
-        records before the next one, as after a gap of the log. Nothing happens if the state is
+        This method only marks the state as uncertain. The caller then restores the state from
+        the two preceding records, as after a gap of the log. Nothing happens if the state is
         uncertain already, or cannot be restored.
 
         Args:
@@ -680,7 +681,8 @@ class _SiteVerifier:
             return
         self._set_site(Site(self._setup))
         self._certain = False
-        # Settings are not part of the state. The new site gets them as the old one got them.
+        # Settings are not part of the state. The new site receives the same changes of
+        # settings.
         if self._start_tick:
             self._site.start_at(self._start_tick)
         for change in self._applied:
@@ -695,7 +697,7 @@ class _SiteVerifier:
         )
 
     def _find_other_sender(self, state: State) -> RecordDifference | None:
-        """Reports a record that was written by another process than the one that is repeated.
+        """Reports a record that was not written by the process that is repeated.
 
         Returns:
             The difference, if the record (result of a control period) states another start of
@@ -777,15 +779,15 @@ class _SiteVerifier:
         contains its text. An invalid text proves that the log is not that of a real run, so the
         difference is reported.
 
-        At most `MAX_RAMPS` changes can wait at a site. Further ones are left out. The changes
-        are also stored in `_applied`, so that `_replace_site` can repeat them.
+        At most `MAX_RAMPS` changes can wait at a site. Further changes are left out. The
+        changes are also stored in `_applied`, so that `_replace_site` can repeat them.
 
         Args:
             tick: Last tick whose changes are returned.
 
         Returns:
-            The changes before the first invalid one, and the difference that reports the
-            invalid one. None in place of the difference if all changes are valid.
+            The changes before the first invalid change, and the difference that reports the
+            invalid change. The difference is None if all changes are valid.
         """
         changes: list[CoreChange] = []
         for change_tick, text in self._inputs.pop_changes(tick):
@@ -814,8 +816,8 @@ class _SiteVerifier:
         never executed such a tick.
 
         Returns:
-            The arrivals before the first impossible one, and the difference that reports it.
-            None in place of the difference if all arrivals are possible.
+            The arrivals before the first impossible arrival, and the difference that reports
+            the impossible arrival. The difference is None if all arrivals are possible.
         """
         samples = self._inputs.samples
         ends = self._inputs.ends
@@ -830,7 +832,7 @@ class _SiteVerifier:
         return state.rx, None
 
 
-def verify(
+def verify_log(
     log: Log,
     progress: Progress | None = None,
     *,
@@ -839,11 +841,10 @@ def verify(
 ) -> VerifyResult:
     """Executes every site of a log again, and compares each record with the result.
 
-    If all records agree, the log contains what its scenario and its recorded inputs produce. In
-    a rerun in which some sites were executed with changed settings, the records of the others
-    were copied from a source log. The copied records are compared with the source log, and
-    these sites are executed from the source log. This requires that the source log is in the
-    same folder.
+    If all records agree, the log contains what its scenario and its recorded inputs produce. A
+    rerun executes some sites with changed settings, and copies the records of the other sites
+    from a source log. The copied records are compared with the source log, and these sites are
+    executed from the source log. This requires that the source log is in the same folder.
 
     Args:
         log: Log of a run or of a rerun that is to be checked.
@@ -851,7 +852,7 @@ def verify(
             their total.
         min_coverage: Smallest fraction of the ticks of every site that must be judged.
         resume_every: In every tick that is divisible by this number, the site is replaced by a
-            new one that is restored from the records. This reveals state that a law keeps
+            new site that is restored from the records. This reveals state that a law keeps
             outside of its `memory`. 0 means never.
 
     Raises:
@@ -896,7 +897,7 @@ def _execute_sites(
     report: Callable[[int], None] | None = None,
     resume_every: int = 0,
 ) -> None:
-    """Executes some sites of a log, and adds the counts and differences to a result.
+    """Executes the given sites of a log, and adds the counts and differences to a result.
 
     Sites (arm controllers) whose control law may not run are left out.
 
@@ -906,7 +907,7 @@ def _execute_sites(
         result: Receives the counts and differences.
         report: Function that is called now and then with the number of records (results of
             control periods) so far.
-        resume_every: See `verify`.
+        resume_every: See `verify_log`.
     """
     # On another platform, each tick is computed from the two records before it.
     samples = make_sample_table(log) if result.whole_run else None
@@ -942,8 +943,8 @@ def _list_states(site_log: SiteLog, *, lazy: bool) -> Sequence[State]:
 def _map_records(log: Log, *, lazy: bool) -> dict[str, Mapping[int, State]]:
     """Returns the records of all sites (arm controllers) of a log, by site and tick.
 
-    A tick is a control period. A site that is executed again looks up in them what it received
-    from other sites.
+    A tick is a control period. A site that is executed again finds in these records what it
+    received from other sites.
 
     Args:
         log: The log.
@@ -989,7 +990,7 @@ def _compare_with_source(recorded: SiteLog, source: SiteLog, result: VerifyResul
 
 
 def _open_rerun_source(log: Log) -> Log | None:
-    """Opens the log of which another log is a repetition with changed settings (rerun).
+    """Opens the source log of a rerun, a repetition with changed settings.
 
     It must be in the same folder as the rerun.
 

@@ -96,8 +96,8 @@ class SiteChannels:
     """Channels of one site in a log that is being written: records, statistics and events.
 
     The `make_…` methods convert ticks (control periods) and messages to entries, and `write`
-    writes an entry to the log. An account for each channel counts the messages, so that the log
-    can state whether any are missing.
+    writes an entry to the log. For each channel, an account counts the messages, so that the
+    log can state whether messages are missing.
 
     Args:
         scenario: Scenario of the log.
@@ -130,9 +130,7 @@ class SiteChannels:
     def make_tick_entries(
         self, output: TickRecord, stats: LinkStats | None, law_failure: Exception | None = None
     ) -> Sequence[SiteEntry]:
-        """Returns the messages that follow the record of a control period in a log.
-
-        They are statistics and events.
+        """Returns the statistics and events that follow the record of a tick in a log.
 
         Args:
             output: Record of the tick (control period): the stored result.
@@ -222,7 +220,7 @@ class SiteChannels:
 
         Args:
             state: The record: the stored result of the tick.
-            payload: The same record as it was encoded.
+            payload: The encoded form of the same record.
         """
         self._exclude_skipped_ticks(state.tick, state.cmd)
         # Old versions did not store the time of sending.
@@ -286,7 +284,7 @@ class SiteChannels:
             event: The event.
             number: Number of the event. It is used only if the event itself has none.
         """
-        has_number = event.n >= 0  # events of the oldest versions have none
+        has_number = event.n >= 0  # events of the oldest versions have no number
         numbered = event if has_number else msgspec.structs.replace(event, n=number)
         payload = encode(msgspec.structs.replace(numbered, v=VERSION))
         t_ns = max(event.t_ns, 0)  # a log has no times before the epoch
@@ -366,7 +364,7 @@ def check_virtual(scenario: Scenario) -> None:
     """Checks that a scenario can run in virtual time, before anything is written.
 
     In virtual time, all sites (simulated processes that each run one arm) run in one process. A
-    real robot cannot take part. An arm whose motion a user's program computes can.
+    real robot cannot take part, but an arm whose motion a user's program computes can.
 
     Args:
         scenario: Description of the experiment.
@@ -421,9 +419,9 @@ def execute_virtual(
 
     In virtual time, the sites run in one process, as fast as possible. A tick is one period of
     a site's control loop. Ticks are executed in the order of their nominal times, and ticks of
-    the same time in the order of the sites. A site for which samples have not been sent yet
-    waits while other sites are executed. If the arm of a site leaves its limits, the run ends
-    with the ticks of that time.
+    the same time in the order of the sites. A site waits while other sites are executed, as
+    long as samples that it needs have not been sent. If the arm of a site leaves its limits,
+    the run ends with the ticks of that time.
 
     Args:
         scenario: Description of the experiment, with its sites and links.
@@ -493,7 +491,7 @@ def _find_ready(
 
     A site, the simulated process of one arm, can execute its next tick (period of the control
     loop) as soon as the samples (sent states) that it needs are in the simulated network. Of
-    the sites that are ready, the one with the earliest tick is selected.
+    the sites that are ready, the site with the earliest tick is selected.
 
     Args:
         pending: Next tick of each site, as (time in ns, index of the site, tick), in order of
@@ -551,7 +549,7 @@ class _VirtualChannels(SiteChannels):
             self.write(entry, self._writer)
 
     def write_hand_events(self, news: list[tuple[int, str]]) -> None:
-        """Writes to the log what an operator's connection has reported, and empties the list.
+        """Writes the reports of an operator's connection to the log, and empties the list.
 
         Args:
             news: The reports, as pairs of a tick (number of a period of the control loop) and a
@@ -576,8 +574,8 @@ def write_virtual_log(
 ) -> bool:
     """Simulates a scenario in virtual time, and writes the log of the run to a stream.
 
-    The log is completed in any case: after the last tick, after `stopped` returns True, and
-    after an error.
+    The log is always completed: after the last tick, after `stopped` returns True, and after an
+    error.
 
     Args:
         scenario: Description of the experiment, with its sites and links.
@@ -589,7 +587,7 @@ def write_virtual_log(
         hands: Actions of live operators, see `execute_virtual`. They replace the programs that
             the scenario names as operators.
         commands: Changes that take effect during the run.
-        policies: Sites whose live operator is a trained program. An event of each says so.
+        policies: Sites whose live operator is a trained program. The log has an event for each.
 
     Returns:
         True if all sites stayed within their limits, False if one diverged.
@@ -676,7 +674,7 @@ def record_virtual(
             returns True.
         views_hz: Rate of the additional channels for viewers, in Hz.
         hands: Actions of live operators, see `execute_virtual`.
-        policies: Sites whose live operator is a trained program. An event of each says so.
+        policies: Sites whose live operator is a trained program. The log has an event for each.
 
     Returns:
         True if all sites stayed within their limits, False if one diverged.
@@ -749,7 +747,8 @@ def simulate_scenario(
 
     Args:
         scenario: Description of the experiment.
-        hands: Actions of live operators, see `execute_virtual`. By default, there are none.
+        hands: Actions of live operators, see `execute_virtual`. By default, nobody moves the
+            arms.
 
     Raises:
         ScenarioError: The scenario cannot run in virtual time.

@@ -1,10 +1,10 @@
-"""Compares a log with a simulation of it, to find the effect of late and lost messages.
+"""Compares a log with a simulation of its run, to find the effect of late and lost messages.
 
 In each control period, an arm sends its state, a sample, to the other arms. The receiver holds
-a sample until a delay has passed that the scenario prescribes; then the sample is due. As long
-as the real network delivers every sample before it is due, it has no effect on the run, and a
-simulation without real network gives the same numbers. The first difference shows when the
-network was too slow.
+a sample until the delay that the scenario prescribes has passed. Then the sample is due. As
+long as the real network delivers every sample before it is due, the network has no effect on
+the run, and a simulation without a network gives the same numbers. The first difference shows
+when the network was too slow.
 
 Invariant (L2):
     - A simulation in which all samples arrive when they arrived in the log equals the log in
@@ -129,13 +129,13 @@ def find_absent_samples(log: Log) -> list[_LateSample]:
 
     If records (results of control periods) of the receiver are missing, the log does not show
     whether a sample was lost or arrived in these ticks. The sample counts as lost if the
-    receiver still uses an older sample in the first recorded tick from the due tick on.
+    receiver still uses an older sample in its first recorded tick at or after the due tick.
 
     Args:
         log: Log of a live session.
 
     Returns:
-        The samples, by the tick in which they were due. Empty if all were in time.
+        The samples, by the tick in which they were due. Empty if all samples were in time.
     """
     absent: list[_LateSample] = []
     for name in log.sites:
@@ -212,7 +212,7 @@ def _find_absent_at_site(log: Log, name: str) -> list[_LateSample]:
 
 
 def _uses_older(site_log: SiteLog, sender: str, tick: int, due_tick: int) -> bool:
-    """True if a site still used an older state of its peer when a given one was due.
+    """True if a site still used an older sample of its peer when a given sample was due.
 
     Args:
         site_log: Records of the receiver.
@@ -229,9 +229,9 @@ def _uses_older(site_log: SiteLog, sender: str, tick: int, due_tick: int) -> boo
 class _VirtualComparison(NamedTuple):
     """Comparison of the log of a live session with simulations of the same experiment.
 
-    It shows whether the real network changed the result beyond the delays and losses that the
-    scenario (description of the experiment) contains. A sample is the state that a site, the
-    process that runs one arm, sends to the other sites.
+    The comparison shows whether the real network changed the result beyond the delays and
+    losses that the scenario (description of the experiment) contains. A sample is the state
+    that a site, the process that runs one arm, sends to the other sites.
 
     Attributes:
         fed: Comparison with a simulation in which each sample arrives when it arrived in the
@@ -241,7 +241,7 @@ class _VirtualComparison(NamedTuple):
             external, no records are compared, because its motion is known only for the recorded
             run.
         absent: Samples that arrived too late or never, by the tick (control period) in which
-            they should have been there.
+            they were due.
     """
 
     fed: RecordComparison
@@ -250,7 +250,7 @@ class _VirtualComparison(NamedTuple):
 
     @property
     def late(self) -> list[_LateSample]:
-        """Messages that arrived later than the delay model of the scenario describes.
+        """Messages that arrived later than the delay model of the scenario allows.
 
         A message (sample) contains the state that a site (process that runs one arm) sends.
         """
@@ -258,7 +258,7 @@ class _VirtualComparison(NamedTuple):
 
     @property
     def lost(self) -> list[_LateSample]:
-        """List of the samples that the network lost, although it should have delivered them.
+        """Samples that the network lost, although it should have delivered them.
 
         A sample is the state that a site (process that runs one arm) sends. Losses that the
         scenario itself describes do not count.
@@ -278,8 +278,8 @@ class _VirtualComparison(NamedTuple):
 def compare_with_virtual(log: Log, progress: Progress | None = None) -> _VirtualComparison:
     """Compares a log with two simulations of its scenario in virtual time.
 
-    In the first simulation, samples arrive as in the log; in the second one, they arrive at
-    once. Both end at the last record of the log.
+    In the first simulation, samples arrive as in the log. In the second simulation, they arrive
+    at once. Both end at the last record of the log.
 
     Args:
         log: Log of a live session, which contains its scenario.
@@ -310,8 +310,8 @@ def compare_with_virtual(log: Log, progress: Progress | None = None) -> _Virtual
             control loop) is executed when its record is read.
 
             Args:
-                network: Network that delivers the samples (sent states). None for one in which
-                    they arrive at once.
+                network: Network that delivers the samples (sent states). If None, samples
+                    arrive at once.
                 ticks_before: Number of ticks of earlier simulations, for the progress.
 
             Yields:
@@ -364,8 +364,8 @@ def _cut_to_records(log: Log) -> Scenario:
 def simulate_without_operators(log: Log) -> Log:
     """Simulates the experiment of a log in virtual time, but without operators.
 
-    An operator is a person or program that moves an arm. The result shows what the arms do by
-    themselves.
+    An operator is a person or program that moves an arm. The result shows how the arms move
+    without operators.
 
     Args:
         log: The log that contains the scenario.

@@ -34,7 +34,7 @@ class Network(Protocol):
 
     A network decides in which tick (control period) of the receiver a sample arrives. A sample
     is the state that a site (arm controller) publishes in one tick. The simulation calls `send`
-    after each tick of a site, and `deliver` before each one.
+    after each tick of a site, and `deliver` before each tick.
     """
 
     def send(self, sender: str, output: TickRecord) -> None:
@@ -48,9 +48,9 @@ class Network(Protocol):
         """
 
     def is_ready(self, receiver: str, k: int) -> bool:
-        """True if everything that a site receives in its next tick has been sent already.
+        """True if all samples that a site receives in its next tick have been sent already.
 
-        The next tick can only be executed then. A site is a simulated process that runs one
+        Only then can the next tick be executed. A site is a simulated process that runs one
         arm, and a tick is a period of its control loop.
 
         Args:
@@ -85,7 +85,7 @@ class PromptNetwork:
         }
 
     def send(self, sender: str, output: TickRecord) -> None:
-        """Stores the state that a site sends in a control period until all others have it."""
+        """Stores the state that a site sends in a tick until all others have received it."""
         for receiver, queues in self._in_transit.items():
             if receiver != sender:
                 queues[sender].append(output)
@@ -93,7 +93,7 @@ class PromptNetwork:
     def is_ready(self, receiver: str, k: int) -> bool:  # noqa: ARG002 - see `Network`
         """Returns True: a site can always execute its next control period without waiting.
 
-        The sites are simulated in the order of time, so that all earlier states have been sent.
+        The sites are simulated in order of time, so all earlier states have been sent.
         """
         return True
 
@@ -168,7 +168,7 @@ class RecordedNetwork:
 
         A sample (sent state) that its sender has not produced does not arrive. After a gap in
         the log, more samples may be assumed to arrive than a tick (control period) accepts
-        (`MAX_ARRIVALS`). Then only the newest are returned.
+        (`MAX_ARRIVALS`). Then only the newest samples are returned.
         """
         peers = self._peers[receiver]
         arrivals = []
@@ -232,14 +232,14 @@ class Deliveries(NamedTuple):
     def complete(
         cls, site_log: SiteLog, rates_hz: Sequence[int], last_ticks: Sequence[int]
     ) -> "Deliveries":
-        """Returns the arrivals at a site for every tick from its first record to its last one.
+        """Returns the arrivals at a site for every tick from its first to its last record.
 
         If the record of a tick is missing, the log does not say which samples arrived in it. A
-        sample that no record lists is assumed to have arrived in such a tick, if one is
-        possible. Three conditions must hold: the tick is after the sample was sent; it is after
-        the arrival of the last earlier sample that a record lists; and it is before the arrival
-        of the first later one. Of several possible ticks, the one is chosen whose delay is
-        nearest to the median delay of the link.
+        sample that no record lists is assumed to have arrived in a tick of this kind, if such a
+        tick is possible. Three conditions must hold: the tick is after the sample was sent; it
+        is after the arrival of the last earlier sample that a record lists; and it is before
+        the arrival of the first later sample. Of several possible ticks, the tick whose delay
+        is nearest to the median delay of the link is chosen.
 
         Args:
             site_log: Records of the site, each of which lists the samples that arrived in its
@@ -355,7 +355,7 @@ def _assume_arrivals(
     peer_hz: int,
     end: int,
 ) -> Iterator[tuple[int, list[int]]]:
-    """Yields assumed arrivals of those messages of one peer that no record lists.
+    """Yields assumed arrivals of messages from one peer that no record lists.
 
     Records are missing from the log, so that the true arrivals are not known.
 

@@ -5,7 +5,7 @@ For example, one can repeat a session with a higher damping at the slave:
     result = rerun("run.mcap", replace=["s"], set={"control.Kd": 5})
     result.sites["s"].error_rms_rad, result.after["s"].q
 
-In open loop, only the replaced sites (the controllers of arms) are executed; the other sites
+In open loop, only the replaced sites (the controllers of arms) are executed. The other sites
 keep their records and do not react. In closed loop, every site is executed, and each sample
 (the state that a site sends to the others) takes as long through the network as it did in the
 log.
@@ -13,8 +13,7 @@ log.
 Invariant:
     - Without changed settings, both modes reproduce the log, bit for bit.
     - A figure such as the mean error is computed from the log and from the rerun over the same
-      times: those for which the log contains a record and the rerun executed a tick (control
-      period).
+      times, at which the log contains a record and the rerun executed a tick (control period).
 """
 
 import io
@@ -58,7 +57,7 @@ from .virtual import SiteChannels, SiteEntry, render_accounts
 
 
 class LogAndRerun(NamedTuple):
-    """A number, such as an error, of a recorded run and of its repetition with changes.
+    """A figure, such as an error, of a recorded run and of its repetition with changes.
 
     Attributes:
         before: Value in the log.
@@ -70,11 +69,11 @@ class LogAndRerun(NamedTuple):
 
 
 class _SiteEffect(NamedTuple):
-    """How one arm moves otherwise in a repeated run with changed settings than in the log.
+    """Effect of changed settings on one arm: how a repeated run differs from the log.
 
-    The run is that of a site (arm controller). The figures are taken over those ticks of which
-    both the log and the repetition (rerun) have a record (result of a control period). They are
-    None if there is no such tick.
+    The figures describe a site (arm controller). They are computed from the ticks (control
+    periods) for which both the log and the repetition (rerun) have a record, and are None if
+    there is no such tick.
 
     Attributes:
         site: Name of the site.
@@ -83,13 +82,14 @@ class _SiteEffect(NamedTuple):
         identical: Number of compared ticks in which all computed fields have the same bits as
             in the log. If settings were changed, the checksum of the arrivals is not compared.
         stands: Number of ticks whose record was copied from the log, because the log does not
-            contain enough to execute them.
+            contain enough data to execute them.
         assumed: Number of executed ticks without a record in the log. The samples that arrived
             in these ticks were assumed.
         lacking: Number of samples that arrived, but whose content is missing from the log.
         first: First difference from the log. None if there is no difference, or if tick rates
             were changed.
-        diverged_at_s: Time at which the arm left its limits, in s. None if it did not.
+        diverged_at_s: Time at which the arm left its limits, in s. None if the arm stayed
+            within them.
         q_rms_rad: Root mean square of the change of the joint angles q, for the joint with the
             largest value, in rad.
         q_max_rad: Largest absolute change of q of any joint, in rad.
@@ -121,9 +121,9 @@ class _SiteEffect(NamedTuple):
 class _LinkEffect(NamedTuple):
     """Difference that a rerun makes to one link: how old the samples are when they are used.
 
-    A link is the directed connection from one site (arm controller) to another. Ages are taken
-    over those ticks (control periods) in which the receiver uses a sample both in the log and
-    in the rerun.
+    A link is the directed connection from one site (arm controller) to another. Ages are
+    computed from the ticks (control periods) in which the receiver uses a sample both in the
+    log and in the rerun.
 
     Attributes:
         link: Name of the link, for example "m1->s".
@@ -188,7 +188,7 @@ def _compare_site_rerun(
         log: The log that was executed again.
         request: Executed sites and changed settings of the rerun.
         site: The executed site, after its last tick.
-        ticks: All ticks of this site in the rerun, in the order of time.
+        ticks: All ticks of this site in the rerun, in order of time.
 
     Returns:
         The effect on the site, and the effects on the links that end at it.
@@ -214,7 +214,7 @@ def _compare_site_rerun(
         return effect, []
 
     links = _compare_links(log, request, records)
-    with np.errstate(over="ignore"):  # a damaged log holds any finite numbers
+    with np.errstate(over="ignore"):  # a damaged log may contain any finite numbers
         before_q = records.before.q[records.before_rows]
         after_q = records.after.q[records.after_rows]
         differences = after_q - before_q
@@ -261,7 +261,7 @@ def _pair_records(
 
 
 def _compute_rms(values: Array) -> float:
-    """Returns the root mean square of each column of an array, and of these the largest.
+    """Returns the largest root mean square of any column of an array.
 
     Args:
         values: Values, shape (K, n), with a column for each joint.
@@ -282,7 +282,7 @@ def _find_largest(values: Array) -> float:
 def _compare_links(
     log: Log, request: RerunRequest, records: _CommonRecords
 ) -> list[_LinkEffect]:
-    """Returns how the delays on the network links to an arm differ in the repeated run.
+    """Returns the differences of the delays on the network links to an arm in the repeated run.
 
     Args:
         log: The log.
@@ -329,10 +329,10 @@ class Rerun(Result):
     links: dict[str, _LinkEffect]
 
     def headline(self) -> str:
-        """Returns one line for the user that says what was executed again.
+        """Returns one line for the user that describes the repeated run.
 
-        It names the log, the way of execution, the sites (processes that each run one arm) that
-        were executed, and the settings that were changed.
+        The line names the log, the way of execution, the sites (processes that each run one
+        arm) that were executed, and the settings that were changed.
         """
         changes = "; ".join(self.request.describe_changes()) or "nothing changed"
         executed = f"{self.request.mode}, {', '.join(self.request.replaced)} executed"
@@ -353,10 +353,10 @@ class Rerun(Result):
     def write(self, stream: Sink, views_hz: float = 0.0) -> None:
         """Writes the rerun to a stream in the form of a log.
 
-        Such a log can be read, shown and checked like that of a run. The records of executed
-        sites contain no measured values, such as computing times and round trips. Recorded
-        sites are copied byte for byte. The file states the SHA-256 hash of its source log, the
-        executed sites and the changes. Its scenario is that of the rerun.
+        Such a log can be read, displayed and checked like the log of a run. The records of
+        executed sites contain no measured values, such as computing times and round trips.
+        Recorded sites are copied byte for byte. The file states the SHA-256 hash of its source
+        log, the executed sites and the changes. Its scenario is that of the rerun.
 
         Args:
             stream: Stream to which the log is written. It is not closed.
@@ -431,10 +431,10 @@ class Rerun(Result):
         This indicates an error of the program or a damaged log. The bits should be the same
         under three conditions:
 
-        - The log was made on this platform.
+        - The log was written on this platform.
         - No setting was changed.
-        - The log contains everything that its sites received. This is not so if the log is
-          itself a rerun in which some sites were copied from another log.
+        - The log contains everything that its sites received. This is not the case if the log
+          is itself a rerun in which some sites were copied from another log.
         """
         same_platform = self.before.session.get("fingerprint") == compute_fingerprint()
         are_executable = set(self.request.replaced) <= set(self.before.executed_sites)
@@ -443,7 +443,7 @@ class Rerun(Result):
 
     @property
     def notes(self) -> list[str]:
-        """Sentences that tell the user what the result of a repeated run cannot show.
+        """Sentences for the user about the limits of a repeated run.
 
         For example, records may have been copied because the log was incomplete. Empty if there
         is nothing to mention.
@@ -451,7 +451,7 @@ class Rerun(Result):
         return list(_describe_limits(self))
 
     def to_rows(self) -> list[dict[str, Any]]:
-        """Returns a table of how the repeated run differs from the recorded run, for JSON.
+        """Returns a table of differences between the repeated and the recorded run, for JSON.
 
         It has one row for each site (process that runs one arm) that was executed again.
         """
@@ -500,7 +500,7 @@ def rerun(
         set: Changed settings of these sites, for example `{"control.Kd": 5}`.
         closed_loop: If True, all sites are executed, and `replace` must be empty.
         progress: Function that is called now and then with the number of executed ticks, and an
-            upper bound of their total.
+            upper bound on their total.
 
     Raises:
         LogError: The log cannot be read, or does not contain enough to execute the sites.
@@ -536,7 +536,7 @@ def _parse_epoch(log: Log) -> int:
 
 
 def _collect_rerun_metadata(log: Log, request: RerunRequest) -> dict[str, str]:
-    """Returns the metadata with which the log of a rerun tells where it comes from.
+    """Returns the metadata with which the log of a rerun states its origin.
 
     Args:
         log: The log that was executed again.
@@ -584,7 +584,7 @@ def _copy_recorded(log: Log, name: str, channels: SiteChannels) -> Iterator[Site
 def _make_executed_entries(
     ticks: Sequence[RerunTick], channels: SiteChannels
 ) -> Iterator[SiteEntry]:
-    """Yields the entries of an executed site, in the order of time."""
+    """Yields the entries of an executed site, in order of time."""
     for tick in ticks:
         state = decode(tick.payload, State, READABLE)
         yield channels.make_record_entry(state, tick.payload)
@@ -605,7 +605,7 @@ def _to_plain_value(value: Any) -> Any:
 
 
 def _describe_limits(result: Rerun) -> Iterator[str]:
-    """Yields sentences about what a repeated run cannot show, for the user.
+    """Yields sentences for the user about the limits of a repeated run.
 
     Args:
         result: The log and its rerun.
@@ -632,10 +632,10 @@ def _describe_limits(result: Rerun) -> Iterator[str]:
             "the log was made with another platform's arithmetic: equal bits cannot be expected"
         )
     if not log.complete:
-        yield "the log was not finished: it is executed as far as it goes"
+        yield "the log is incomplete: it is executed up to its last record"
     for law in find_user_laws(request.scenario):
         if law.changed and any(site in request.replaced for site in law.sites):
-            yield f"executed as its file is now: {law}"
+            yield f"the law is executed as its file is now: {law}"
     yield from _describe_later_changes(result)
     for effect in result.sites.values():
         yield from _describe_site_limits(effect, log.absent_ticks(effect.site))
@@ -664,23 +664,23 @@ def _describe_site_limits(effect: _SiteEffect, absent_ticks: int) -> Iterator[st
     name = effect.site
     if effect.stands:
         copied = count_nouns(
-            effect.stands, "record stands as it is", "records stand as they are"
+            effect.stands, "record is copied unchanged", "records are copied unchanged"
         )
-        yield f"{name}: {copied}: too little is known to execute more"
+        yield f"{name}: {copied}, because the log lacks inputs to execute more"
     if effect.assumed:
         unrecorded = count_nouns(effect.assumed, "tick has", "ticks have")
-        yield f"{name}: {unrecorded} no record in the log: the arrivals are assumed"
+        yield f"{name}: {unrecorded} no record in the log: their arrivals are assumed"
     if absent_ticks:
         ticks = count_nouns(absent_ticks, "tick")
         yield (
-            f"{name}: {ticks} of the run it did not make, because it was away; they are "
+            f"{name}: it did not execute {ticks} of the run, because it had left; they are "
             "executed as if it had been there"
         )
     if effect.lacking:
         missing = count_nouns(
             effect.lacking, "sample that arrived is", "samples that arrived are"
         )
-        yield f"{name}: {missing} not in the log: executed without"
+        yield f"{name}: {missing} not in the log, and therefore missing in the rerun"
     if not effect.executed:
         yield f"{name}: nothing could be executed"
 
@@ -720,6 +720,6 @@ def _describe_later_changes(result: Rerun) -> Iterator[str]:
         prefix = f"links.{owner}." if is_link else f"dominance.{owner}."
         if any(key.startswith(prefix) for key in keys_set_by_user):
             yield (
-                f"{owner} changes during the run, in the log and in the rerun: from that "
-                "change on the setting of the run holds"
+                f"{owner} changes during the run, in the log and in the rerun: the new setting "
+                "applies only until its first change"
             )

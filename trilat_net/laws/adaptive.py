@@ -42,8 +42,8 @@ class Adaptive(ControlLaw):
     theorem, with the weights of docs/theory/errata-proof.md). This condition is sufficient and
     does not cover delays that vary.
 
-    Gamma = 0 and theta_hat0 = theta make the law with known parameters; Kd = 0 removes the
-    damping of the error.
+    With Gamma = 0 and theta_hat0 = theta, this is the law with known parameters. Kd = 0 removes
+    the damping of the error.
 
     Attributes:
         Lambda: Rate at which errors decay, per joint, 1/s.
@@ -105,7 +105,7 @@ class Adaptive(ControlLaw):
         """
         return theta_hat - gain_s * np.array(self.Gamma) * Yr
 
-    def gains(self, theta: Array) -> Gains:  # noqa: ARG002 - as the other laws
+    def gains(self, theta: Array) -> Gains:  # noqa: ARG002 - used by other laws
         """Converts the gains of this law to the form that the compiled control loop reads.
 
         Args:

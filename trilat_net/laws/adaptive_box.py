@@ -1,9 +1,10 @@
 """Implements the adaptive law with bounds: each estimated parameter is kept in an interval.
 
 The adaptive law estimates the dynamic parameters theta of its arm, such as masses and inertias.
-Without bounds, an estimate may drift as long as the errors are not zero. Here the user states a
-lowest and a highest value for each parameter (together a box), and a projection keeps the
-estimate between them. The torque is computed as in `Adaptive`, by Eq. (13) of the paper.
+Without bounds, an estimate may drift as long as the errors are not zero. With this law, the
+user states a lowest and a highest value for each parameter (together a box), and a projection
+keeps the estimate between them. The torque is computed as in `Adaptive`, by Eq. (13) of the
+paper.
 
 The compiled control loop computes this law (`core.step.control.project_estimate`).
 `AdaptiveBox.advance_estimate` states the projection in plain Python, and
@@ -71,8 +72,8 @@ class AdaptiveBox(Adaptive):
         gains = Adaptive.gains(self, theta)
         return gains._replace(low=self.theta_low, high=self.theta_high)
 
-    def check(self, path: str, sites: int) -> None:  # noqa: ARG002 - as the other laws
-        """Refuses settings of the law that contradict each other.
+    def check(self, path: str, sites: int) -> None:  # noqa: ARG002 - used by other laws
+        """Rejects settings of the law that contradict each other.
 
         A lower bound must not exceed its upper bound, and the first estimate must lie within
         the bounds.
@@ -82,7 +83,7 @@ class AdaptiveBox(Adaptive):
             sites: Number of sites, which this law does not use.
 
         Raises:
-            ScenarioError: A bound or an estimate is refused; the error names the key.
+            ScenarioError: A bound or an estimate is invalid. The error names the key.
         """
         parameters = zip(self.theta_low, self.theta_hat0, self.theta_high, strict=True)
         for n, (low, first, high) in enumerate(parameters):
@@ -91,7 +92,7 @@ class AdaptiveBox(Adaptive):
                 raise ScenarioError(problem, path=f"{path}.theta_high[{n}]")
             if not low <= first <= high:
                 bounds = f"theta_low = {low:g} and theta_high = {high:g}"
-                problem = f"must lie between {bounds}, not be {first:g}"
+                problem = f"must be between {bounds}, but is {first:g}"
                 raise ScenarioError(problem, path=f"{path}.theta_hat0[{n}]")
 
     @classmethod

@@ -23,10 +23,10 @@ Symbols:
     - Lambda, Kp, Kd, Gamma, Gamma_l: gains.
 
 The functional V of the law `adaptive` does not rise, because the adaptation of l_hat cancels
-the term that wrong lengths add. The end of its proof does not carry over.
-docs/theory/laws-lengths.md proves instead that e and qd go to zero, because an end effector of
-finite reach cannot move at one velocity for ever. Source of the adaptive Jacobian: Cheah, Liu
-and Slotine, Int. J. Robotics Research 25 (2006).
+the term that wrong lengths add. The last step of the proof for `adaptive` does not apply to
+this law. docs/theory/laws-lengths.md proves instead that e and qd go to zero, because an end
+effector of finite reach cannot move at a constant velocity for ever. Source of the adaptive
+Jacobian: Cheah, Liu and Slotine, Int. J. Robotics Research 25 (2006).
 
 Invariant:
     - Both estimates are integrated by the trapezoid rule, like the estimate of `adaptive`.
@@ -50,10 +50,10 @@ LEAST_SINE = 0.1
 
 @leaf
 def _solve_jacobian(lengths: Pair, q: Pair, b: Pair) -> Pair:
-    """Returns the joint rates that move the end effector of the planar arm at a velocity.
+    """Returns the joint rates that move the end effector of the planar arm at a given velocity.
 
-    It is the solution of J rates = b, where J is the Jacobian of the end effector. A stretched
-    elbow makes J singular. Then the sine of the elbow's angle is replaced by `LEAST_SINE`.
+    The rates solve J rates = b, where J is the Jacobian of the end effector. A stretched elbow
+    makes J singular. In this case, the sine of the elbow's angle is replaced by `LEAST_SINE`.
 
     Args:
         lengths: Lengths of the two links, m.
@@ -111,7 +111,7 @@ def _jacobian_rate_times(
     """Returns the product of the Jacobian's time derivative and the joint velocities v.
 
     This is the part of the end effector's acceleration that remains if v is constant. The
-    Jacobian also changes because the estimates of the link lengths do.
+    Jacobian also changes because the estimates of the link lengths change.
 
     Args:
         lengths: Estimated lengths of the links, m.
@@ -197,7 +197,7 @@ class AdaptiveKinematics(ControlLaw):
         self.lengths_m = list(self.lengths0_m)
         self.Yr = [0.0] * len(self.theta_hat)
         self.rate_m_s = [0.0, 0.0]
-        # The true lengths stand for the instrument that measures the end effector.
+        # The true lengths take the place of an instrument that measures the end effector.
         self.true_lengths_m = list(facts.lengths_m)
         self.g_m_s2 = facts.g_m_s2
 
@@ -269,7 +269,7 @@ class AdaptiveKinematics(ControlLaw):
         l1 = self.lengths_m[0]
         l2 = self.lengths_m[1]
         lengths = (l1, l2)
-        # An estimate at an edge of its box does not move.
+        # An estimate at one of its bounds does not move.
         l1_rate = self.rate_m_s[0] if self.least_m < l1 < self.most_m else 0.0
         l2_rate = self.rate_m_s[1] if self.least_m < l2 < self.most_m else 0.0
         length_rates = (l1_rate, l2_rate)
@@ -317,9 +317,9 @@ class AdaptiveKinematics(ControlLaw):
         """Evaluates whether this control law is proved to be stable in an experiment.
 
         The proof in docs/theory/laws-lengths.md that the errors e and the velocities qd go to
-        zero requires that all delays are constant, that each arm follows every other one at
-        least through others (irreducible matrix of weights), that the elbows stay bent, and
-        that the true lengths of the links lie between the bounds `least_m` and `most_m`.
+        zero requires that all delays are constant, that each arm follows every other arm,
+        directly or through others (irreducible matrix of weights), that the elbows stay bent,
+        and that the true lengths of the links lie between the bounds `least_m` and `most_m`.
 
         Args:
             situation: This arm, the other arms, their laws, and the delays between them.
@@ -335,7 +335,7 @@ class AdaptiveKinematics(ControlLaw):
         text = (
             "e and qd go to zero for every constant delay and irreducible alpha, while "
             f"abs(sin q2) > {LEAST_SINE:g} and the lengths are between {self.least_m:g} and "
-            f"{self.most_m:g} m (sufficient); the run shows if elbows stay bent"
+            f"{self.most_m:g} m (sufficient); the run shows whether the elbows stay bent"
         )
         return StabilityCondition(None, text)
 

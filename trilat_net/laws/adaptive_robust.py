@@ -1,8 +1,8 @@
 """Implements the bounded adaptive law with an additional torque against unknown disturbances.
 
 The law estimates the dynamic parameters of its arm within a box, as `AdaptiveBox` does. The
-additional torque opposes what no value of these parameters explains, such as friction or the
-torque of an operator. It never exceeds a bound that the user states.
+additional torque opposes torques that no value of these parameters explains, such as friction
+or the torque of an operator. It never exceeds a bound that the user states.
 
 The compiled control loop computes this law (`core.step.control.robust_torque`).
 `AdaptiveRobust.compute_torque` states the same law in plain Python, and
@@ -24,19 +24,19 @@ from .interface import TuningSite
 class AdaptiveRobust(AdaptiveBox):
     """Adaptive law with bounded estimates and a robust term -rho r / sqrt(r^2 + width^2).
 
-    Premises: constant delays, no person who moves an arm, parameters within their bounds, and a
-    disturbance of at most rho at each joint, where r is the filtered tracking error. Then the
-    mean over time of the power that V, the energy function of the stability proof, dissipates
-    is at most 0.3003 sum_i beta_i sum rho width, and no stronger statement is proved;
+    Here r is the filtered tracking error. Premises: constant delays, no operators, parameters
+    within their bounds, and a disturbance of at most rho at each joint. Then the mean over time
+    of the power that V, the energy function of the stability proof, dissipates is at most
+    0.3003 sum_i beta_i sum rho width, and no stronger statement is proved;
     docs/reference/laws-adaptive.md derives the bound.
 
     Source: Slotine and Li, "Applied Nonlinear Control" (1991), 7.1, for the smooth term.
 
     Attributes:
-        Lambda, Kp, Kd, Gamma, theta_hat0, theta_low, theta_high: As of `AdaptiveBox`.
-        rho_nm: Bound of the disturbance per joint, N m (N for a sliding joint).
-        width_rad_s: Value of r at which 0.71 rho opposes r, per joint, rad/s (m/s).
-        friction: Factor of the joints' own friction that the law compensates; 0: no friction.
+        Lambda, Kp, Kd, Gamma, theta_hat0, theta_low, theta_high: As in `AdaptiveBox`.
+        rho_nm: Bound on the disturbance per joint, N m (N for a sliding joint).
+        width_rad_s: Value of r at which the robust term is 0.71 rho, per joint, rad/s (m/s).
+        friction: Fraction of the joints' friction that the law compensates, 0 to 1.
     """
 
     rho_nm: NotNegativeJoints = (1.0,)
@@ -102,17 +102,17 @@ class AdaptiveRobust(AdaptiveBox):
         """States the bound on the errors that is proved for this law in a scenario.
 
         The errors do not converge to zero, because friction or an operator may disturb the arm
-        with up to `rho_nm` at each joint. Proved is a bound on their mean over time. In V, the
-        energy function of the stability proof, site i (the process of one arm) dissipates a
+        with up to `rho_nm` at each joint. Only a bound on their mean over time is proved. In V,
+        the energy function of the stability proof, site i (the process of one arm) dissipates a
         power that consists of beta_i r' Kp r and a term for the disagreement of the sites. r is
         the filtered error in rad/s, Kp a damping gain in N m s/rad, and beta_i the weight of
         the site in V. The mean of this power is at most
 
             beta_i ROBUST_RESIDUE sum rho width    in W, summed over the joints of the site.
 
-        The factor `ROBUST_RESIDUE` (0.3003) limits what the smooth robust term lets through. At
-        each joint, rho is the largest disturbance in N m, and width the value of r in rad/s at
-        which the robust term opposes it with 0.71 rho.
+        The factor `ROBUST_RESIDUE` (0.3003) bounds the power that the smooth robust term does
+        not cancel. At each joint, rho is the largest disturbance in N m, and width the value of
+        r in rad/s at which the robust term opposes it with 0.71 rho.
 
         The proof assumes that all delays are constant, and that the true parameters theta of
         the arm are within the box, the bounds in which the law searches for them.
@@ -129,7 +129,7 @@ class AdaptiveRobust(AdaptiveBox):
         bound_w = ROBUST_RESIDUE * sum(bounds_per_joint)
         # The longest delay is NaN if any delay varies.
         delays_vary = bool(np.isnan(situation.longest_s))
-        delays = "to be constant, and vary here" if delays_vary else "constant"
+        delays = "assumed constant, but vary here" if delays_vary else "constant"
         text = (
             f"delays are {delays}, theta is in its box: with torque of at most rho_nm that no "
             "estimate explains, the mean of beta times r'Kp r and the disagreement is at most "

@@ -42,7 +42,7 @@ class Authority(ControlLaw):
     Attributes:
         K: Stiffness per joint, N m/rad.
         d: Damping of the arm's velocity, per joint, N m s/rad.
-        leads: True if the other arms follow this arm. This is so for a user, not for the slave.
+        leads: True if the other arms follow this arm: for a user, but not for the slave.
         gravity: Ratio of the compensated gravity torque to the true gravity torque. 1 is exact.
     """
 
@@ -160,7 +160,7 @@ class Authority(ControlLaw):
         """Evaluates for which gains and delays this law is stable at one arm of a scenario.
 
         For the arm of a user, the loop is a spring with a damper between the two users, whose
-        known condition is used. The slave follows the users, but nobody follows the slave. It
+        known condition is used. The slave follows the users, but no arm follows the slave. It
         closes no loop and is stable for every delay.
 
         Args:

@@ -1,4 +1,4 @@
-"""Defines how a control law tells when it is stable, and how it behaves for small motions.
+"""Defines how a control law states when it is stable, and how it behaves for small motions.
 
 - The stability condition says for which gains and delays the law is stable. The commands
   `trilat scenario check` and `trilat linear` print it.
@@ -62,9 +62,9 @@ class LawSituation(NamedTuple):
             chain.
         hold_s: Duration for which a torque is held, s: one tick with the scheme `digital`, NaN
             if sites have several rates, otherwise 0 as in continuous time.
-        hands: Per site the operators and environments that react to the motion of its arm. None
-            instead of them if the reaction of one is not a spring and a damper per joint. ()
-            instead of all sites if nothing is known.
+        hands: For each site, the operators and environments that react to the motion of its
+            arm. None for a site if one of these reactions is not a spring and a damper per
+            joint. () if nothing is known about any site.
         in_task_space: True if end effectors follow each other, instead of joints.
     """
 
@@ -82,7 +82,7 @@ class LawSituation(NamedTuple):
 
     @property
     def longest_s(self) -> float:
-        """Longest delay of the links over which an arm receives the arms that it follows, s.
+        """Longest delay of the links from the arms that this arm follows, s.
 
         It is NaN if any of these delays varies.
         """
@@ -113,7 +113,7 @@ class LawSituation(NamedTuple):
 class StabilityCondition(NamedTuple):
     """Answer to the question whether a control law is stable at one arm of an experiment.
 
-    It states the condition, for example a lower bound of the damping, and whether it is met.
+    It states the condition, for example a lower bound on the damping, and whether it is met.
 
     Attributes:
         holds: True if the condition is met, False if not, None if it cannot be decided.
@@ -133,8 +133,8 @@ def find_least_reversible(alpha: Array) -> float | None:
 
     Row i of the matrix alpha contains the weights with which arm i follows the others. The
     matrix is reversible if positive weights D_i exist with D_i alpha_ij = D_j alpha_ji. Then
-    all eigenvalues are real. The negative of the least one is a lower bound of d / (K T), where
-    d is the damping, K the stiffness and T the delay, see `judge_position_exchange`.
+    all eigenvalues are real. The negative of the least eigenvalue is a lower bound on d / (K
+    T), where d is the damping, K the stiffness and T the delay, see `judge_position_exchange`.
 
     Args:
         alpha: Dominance matrix, shape (N, N).
@@ -152,9 +152,9 @@ def judge_position_exchange(situation: LawSituation, damping: str) -> StabilityC
     """Evaluates whether arms that are coupled by springs and braked by dampers are stable.
 
     The control law is called P+d. Its condition holds for arms of any mass. For two arms, it is
-    due to Nuno, Basanez, Ortega and Spong, IJRR 28, 2009. More than two need the same stiffness
-    K, damping d and delay T at all arms, and reversible weights with which they follow each
-    other, see `find_least_reversible` (docs/theory/damping-conditions.md, 13).
+    due to Nuno, Basanez, Ortega and Spong, IJRR 28, 2009. More than two arms need the same
+    stiffness K, damping d and delay T at all arms, and reversible weights with which they
+    follow each other, see `find_least_reversible` (docs/theory/damping-conditions.md, 13).
 
     A torque that is held for the period h acts h / 2 later. Therefore d is reduced by K h / 2
     and T increased by h / 2, for arms whose least inertia is above d h / 2
@@ -167,8 +167,8 @@ def judge_position_exchange(situation: LawSituation, damping: str) -> StabilityC
     Returns:
         The condition. It is undecided for delays that vary, for several tick rates, in task
         space, if the sites have different laws or ratios Kd / K, and if another site does not
-        compensate gravity exactly. None if the law of the site itself does not, because then no
-        condition is known.
+        compensate gravity exactly. None if the law of this site does not compensate gravity
+        exactly, because then no condition is known.
     """
     laws = situation.laws
     gravity_factors = [getattr(law, "gravity", 1.0) for law in laws]
@@ -176,10 +176,10 @@ def judge_position_exchange(situation: LawSituation, damping: str) -> StabilityC
         return None
     if situation.in_task_space:
         # The stiffness belongs to coordinates of the end effector, and the damping to joints.
-        return StabilityCondition(None, "known for joints that follow joints")
+        return StabilityCondition(None, "known only for joints that follow joints")
     if not situation.alpha.any():
         text = (
-            "nobody follows anybody, which closes no loop: stable in continuous time at every "
+            "no arm follows another, so there is no loop: stable in continuous time for every "
             "delay and d > 0"
         )
         return StabilityCondition(True, text)
@@ -199,7 +199,7 @@ def judge_position_exchange(situation: LawSituation, damping: str) -> StabilityC
         # docs/theory/damping-conditions.md: with other ratios some arms are unstable
         return StabilityCondition(None, "known for one ratio Kd / K at all sites")
     if np.isnan(hold_s):
-        text = "known of held torques for sites of one tick rate"
+        text = "known for held torques only with one tick rate at all sites"
         return StabilityCondition(None, text)
 
     scope = "sufficient in continuous time, whatever the masses"
@@ -272,13 +272,13 @@ def _judge_two_sites(
 def _judge_several_sites(
     situation: LawSituation, K: Array, d: Array, scope: str
 ) -> StabilityCondition:
-    """Evaluates how much damping more than two arms need that springs couple with a delay.
+    """Evaluates the damping that more than two arms need if delayed springs couple them.
 
         d > c K T
 
     d is the damping, K the stiffness of the springs and T the delay. The factor c is the larger
-    one of two numbers: the negative of the least eigenvalue of the dominance matrix, for
-    motions in which the arms differ, and the factor for the common motion of all arms
+    of two numbers: the negative of the least eigenvalue of the dominance matrix, for motions in
+    which the arms differ, and the factor for the common motion of all arms
     (`_find_common_motion_share`).
 
     Args:
@@ -297,7 +297,7 @@ def _judge_several_sites(
     stiffness_differs = np.ptp(K, axis=0).any()
     gains_differ = stiffness_differs or np.ptp(d, axis=0).any()
     if gains_differ or np.ptp(delays_s):
-        text = "known of more than two sites for one K, one d and one delay"
+        text = "known for more than two sites only with one K, one d and one delay"
         return StabilityCondition(None, text)
     least = find_least_reversible(situation.alpha)
     if least is None:
@@ -434,8 +434,8 @@ class LinearForm:
     def list_receivers(self) -> list[int]:
         """Returns the other arms to which the law sends signals, such as waves, as indices.
 
-        The linear analysis adds a variable for the signal to each of them. The indices ascend.
-        There are none if the law exchanges nothing but the motion.
+        The linear analysis adds a variable for the signal to each of them. The indices are in
+        ascending order. The list is empty if the law exchanges only the motion.
         """
         receivers = set()
         for row, _ in self.blocks:

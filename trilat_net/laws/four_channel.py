@@ -121,10 +121,10 @@ class FourChannel(ControlLaw):
     needs_theta: ClassVar = True
 
     def begin(self, facts: LawContext) -> None:
-        """Prepares the law before a run: stores the torque limits and creates a work space.
+        """Prepares the law before a run: stores the torque limits and allocates buffers.
 
         If the law sends the acceleration of its arm, it computes the acceleration from the
-        equation of motion. This computation needs the limits and the work space.
+        equation of motion. This computation needs the limits and the buffers.
 
         Args:
             facts: Facts about the arm and the other arms that are known before the run.
@@ -238,7 +238,7 @@ class FourChannel(ControlLaw):
         return form
 
     def condition(self, situation: LawSituation) -> StabilityCondition | None:  # noqa: ARG002
-        """Evaluates the stability of this law as far as the gains alone decide it.
+        """Evaluates the stability of this law in the cases that the gains alone decide.
 
         If the feedforward gain `acceleration` is 1, high frequencies are undamped, and the
         condition is not met. In all other cases it is undecided (`holds` is None), because it

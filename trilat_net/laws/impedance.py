@@ -36,7 +36,7 @@ from .conditions import (
 from .interface import DAMPING, INERTIA, STIFFNESS, ControlLaw, TuningRun, TuningSite
 
 MOST_HANDS = 4
-"""Largest number of hands at the masters whose selections are tried one by one."""
+"""Largest number of hands at the masters for which all combinations are tried."""
 
 
 @compiled
@@ -64,7 +64,7 @@ class Impedance(ControlLaw):
     }
     remembers: ClassVar = ("start",)
     tune: ClassVar = {"M": INERTIA, "B": DAMPING, "K": STIFFNESS}
-    known_facts: ClassVar = "gravity AND inertia exactly: more than the others"
+    known_facts: ClassVar = "gravity and the exact inertia: more than most laws"
     needs_theta: ClassVar = True
     needs_model: ClassVar = True
 
@@ -139,8 +139,8 @@ class Impedance(ControlLaw):
         """Returns the part of this law that the linear analysis can express by gains: gravity.
 
         The linear analysis considers small motions about a pose at rest. The gains compensate
-        the torque of gravity. The spring, the damper and the forces of this law are no such
-        gains; `linear_form` describes them as matrices.
+        the torque of gravity. The spring, the damper and the forces of this law cannot be
+        expressed by gains; `linear_form` describes them as matrices.
 
         Args:
             theta: Parameters of the arm's dynamics, such as masses, shape (P,), where P is
@@ -199,22 +199,22 @@ class Impedance(ControlLaw):
     def explain_idle_shares(self, situation: LawSituation) -> str:  # noqa: ARG002
         """Explains to the user that the dominance factors of a master have no effect.
 
-        A master stays at its start pose and follows nobody. Therefore the weights of a master
-        do not matter.
+        A master stays at its start pose and does not follow other arms, so its weights have no
+        effect.
 
         Returns:
             A sentence. Empty for the slave.
         """
-        return "" if self.follows else "follows = false stays at its start pose"
+        return "" if self.follows else "an arm with follows = false stays at its start pose"
 
     def condition(self, situation: LawSituation) -> StabilityCondition | None:
         """Evaluates whether the loop between the masters and the slave is stable.
 
-        Only a slave that touches something sends forces and thereby closes a loop. The loop is
-        then judged by the small-gain theorem: it is stable for constant delays of any length if
-        its gain is below 1 at every frequency. A hand at a master changes the gain. Therefore
-        the gain is computed with each selection of the scenario's hands at the masters, from
-        none to all, because a person may let go.
+        Only a slave that touches something sends forces, which closes a loop. The loop is then
+        judged by the small-gain theorem: it is stable for constant delays of any length if its
+        gain is below 1 at every frequency. A hand at a master changes the gain. A person may
+        also let go. Therefore the gain is computed with each combination of the scenario's
+        hands at the masters, from none to all.
 
         The condition is undecided in two cases:
 
@@ -257,8 +257,8 @@ class Impedance(ControlLaw):
         master_hands = _select_master_hands(hands, slave)
         if slave_loads is None or master_hands is None:
             text = (
-                "known for springs and dampers per joint, but a hand at a master or what the "
-                "slave touches is of another kind (a hand at a master may void the bound)"
+                "known for springs and dampers per joint, but a hand at a master or the "
+                "environment of the slave is of another kind (such a hand may void the bound)"
             )
             return StabilityCondition(None, text)
 
@@ -287,7 +287,7 @@ class Impedance(ControlLaw):
     def target_motion(self, run: TuningRun) -> Array | None:
         """Computes the motion of the impedances that the user has chosen, without any delay.
 
-        The outside torques of the run drive the model
+        The external torques of the run drive the model
 
             M qdd + B (qd - qd_ref) + K (q - q_ref) = tau_h + sum_j f_j
 
@@ -372,7 +372,7 @@ def _find_stiffest_wall(
 
     Args:
         laws: Settings of the law of each arm.
-        dominance_factors: a_i, those of the slave, shape (N,).
+        dominance_factors: Dominance factors a_i of the slave, shape (N,).
         slave: Index of the slave.
         hands: Springs and dampers that act on the arm of each site. By default, none act.
 
@@ -456,18 +456,18 @@ def _compute_loop_gain(
 def _select_master_hands(
     hands: Sequence[Sequence[ArmLoad] | None], slave: int
 ) -> list[tuple[tuple[ArmLoad, ...], ...]] | None:
-    """Returns each selection of the persons who hold the masters, from nobody to all of them.
+    """Returns all combinations of the persons who hold the masters, from nobody to everybody.
 
     A person may let go of an arm at any time. Therefore stability is checked for each
-    selection.
+    combination.
 
     Args:
         hands: Springs and dampers that act on the arm of each site.
         slave: Index of the slave, whose hands are left out.
 
     Returns:
-        Per selection the hands of each site. None if a hand at a master is not a spring and a
-        damper per joint, or if there are more than `MOST_HANDS` hands.
+        For each combination, the hands of each site. None if a hand at a master is not a spring
+        and a damper per joint, or if there are more than `MOST_HANDS` hands.
     """
     selections_by_site: list[list[tuple[ArmLoad, ...]]] = []
     count = 0
@@ -490,8 +490,8 @@ def _select_master_hands(
 def _describe_stiffest_wall(situation: LawSituation, slave: int) -> str:
     """Returns a phrase about the walls against which a slave in free motion is stable.
 
-    Example: "at a spring of up to 250 N m/rad at the slave ...". The bound is the smallest over
-    all combinations of hands at the masters. Without a bound, the phrase gives the reason.
+    Example: "with a spring of up to 250 N m/rad at the slave, ...". The bound is the smallest
+    over all combinations of hands at the masters. Without a bound, the phrase gives the reason.
 
     Args:
         situation: All sites, their laws and their hands.
@@ -510,8 +510,8 @@ def _describe_stiffest_wall(situation: LawSituation, slave: int) -> str:
     stiffest = min(stiffnesses)
     limit = "of any stiffness" if stiffest == np.inf else f"of up to {stiffest:.4g} N m/rad"
     return (
-        f"at a spring {limit} at the slave for constant delays of any length, with and without "
-        "the hands at the masters (small gain: sufficient, in continuous time)"
+        f"with a spring {limit} at the slave, for constant delays of any length, with and "
+        "without the hands at the masters (small gain: sufficient, in continuous time)"
     )
 
 
@@ -555,7 +555,7 @@ def _exponentiate(matrix: Array) -> Array:
     """Computes the exponential of a small matrix by scaling and squaring of its power series.
 
     Source: Moler and Van Loan, "Nineteen dubious ways to compute the exponential of a matrix",
-    SIAM Review 45, 2003. SciPy is not imported for it, because a session does not need SciPy.
+    SIAM Review 45, 2003. SciPy is not used, because a session should not depend on SciPy.
 
     Args:
         matrix: The matrix, shape (n, n).

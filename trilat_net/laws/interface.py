@@ -127,8 +127,8 @@ class LawSettings(Frozen, frozen=True):
     def books_energy(self) -> bool:
         """True if the law keeps an account of the energy that the arms exchange.
 
-        Then all sites must use this law: each site adds up the energy that it sends, and the
-        receiving site subtracts what it uses.
+        In this case, all sites must use the law: each site adds up the energy that it sends,
+        and the receiving site subtracts what it uses.
         """
         return self.plugged and issubclass(self.kind, EnergyLaw)
 
@@ -138,14 +138,14 @@ class LawSettings(Frozen, frozen=True):
         return str(self.__struct_config__.tag)
 
     def check(self, path: str, sites: int) -> None:
-        """Refuses gains that contradict each other, and an unsuitable number of arms.
+        """Rejects gains that contradict each other, and an unsuitable number of arms.
 
         Args:
             path: Path of the law's table in the scenario, for errors.
             sites: Number of sites in the scenario.
 
         Raises:
-            ScenarioError: A gain or the number of sites is refused; the error names the key.
+            ScenarioError: A gain or the number of sites is invalid. The error names the key.
         """
 
     def find_problem(self, rates_hz: Mapping[str, int]) -> KeyProblem | None:  # noqa: ARG002
@@ -180,8 +180,8 @@ class LawSettings(Frozen, frozen=True):
         """Returns the gains of a built-in law that has the same linear part as this law.
 
         For the linear analysis, which considers small motions around a pose at rest, the
-        built-in law takes the place of this law. Terms that it does not have are added by
-        `linear_form`.
+        built-in law takes the place of this law. Terms that the built-in law does not have are
+        added by `linear_form`.
 
         Args:
             theta: Parameters of the arm's dynamics, such as masses and inertias, shape (P,),
@@ -314,7 +314,7 @@ class LawSettings(Frozen, frozen=True):
             return None
 
         def make_law(context: LawContext) -> UserLaw:
-            """Creates the control law of one arm, if its class can be used there.
+            """Creates the control law of one arm, if the class of the law suits this arm.
 
             Otherwise, the check of the class raises an error.
             """
@@ -449,8 +449,8 @@ def _derive_settings(kind: type[ControlLaw], tag: str) -> type[LawSettings]:
 
     A law is written as one class, whose instances compute torques while an arm is controlled. A
     scenario, the description of an experiment, needs only the gains of the law: it reads and
-    checks them long before, and without, such an instance. Therefore a second class is derived,
-    a frozen record (`msgspec.Struct`), so that no author of a law has to write the gains twice.
+    checks them without creating an instance. Therefore a second class is derived, a frozen
+    record (`msgspec.Struct`), so that no author of a law has to write the gains twice.
 
     Annotations of the law and its base classes become the fields of the record; each has a
     default, which is the value of the class attribute. Methods and class variables that need
@@ -534,7 +534,7 @@ def check_law_class(
     sites: int,
     scheme: str,
 ) -> None:
-    """Refuses a class that is not a control law, or that does not suit the arm.
+    """Rejects a class that is not a control law, or that does not suit the arm.
 
     A law may restrict its use by class attributes: the number of arms by `sites = 2` or
     `sites = (2, 4)`, the integration scheme by `schemes = ("digital",)`, and by
@@ -548,7 +548,7 @@ def check_law_class(
         scheme: Integration scheme of the scenario.
 
     Raises:
-        ScenarioError: The class is refused; the error has the path of the key.
+        ScenarioError: The class is unsuitable. The error contains the path of the key.
     """
     path = f"sites.{context.site}.control.law"
     _check_methods(kind, code, path)
@@ -570,7 +570,7 @@ def check_law_class(
 
 
 def _check_methods(kind: Any, code: str, path: str) -> None:
-    """Refuses a class without a method `torque`, or with a memory that it does not declare.
+    """Rejects a class without a method `torque`, or with a memory that it does not declare.
 
     The memory of a law is everything that it must know in the next control period. It is
     logged, so that a run can be verified from any period. A class declares it by `remembers`,
@@ -582,7 +582,7 @@ def _check_methods(kind: Any, code: str, path: str) -> None:
         path: Path of the key for errors.
 
     Raises:
-        ScenarioError: The class is refused.
+        ScenarioError: The class has no such method, or does not declare its memory.
     """
     is_declared = hasattr(kind, "remembers")
     has_memory_methods = any(hasattr(kind, name) for name in ("memory", "recall"))
@@ -607,7 +607,7 @@ def _check_methods(kind: Any, code: str, path: str) -> None:
 
 
 def _check_site_count(kind: Any, code: str, path: str, sites: int) -> None:
-    """Refuses a law that does not support the number of arms in the scenario.
+    """Rejects a law that does not support the number of arms in the scenario.
 
     The class of a law may state a number or a range in its attribute `sites`, for example
     `sites = 2` or `sites = (2, 4)`. A site is the process that controls one arm.
@@ -619,7 +619,8 @@ def _check_site_count(kind: Any, code: str, path: str, sites: int) -> None:
         sites: Number of sites in the scenario.
 
     Raises:
-        ScenarioError: The number is refused, or `sites` is not a number or a pair of numbers.
+        ScenarioError: The law does not support this number, or its `sites` is not a number or a
+            pair of numbers.
     """
     declared = getattr(kind, "sites", None)
     bounds: Any = declared
@@ -645,7 +646,7 @@ def _check_site_count(kind: Any, code: str, path: str, sites: int) -> None:
 
 
 def _find_written_attributes(kind: Any) -> list[str]:
-    """Returns the names of the attributes that a class assigns to itself outside of `__init__`.
+    """Returns the names of the attributes of `self` that a class assigns outside `__init__`.
 
     An attribute that changes during a run is a memory, which a control law must declare so that
     runs can be repeated from the log. The source of each method is searched for assignments to
@@ -681,7 +682,7 @@ def make_instance(
 ) -> Any:
     """Returns an instance of a user's class, created from its context and settings.
 
-    A class without a constructor needs neither.
+    A class without a constructor receives neither.
 
     Args:
         kind: The class.
@@ -691,14 +692,14 @@ def make_instance(
         path: Path of the key for errors. By default the site's [control] table.
 
     Raises:
-        ScenarioError: The class raised an exception. The user's code may raise any.
+        ScenarioError: The class raised an exception, of any kind.
     """
     has_init = kind.__init__ is not object.__init__
     has_new = kind.__new__ is not object.__new__
     takes_arguments = has_init or has_new
     try:
         return kind(context, **settings) if takes_arguments else kind()
-    except (Exception, SystemExit) as error:  # the user's code may raise anything
+    except (Exception, SystemExit) as error:  # the user's code may raise any exception
         arguments = ", ".join(f"{key} = {value!r}" for key, value in settings.items())
         error_path = path or f"sites.{context.site}.control"
         problem = (

@@ -119,8 +119,8 @@ class LeeSpong(ControlLaw):
 
         The settings form the table [control] of a scenario, the description of an experiment.
         The largest delay T_max, from which the law computes its damping, is set to half of the
-        longest mean round trip between two sites. If delays vary, some are larger, and
-        stability is not proved.
+        longest mean round trip between two sites. If the delays vary, some of them exceed this
+        value, and stability is not proved.
 
         Args:
             gains: Tuned gains by name.

@@ -22,9 +22,9 @@ from .interface import DAMPING, STIFFNESS, ControlLaw
 class PD(ControlLaw):
     """Spring to the other arms, damper and known gravity: tau = G(q) - K e - d qd.
 
-    The error e is the position less the reference, which is the position of the peers, weighted
-    by the dominance factors alpha. For reversible dominance factors, equal gains and one
-    constant delay T, the linearised loop of N sites is stable for all masses if d >
+    The error e is the position minus the reference, which is the position of the peers,
+    weighted by the dominance factors alpha. For reversible dominance factors, equal gains and
+    one constant delay T, the linearised loop of N sites is stable for all masses if d >
     max(abs(lambda_min(alpha)), 0.2172) K T. For some masses this bound is also necessary. Two
     sites need 4 d_1 d_2 > (T_1 + T_2)^2 K_1 K_2. For other dominance factors some heavy arms
     are unstable at any d. These bounds hold in continuous time: torques that are held over a

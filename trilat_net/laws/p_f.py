@@ -25,7 +25,7 @@ from .interface import DAMPING, STIFFNESS, ControlLaw, TuningSite
 class PF(ControlLaw):
     """Direct force reflection with known gravity: tau = G(q) - K e - d qd + k_f felt.
 
-    G(q) is the gravity torque. The error e is the position less the reference, which is the
+    G(q) is the gravity torque. The error e is the position minus the reference, which is the
     position of the peers, weighted by the dominance factors. `felt` is the torque of operators
     and environments on the peers' arms as received, with the same weights.
 
@@ -37,7 +37,7 @@ class PF(ControlLaw):
 
     K and d_s are the slave's gains. This is the edge for a light slave, whose inertia M_s per
     joint is at most d_s^2 / (4 K). For a heavier slave the edge is higher and has no closed
-    form; the larger one of this value and k_f K (2 M_s + T d_s)^2 / (4 M_s d_s) is sufficient
+    form; the larger of this value and k_f K (2 M_s + T d_s)^2 / (4 M_s d_s) is sufficient
     (docs/theory/port-conditions.md, 15).
 
     Attributes:
@@ -100,7 +100,7 @@ class PF(ControlLaw):
         )
 
     def check(self, path: str, sites: int) -> None:
-        """Refuses an experiment that has more or fewer than two arms.
+        """Rejects an experiment that has more or fewer than two arms.
 
         With several other arms, it would be ambiguous which contact force the master reflects
         to its user.
@@ -120,7 +120,7 @@ class PF(ControlLaw):
                 path=f"{path}.law",
             )
 
-    def explain_idle_shares(self, situation: LawSituation) -> str:  # noqa: ARG002 - as the other laws
+    def explain_idle_shares(self, situation: LawSituation) -> str:  # noqa: ARG002 - used by other laws
         """Explains to the user that the dominance factors of an arm have no effect.
 
         Dominance factors are the weights with which an arm follows the other arms. If the
@@ -132,7 +132,7 @@ class PF(ControlLaw):
         """
         if any(self.K) or any(self.k_f):
             return ""
-        return "K = 0 and k_f = 0 follow nobody"
+        return "with K = 0 and k_f = 0, an arm does not follow others"
 
     @classmethod
     def explain_misfit(cls, roles: Sequence[str]) -> str:
@@ -161,8 +161,8 @@ class PF(ControlLaw):
     def write_control(cls, gains: Mapping[str, float], site: TuningSite) -> dict[str, Any]:
         """Returns the settings of this law for one arm, after its gains were tuned.
 
-        They are the table [control] of a scenario file. It depends on the role of the arm,
-        because only the slave has a spring and only the master feels forces.
+        The settings form the table [control] of a scenario file. They depend on the role of the
+        arm, because only the slave has a spring and only the master feels forces.
 
         Args:
             gains: The tuned gains by name.

@@ -22,7 +22,7 @@ from .interface import DAMPING, ERROR_DAMPING, STIFFNESS, ControlLaw
 class PdD(ControlLaw):
     """Spring and damper to the other arms, known gravity: tau = G(q) - K e - d qd - Kd ed.
 
-    G(q) is the gravity torque. The error e is the position less the reference, which is the
+    G(q) is the gravity torque. The error e is the position minus the reference, which is the
     position of the peers, weighted by the dominance factors; ed is its derivative. For constant
     delays and a ratio Kd / K that is the same at all sites, the condition of P+d on K and d is
     sufficient.

@@ -1,9 +1,9 @@
-"""Implements a spring law in which no other arm can pull with more than a largest force.
+"""Implements a spring law in which the pull of each other arm is limited.
 
 The law P+d couples an arm by a spring (P) to the arms that it follows, its peers, and brakes it
 by a damper (d). Such a spring would pull strongly towards a peer that is far away, for example
-after a network failure. Here the pull grows with the distance like a hyperbolic tangent and
-approaches a largest value.
+after a network failure. In this law, the pull grows with the distance like a hyperbolic tangent
+and approaches a largest value.
 
 Invariant:
     - No peer pulls with more than alpha_ij P at any distance. P is the largest pull of all
@@ -103,13 +103,14 @@ class SaturatedPd(ControlLaw):
         """Evaluates the stability of this law, and whether its torques stay within limits.
 
         The condition of a linear spring of stiffness K with a damper applies at any pose at
-        rest, also where sites are held apart. That the spring is nowhere stiffer than K is not
-        the reason: the slopes of a hyperbolic tangent form a positive semidefinite matrix, and
-        the Schur product theorem gives the bound (docs/theory/damping-conditions.md, 13).
+        rest, even if sites are held apart. It does not suffice that the spring is nowhere
+        stiffer than K. The reason is that the slopes of a hyperbolic tangent form a positive
+        semidefinite matrix; the Schur product theorem then gives the bound
+        (docs/theory/damping-conditions.md, 13).
 
         If the gravity torque of the arm is known, the torque limit of each joint must be above
-        the sum of the gravity torque and the largest spring torque P. The text then states up
-        to which joint speed the damper does not exceed the rest.
+        the sum of the gravity torque and the largest spring torque P. The text then states the
+        joint speed up to which the damper stays within the remaining torque.
 
         Args:
             situation: The site, its peers (the other sites), its torque limits and the delays.

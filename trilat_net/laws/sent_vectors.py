@@ -1,4 +1,4 @@
-"""Reads and checks which numbers a control law sends to other arms, besides the motion.
+"""Reads and checks which vectors a control law sends to other arms, besides the motion.
 
 Some laws send vectors, for example waves or energies. The class of the law declares their names
 and lengths in the class variable `sends`. The receivers need the declaration to read the
@@ -22,14 +22,14 @@ from ..records import MAX_JOINTS
 
 
 class _SentVectorSpec(Frozen, frozen=True):
-    """What a control law declares about a vector that it sends in every control period.
+    """Declaration of a vector that a control law sends in every control period.
 
     The length may depend on the arm, which the class of the law does not know.
 
     Attributes:
-        unit: Unit of its numbers, as in "J"; "" for dimensionless numbers.
-        length: Count of its numbers: "joints", "coordinates" (that sites share), or a number.
-        per_peer: True: each peer gets its own vector; false: all peers get the same vector.
+        unit: Unit of its values, as in "J", or "" for dimensionless values.
+        length: Number of its values: "joints", "coordinates" (that sites share), or a number.
+        per_peer: True if each peer gets its own vector, False if all peers get the same vector.
     """
 
     unit: Annotated[str, Meta(max_length=24, pattern=r"^[ -~]*$")] = ""
@@ -43,7 +43,7 @@ SentVectorSpecs = dict[str, _SentVectorSpec]
 
 
 def convert_sends(sends: Any, code: str, path: str) -> SentVectorSpecs:
-    """Checks what a control law declares to send to other arms, and converts it.
+    """Checks and converts the declaration of the vectors that a control law sends.
 
     The class variable `sends` declares vectors, each with its name, unit and length.
 

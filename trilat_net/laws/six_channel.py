@@ -43,10 +43,10 @@ class SixChannel(FourChannel):
                 weights with which site i follows the others.
 
         Returns:
-            Not met, if the dominance factors do not follow from one number. Otherwise the
-            condition of the four-channel law, which may be undecided. Its text then begins with
-            a, and with the weights beta with which the torques of the operators add up to zero
-            at rest.
+            A condition that is not met if the dominance factors do not follow from one number.
+            Otherwise the condition of the four-channel law, which may be undecided. Its text
+            then begins with a, and with the weights beta with which the torques of the
+            operators add up to zero at rest.
         """
         if len(situation.alpha) != 3:
             return StabilityCondition(False, "this law is for two users and a slave")

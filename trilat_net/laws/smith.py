@@ -2,7 +2,7 @@
 
 A Smith predictor removes a delay from a control loop: the controller follows a model of the
 remote side that has no delay, and corrects it by the delayed difference from the true motion.
-Here it extends the law P+d, a spring between the arms and a damper at each arm.
+In this law, it extends P+d, a spring between the arms and a damper at each arm.
 
     slave    tau = G - K (q_s - q_m(t - T)) - d qd_s
              sends w = q_s - x, where the model x is driven by q_m(t - T)
@@ -12,8 +12,8 @@ Here it extends the law P+d, a spring between the arms and a damper at each arm.
 Here q_m, q_s, qd_m and qd_s are the positions and velocities of master and slave, tau is the
 torque of an arm and G its gravity torque, T is the delay, K a stiffness and d a damping. Both
 ends run the same model, so the law stores no past values, however long the delay is. The signal
-w is the part of the slave's motion that the model misses, for example in contact. The master is
-the site with `predicts` = true.
+w is the part of the slave's motion that the model does not predict, for example in contact. The
+master is the site with `predicts` = true.
 
 Invariant:
     - The model moves like an arm whose torque is held over each tick, a period of the control

@@ -4,11 +4,11 @@ The law makes the outputs r = qd + Lambda q of all arms equal, where q and qd ar
 and velocities of the joints, and Lambda is a gain. While it controls an arm, it learns the
 dynamic parameters of the arm, such as masses.
 
-The flaw: an arm can rest only if the learning rests, too. This requires Y_G' r = 0, where Y_G
-is the matrix whose product with the parameters is the gravity torque, and Y_G' its transpose.
-At rest, r is Lambda q. Therefore under gravity each arm ends at q = 0, or where its links have
-no lever arm: it hangs, with cos q1 = 0 and cos(q1 + q2) = 0. Users cannot hold it anywhere
-else. Laws that compare positions, such as `adaptive`, do not have this flaw, because
+The flaw: an arm can rest only if its parameter estimate is also at rest. This requires Y_G' r =
+0, where Y_G is the matrix whose product with the parameters is the gravity torque, and Y_G' its
+transpose. At rest, r is Lambda q. Therefore under gravity each arm ends at q = 0, or where its
+links have no lever arm: it hangs, with cos q1 = 0 and cos(q1 + q2) = 0. Users cannot hold it
+anywhere else. Laws that compare positions, such as `adaptive`, do not have this flaw, because
 their r contains the position error instead of q.
 
 Invariant:
@@ -44,7 +44,7 @@ class Sync(ControlLaw):
     q and qd are the positions and velocities of the joints, r_j the output of arm j as
     received, and alpha_ij the weight with which arm i follows arm j. theta_hat is the estimate
     of the arm's dynamic parameters. The matrix Y(q, qd, -Lambda q, -Lambda qd) is the
-    regressor: times the parameters, it gives the torque of the arm's dynamics. Y' is its
+    regressor: its product with the parameters is the torque of the arm's dynamics. Y' is its
     transpose.
 
     Weakness: under gravity all arms end at q = 0 or hanging. The law is for planar arms.
@@ -96,8 +96,8 @@ class Sync(ControlLaw):
         q and qd are the positions and velocities of the two joints. q_des and qd_des are those
         of the peers, the other arms, averaged with the weights with which this arm follows
         them. K (N m s/rad), Lambda (1/s) and Gamma are gains. theta_hat is the estimate of the
-        arm's parameters, and Y the regressor: the matrix that gives, times the parameters, the
-        torque of the arm's dynamics along the reference velocity v = -Lambda q with the
+        arm's parameters, and Y the regressor: the matrix whose product with the parameters is
+        the torque of the arm's dynamics, for the reference velocity v = -Lambda q and the
         acceleration a = -Lambda qd. Y' is its transpose. r is also qd - v.
 
         The regressor is evaluated once for the torque and the estimate. The estimate is

@@ -95,10 +95,10 @@ class Tanks(EnergyLaw):
     def torque(self, now: LawInput) -> None:
         """Computes the torque of a control period, and sends energy packets to the other arms.
 
-        First, the work of the previous period and the received packets are booked, and packets
-        are sent. Then the torque of the springs that couple the arms is computed, and reduced
-        to what the energy in the tank pays for. Damping is added while the tank is below its
-        level.
+        First, the work of the previous period and the received packets are entered in the
+        energy account, and packets are sent. Then the torque of the springs that couple the
+        arms is computed, and reduced until the energy in the tank covers its work. Damping is
+        added while the tank is below its level.
 
         Args:
             now: Inputs and outputs of the law in this tick.
@@ -160,7 +160,7 @@ class Tanks(EnergyLaw):
         """Computes the energies that show whether the law was passive in a run.
 
         Each arm has an energy tank, the amount of energy that its controller may still spend.
-        All energies are in J. In the records, of which there is one per control period,
+        All energies are in J. In the records (one per control period),
 
         - "E" is the sum of the energy sent to a peer (another arm) so far;
         - "E_seen" is the sum of the energy received so far, one column per peer;
@@ -173,8 +173,8 @@ class Tanks(EnergyLaw):
 
         Returns:
             The energy sent to each peer (`gave`) and received from it (`took`), the energy that
-            the arm gave to the controller (`port`), and the energy in the tank (`store`).
-            Nothing is booked as dissipated (`taken`): damping moves energy into the tank.
+            the arm gave to the controller (`port`), and the energy in the tank (`store`). No
+            energy counts as dissipated (`taken`), because damping moves energy into the tank.
         """
         sent_energies = [peer.sent["E"] for peer in seen.peers]
         E_seen = seen.memory["E_seen"]
@@ -201,16 +201,19 @@ class Tanks(EnergyLaw):
         """Evaluates whether the energy tanks keep the coupled arms passive.
 
         Passive means that they never give more energy than they received. A tank is the amount
-        of energy that the controller of an arm may still spend. In each control period, it
-        sends a fixed part of its content to the other arms. The condition is met if this part
-        is at most 1, provided that persons and environments are passive.
+        of energy that the controller of an arm may still spend. In each control period, the
+        controller sends a fixed part of this energy to the other arms. The condition is met if
+        this part is at most 1, provided that persons and environments are passive.
 
         Args:
             situation: This arm, with the rate of its control loop.
         """
         part_per_tick = self.packet_1_s / situation.rate_hz
         if part_per_tick > 1.0:
-            text = f"a tank sends {part_per_tick:.3g} of its energy a tick, more than it has"
+            text = (
+                f"a tank sends {part_per_tick:.3g} times its energy per tick, "
+                "which is more than it has"
+            )
             return StabilityCondition(False, text)
         text = (
             "motion stays bounded (decay is not proved): tanks are passive for any shares, "

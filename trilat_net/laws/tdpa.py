@@ -39,13 +39,14 @@ SWEEPS = 3
 another.
 """
 AHEAD = 2.0
-"""Ticks of a leader's motion that are paid for in advance: a joint needs one tick to reverse
-and two to come to rest.
+"""Number of ticks of a leader's motion whose energy is set aside in advance.
+
+A joint needs one tick to reverse and two to come to rest.
 """
 SPENT_S = 0.1
 """Time for which the remaining energy lasts at the rate of drift compensation, s."""
 _SLACK_NM = 1e-9
-"""Below this torque a follower's controller has nothing to act on, N m."""
+"""Torque below which a follower's controller does nothing, N m."""
 
 
 @compiled
@@ -84,7 +85,7 @@ def _observe_leader(law: Any, now: LawInput, j: int, i: int) -> None:
     """Updates how much energy the leader's arm may still take out of a coupling.
 
     A coupling connects the leader to an arm that follows it. The leader feels a torque of the
-    coupling. It may take only energy out of the coupling that the follower has put in:
+    coupling. It may take out only energy that the follower has put into the coupling:
 
         W_led = reserve + E_followed + (sum of the work of the leader where it is negative)
 
@@ -158,16 +159,16 @@ def _limit_leader_torque(law: Any, now: LawInput, j: int, i: int) -> None:
     """Limits the torque that the leader of a coupling feels, so that its energy is covered.
 
     The coupling connects this arm, the leader, to follower j. The torque of the follower is
-    reduced to a magnitude that the known energy pays for during the next `AHEAD` ticks (control
-    periods). The prediction assumes that the joint continues its motion, and adds the effect of
-    the torques that change in this tick, the coupling's own torque included. An energy deficit
-    is repaid by damping.
+    reduced to a magnitude whose work the known energy covers during the next `AHEAD` ticks
+    (control periods). The prediction assumes that the joint continues its motion, and adds the
+    effect of the torques that change in this tick, the coupling's own torque included. An
+    energy deficit is repaid by damping.
 
     With m the magnitude of the torque, the predicted cost is
 
         m (free_step + step_per_torque m)
 
-    where free_step is the motion against the torque that the joint would make without it.
+    where free_step is the motion of the joint against the torque, if this torque did not act.
 
     Args:
         law: The law, whose torque F_now of the coupling is written.
@@ -199,7 +200,7 @@ def _limit_leader_torque(law: Any, now: LawInput, j: int, i: int) -> None:
             inverse_inertia = law.inverse[row + m]
             step += half * inverse_inertia * law.torque_change[m]
 
-    # The step against the torque that the joint would make without this coupling's torque.
+    # The motion against the torque, as it would be without this coupling's torque.
     current = law.F_now[index]
     current_step = step_per_torque * sign * current
     disturbance_step = half * law.acceleration_rad_s2
@@ -322,14 +323,14 @@ def _compute_drift_velocity(
     error: float,
     available_J: float,
 ) -> float:
-    """Returns the velocity that moves the goal back to the peers, as far as energy allows.
+    """Returns the velocity that moves the goal back to the peers, within the available energy.
 
     A spring and a damper pull the arm to this goal. It moves with the velocities of the peers
     (the arms that are followed), which may have been reduced, and so drifts away from their
     position. The correction moves the goal for all peers together, so the work of the whole
     torque counts. If work is computed from motion (`law.by_step`), the reactions of the damper
-    and the spring count too, also in connection with the velocities of the peers. The power of
-    a correction with speed v is linear v + square v^2.
+    and the spring count too, including those to the velocities of the peers. The power of a
+    correction with speed v is linear v + square v^2.
 
     Args:
         law: The law, with its energy accounts.
@@ -416,11 +417,11 @@ def _book_follower(
     force: float,
     drift: float,
 ) -> None:
-    """Books the energy of one period at the follower's end of the coupling to peer j.
+    """Enters the energy of one period in the accounts of the coupling to peer j.
 
-    The coupling connects this arm, the follower, to the peer that leads it. The peer's velocity
-    moves the goal of a spring and damper, which pull the arm with the force F. Sums of energy
-    since the start, J:
+    The coupling connects this arm, the follower, to the peer that leads it. The accounts are
+    those of the follower's end. The peer's velocity moves the goal of a spring and damper,
+    which pull the arm with the force F. Sums of energy since the start, J:
 
         E_led        energy that the leader has put into the coupling, as it reports it
         E_moved      energy taken out of the coupling by moving the goal
@@ -436,7 +437,7 @@ def _book_follower(
 
     - If work is computed from motion (`law.by_step`), v is the velocity in use, `law.v_led`,
       which the controller may have reduced. No energy is saved then.
-    - In the published law, v is the velocity of the leader. The difference to the velocity in
+    - In the published law, v is the velocity of the leader. The difference from the velocity in
       use saves F (v - v_led) h.
 
     Args:
@@ -477,8 +478,8 @@ def _charge_unpaid_energy(law: Any, now: LawInput, i: int, spring: float) -> Non
     where `force` is the torque of spring and damper during the period and `paid` the predicted
     work. If the result is positive, the arm and its spring received more energy than was paid.
     The difference is charged to the couplings, in proportion to the weights alpha with which
-    the arm follows its peers. If it is negative, earlier charges are paid back, but no more
-    than these.
+    the arm follows its peers. If the result is negative, earlier charges are paid back, up to
+    their total amount.
 
     Accounts of each coupling, J: `E_moved` is the energy taken out so far, and `lent` the part
     of it that was charged by this function and not paid back. `E_yielded` is the energy saved
@@ -523,7 +524,7 @@ def _settle_follower(
     drift_velocity: float,
     available_J: float,
 ) -> None:
-    """Computes the torque of a following joint so that known energy covers its work.
+    """Computes the torque of a following joint so that the available energy covers its work.
 
     The follower is the arm that follows its peers, the other arms, in one coupling each. The
     torque depends on the velocity with which the spring's goal moves. The velocity depends on
@@ -704,13 +705,14 @@ class Tdpa(EnergyLaw):
     Source: Ryu, Artigas and Preusche (2010); for several arms Panzirsch and others (2012).
 
     Attributes:
-        K: Spring by which the site follows, per joint, N m/rad; 0: the site follows nobody.
-        B: Damper by which the site follows, per joint, N m s/rad.
-        acceleration_rad_s2: Largest change per tick (period of the control loop) of a joint's
-            acceleration by torques other than the law's that the leaders' controllers plan for.
-            Half of the reserve pays for larger changes.
-        drift_rad_s: Largest velocity by which positions that have drifted apart are brought
-            together again; 0: positions drift.
+        K: Stiffness of the spring by which the site follows, per joint, N m/rad. 0 if the site
+            follows no other site.
+        B: Damping with which the site follows, per joint, N m s/rad.
+        acceleration_rad_s2: Change of a joint's acceleration per tick (period of the control
+            loop) for which the leaders' controllers plan, caused by other torques than those of
+            the law. Half of the reserve covers larger changes.
+        drift_rad_s: Largest velocity with which positions that have drifted apart are brought
+            together again. With 0, positions drift.
         reserve_J: Initial energy of an end per joint and peer, J.
         energy: How work is computed. "step": energy that the arm receives, torque times the
             step in q; "velocity": torque times velocity times period, as published.
@@ -848,7 +850,7 @@ class Tdpa(EnergyLaw):
             force = self.force[i]
             for j in range(peers):
                 felt += self.F_now[j * n + i]
-            # The part of the felt torque that keeps the joint's torque within its limits.
+            # Factor of the felt torque that keeps the joint's torque within its limits.
             least_felt = force - self.high[i]
             most_felt = force - self.low[i]
             applied = max(least_felt, min(most_felt, felt))
@@ -924,13 +926,13 @@ class Tdpa(EnergyLaw):
         """Explains to the user that the dominance factors of an arm have no effect.
 
         A dominance factor is the weight with which an arm follows another arm. If the stiffness
-        K and the damping B are zero, the arm follows nobody.
+        K and the damping B are zero, the arm does not follow the others.
 
         Returns:
             A sentence for the user. Empty if K or B is not zero.
         """
         follows = any(self.K) or any(self.B)
-        return "" if follows else "K = 0 and B = 0 follow nobody"
+        return "" if follows else "with K = 0 and B = 0, an arm does not follow others"
 
     def condition(self, situation: LawSituation) -> StabilityCondition | None:  # noqa: ARG002
         """States under which assumptions the law keeps the session passive.
@@ -942,8 +944,8 @@ class Tdpa(EnergyLaw):
         - With `energy` = "step", work is torque times motion, which is exact. But energy is
           paid before a tick (a period of the control loop), and the motion in it is predicted.
           If another torque changes the acceleration, the prediction is wrong, and half of
-          `reserve_J` pays for the difference. Changes of up to `acceleration_rad_s2` are
-          planned for.
+          `reserve_J` covers the difference. Changes of up to `acceleration_rad_s2` are planned
+          for.
         - With `energy` = "velocity", as the law was published, work is torque times velocity
           times the period h. This leaves out the acceleration qdd within a tick, and with it a
           work of up to tau qdd h^2 / 2, where tau is the torque.
@@ -956,14 +958,14 @@ class Tdpa(EnergyLaw):
             f"jitter, loss and shares, where {PASSIVE_OUTSIDE}"
         )
         if self.energy == "velocity":
-            leak = "up to tau qdd h^2 / 2 per tick, which the accounts by velocity miss"
+            leak = "except for up to tau qdd h^2 / 2 per tick that the energy account misses"
             return StabilityCondition(True, f"{passive_coupling}, {leak}")
 
         planned_change = ""
         if self.acceleration_rad_s2:
             planned_change = f" beyond {self.acceleration_rad_s2:g} rad/s^2"
         reserve = (
-            ", while half of reserve_J pays for changes of acceleration by other torques in a "
+            ", if half of reserve_J covers changes of acceleration by other torques in a "
             f"tick{planned_change}"
         )
         return StabilityCondition(True, passive_coupling + reserve)

@@ -63,14 +63,15 @@ from .conditions import (
 from .interface import DAMPING, STIFFNESS, EnergyLaw, TuningSite
 
 RECEPTIONS = ("replay", "zero", "scaled", "hold")
-"""Ways of playing waves, see `Wave`. `hold` repeats the last wave; it is not passive, and
-serves only for comparison.
+"""Ways to choose the wave that acts on the arm, see `Wave`.
+
+`hold` repeats the last wave. It is not passive, and serves only for comparison.
 """
 _REPLAY = 0
 _SCALED = 2
 _HOLD = 3
 CONCEALED_S = 0.005
-"""A held wave is limited to the wave for which the known energy lasts for this time, s."""
+"""A repeated wave is limited so that the known energy lasts for this time, s."""
 STAMP_FILTER_TICKS = 20.0
 """Time constant of the filtered rate at which stamps advance, ticks."""
 
@@ -83,14 +84,14 @@ def _replay_wave(
     energy: float,
     h: float,
 ) -> float:
-    """Returns the wave to play so that lost waves are made up for, as far as energy allows.
+    """Returns the wave to play so that lost waves are made up for, within the known energy.
 
-    A wave acts on the arm like a force that also carries energy. If messages are lost, the arm
-    would end at a wrong position. Later messages contain the integral of all waves, so that the
-    integral of the lost ones is known. The line owes this integral to the arm. It is played in
-    addition to the wave of this control period, at the mean rate of the lost waves or slower.
-    The known energy is divided evenly over the owed integral: each unit of the integral may
-    cost only its part of the energy.
+    A wave acts on the arm (is played) like a force that also carries energy. If messages are
+    lost, the arm would end at a wrong position. Later messages contain the integral of all
+    waves, so that the integral of the lost waves is known. The line owes this integral to the
+    arm. The owed integral is played in addition to the wave of this control period, at the mean
+    rate of the lost waves or slower. The known energy is divided evenly over the owed integral:
+    each unit of the integral may cost only its part of the energy.
 
     Args:
         law: The law, whose owed integral and owed time are reduced by the part that is played.
@@ -113,7 +114,7 @@ def _replay_wave(
     # The other half of the reserve is for the ticks without a sample (`_conceal_wave`).
     free = energy - 0.5 * law.reserve
     available = max(free, 0.0)
-    # Beside the wave f, an extra wave e costs f + e / 2 per unit of the integral.
+    # In addition to the wave f, an extra wave e costs f + e / 2 per unit of the integral.
     energy_per_integral = available / owed
     aligned_wave = sign * fresh
     affordable = 2.0 * (energy_per_integral - aligned_wave)
@@ -161,7 +162,7 @@ def _conceal_wave(law: Any, index: int, energy: float, h: float) -> float:
     bounded_above = min(largest_wave, last_wave)
     held = max(-largest_wave, bounded_above)
     played: float = held
-    # The product is positive if the owed waves have the sign of the repeated one.
+    # The product is positive if the owed waves have the sign of the repeated wave.
     if law.owed_U[index] * held > 0.0:
         spent = 0.5 * held * held * h
         remaining = energy - spent
@@ -198,8 +199,8 @@ def _receive_wave(
         now: Inputs and outputs of the law in this tick.
         j: Index of the peer, the site at the other end of the line.
         i: Index of the joint.
-        missed: Number of samples between the sample in use and the previous one; -1 if there
-            is no new sample.
+        missed: Number of samples between the sample in use and the previously used sample. -1
+            if there is no new sample.
 
     Returns:
         The wave to play, sqrt(W).
@@ -366,7 +367,7 @@ def _send_waves(law: Any, now: LawInput, i: int, committed: float) -> None:
     A wave u in sqrt(W) that lasts for a control period h carries the energy u^2 h / 2. The
     site, the process of one arm, keeps an account H of the energy that it may send, J. A part
     of H is not available: the energy stored in the springs, the energy that the coming period
-    needs (`committed`), and half of the initial reserve. That half is kept because the motion
+    needs (`committed`), and half of the initial reserve. This half is kept because the motion
     in the coming period is only predicted and may cost more.
 
     Each message to a peer (another arm) contains the wave u and two sums since the start, from
@@ -438,24 +439,23 @@ class Wave(EnergyLaw):
 
     Attributes:
         b: Impedance per joint, N m s/rad.
-        K: Spring of an end that moves its arm by a spring, per joint, N m/rad; 0: no spring.
-        B: Damper of such an end, per joint, N m s/rad; b matches it to the line.
-        lines: Impedances of single lines, for all joints, as in { "m1-s" = 18.0 }, N m s/rad; 0
-            removes a line, and lines that are not named have b. "shares": impedances that give
-            the dominance factors at the start, b on average, if these factors are reversible;
-            otherwise b. Dominance factors are the weights with which an arm follows its peers,
-            the other arms. They are reversible if positive weights D_i exist with D_i alpha_ij
-            = D_j alpha_ji.
+        K: Stiffness of the spring by which an end moves its arm, per joint, N m/rad. 0 for an
+            end without a spring.
+        B: Damping beside this spring, per joint, N m s/rad. The value b matches it to the line.
+        lines: Impedances of single lines, for all joints, as in { "m1-s" = 18.0 }, N m s/rad. 0
+            removes a line, and lines that are not named have the impedance b. With "shares",
+            the impedances are chosen so that they give the dominance factors at the start, with
+            the mean b, if these factors are reversible; otherwise all are b. Dominance factors
+            are the weights with which an arm follows its peers, the other arms. They are
+            reversible if positive weights D_i exist with D_i alpha_ij = D_j alpha_ji.
         beta: Divisor of the site's torque, dimensionless; it scales the forces that the users
             feel relative to each other.
-        reception: Which wave is played if samples are late or lost. "replay": the last wave is
-            held, and missed waves are made up for, as far as the known energy allows; "zero":
-            missed waves are dropped, and positions drift; "scaled": the last wave continues,
-            times sqrt(1 - T'), where T' is the rate of change of the delay, for delays that
-            vary continuously.
-        reserve_J: Initial energy of an end per joint, J, and the same energy again for playing
-            the waves of each line. An end that has less than half of the reserve sends smaller
-            waves.
+        reception: Selects the wave that acts if samples are late or lost. "replay" repeats the
+            last wave, and makes up for missed waves within the known energy. "zero" drops
+            missed waves, so positions drift. "scaled" continues the last wave times sqrt(1 -
+            T'), where T' is the rate of change of the delay, for delays that vary continuously.
+        reserve_J: Initial energy of an end per joint, J. Each line has the same initial energy
+            for its waves. An end that has less than half of the reserve sends smaller waves.
     """
 
     b: PositiveJoints = (10.0,)
@@ -471,7 +471,8 @@ class Wave(EnergyLaw):
         "u": {"unit": "sqrt(W)", "length": "joints", "per_peer": True},
         "U": {"unit": "sqrt(W) s", "length": "joints", "per_peer": True},
         "E": {"unit": "J", "length": "joints", "per_peer": True},
-        # W, known and not yet played, and H, the energy of this end, are for logs alone.
+        # W (known energy that has not acted yet) and H (energy of this end) are sent only for
+        # logs.
         "W": {"unit": "J", "length": "joints", "per_peer": True},
         "H": {"unit": "J", "length": "joints"},
     }
@@ -531,7 +532,7 @@ class Wave(EnergyLaw):
         self.held_s = [0.0] * ends  # time since the newest message, s
 
         # Per line.
-        self.stamp = [-1.0] * peers  # tick in which the newest message was sent, -1: none yet
+        self.stamp = [-1.0] * peers  # tick in which the newest message was sent, -1 before it
         self.rate = [1.0] * peers  # filtered increase of the stamp per tick
 
         # Constants.
@@ -630,7 +631,7 @@ class Wave(EnergyLaw):
     def energies(self, seen: LawRecords) -> LawEnergies:
         """Computes the energies that show whether the law was passive in a run.
 
-        All energies are in J. In the records, of which there is one per control period,
+        All energies are in J. In the records (one per control period),
 
         - "E" is the energy of all waves so far, sent to or received from a peer (another arm);
         - "W" is the part of the received energy whose waves have not acted on the arm yet, so
@@ -648,9 +649,9 @@ class Wave(EnergyLaw):
             seen: Records of the site in the run.
 
         Returns:
-            The energy sent to each peer (`gave`) and used of its waves (`took`), the energy
-            that the arm gave to its controller (`port`), H (`store`), the dissipated energy
-            (`taken`), and W, which the site observed itself (`observed`).
+            The energy sent to each peer (`gave`), the energy used from the peer's waves
+            (`took`), the energy that the arm gave to its controller (`port`), H (`store`), the
+            dissipated energy (`taken`), and W, which the site observed itself (`observed`).
         """
         sent_energies = []
         used_energies = []
@@ -771,8 +772,8 @@ class Wave(EnergyLaw):
         impedances = np.zeros(len(situation.names))
         for index, peer in enumerate(situation.names):
             if peer != site:
-                # The first joint stands for all. Impedances that are computed from dominance
-                # factors have the same ratios at every joint.
+                # The first joint represents all joints. Impedances that are computed from
+                # dominance factors have the same ratios at every joint.
                 joint_impedances = self.find_impedances(site, peer)
                 impedances[index] = joint_impedances[0]
         total_impedance = impedances.sum()
@@ -788,7 +789,7 @@ class Wave(EnergyLaw):
         are_chosen_by_user = bool(self.lines)
         if are_chosen_by_user or find_balancing_weights(situation.alpha) is not None:
             return explanation
-        return f"{explanation}, as the shares of sites are not reversible"
+        return f"{explanation}, because the shares of the sites are not reversible"
 
     def find_impedances(self, site: str, peer: str) -> tuple[float, ...]:
         """Returns the impedance of the line between two sites, for each joint, N m s/rad.
@@ -917,7 +918,7 @@ class Wave(EnergyLaw):
     def condition(self, situation: LawSituation) -> StabilityCondition | None:
         """Evaluates whether the law keeps the coupled arms passive.
 
-        Passive means that they never give more energy than they received. This holds for any
+        Passive means that they never give more energy than they received. This is true for any
         delays and lost messages, if persons and environments are passive. The text also states
         with which weight each arm follows the others. The weights are proportional to the
         impedances of the lines, the virtual connections over which arms exchange waves.

@@ -2,7 +2,7 @@
 
 The messages of a channel are numbered consecutively. A gap in the numbers therefore shows that
 a message is missing: after the numbers 1, 2 and 5, the messages 3 and 4 are missing. An
-`Account` holds these counts for one channel. The process that writes a log (the recorder)
+`Account` contains these counts for one channel. The process that writes a log (the recorder)
 updates its accounts while it records, and a check of the log computes them again later.
 
 The results of an arm's control loop are numbered by its periods (ticks). Some numbers never had
@@ -14,8 +14,8 @@ Invariant:
       missing messages.
     - Unpublished numbers are neither expected nor missing.
     - The memory is bounded: an account stores at most `MAX_GAPS` ranges of missing numbers. If
-      there are more ranges, those with the lowest numbers are forgotten, but their messages
-      still count as missing.
+      there are more ranges, the lowest ranges are forgotten, but their messages still count as
+      missing.
 """
 
 import math
@@ -56,9 +56,9 @@ class RangeSet:
     def insert(self, first: int, last: int) -> None:
         """Inserts a range of consecutive numbers, none of which the set contains yet.
 
-        If the set contains the number before the range, the range extends that one. It is not
-        merged with a range directly behind it, which would only save memory. If there are too
-        many ranges afterwards, those with the lowest numbers are forgotten.
+        If a range of the set ends just before the new range, that range is extended. The new
+        range is not merged with a range that begins just after it, because this would only save
+        memory. If there are then too many ranges, the lowest ones are forgotten.
 
         Args:
             first: First number of the range.
@@ -84,12 +84,12 @@ class RangeSet:
     def remove(self, number: int, last_to_remove: int | None = None) -> bool:
         """Removes a number, or the numbers from `number` to `last_to_remove`.
 
-        All numbers to remove must be in one range of the set. What remains of that range is one
+        All numbers to remove must be in one range of the set. The rest of that range is one
         range, two ranges or nothing.
 
         Args:
             number: The number, or the first of several numbers.
-            last_to_remove: Last number to remove. None removes only `number`.
+            last_to_remove: Last number to remove. If None, only `number` is removed.
 
         Returns:
             False if the set does not contain `number`. Nothing is removed in this case.
@@ -111,7 +111,7 @@ class RangeSet:
         return True
 
     def find(self, number: int) -> tuple[int, int] | None:
-        """Returns the range of consecutive numbers in which a number lies. None if in none.
+        """Returns the range of consecutive numbers that contains a number, or None.
 
         Args:
             number: The number to look for.
@@ -161,10 +161,10 @@ class Account:
         duplicate: Number of messages that arrived although a message with their number had been
             received.
         reordered: Number of messages that arrived after a message with a higher number.
-        refilled: Number of messages that were missing at first, and that the sender sent again
+        refilled: Number of messages that were initially missing, and that the sender sent again
             from its memory.
-        unpublished: How many numbers never had a message. The sender skipped them, or was
-            killed before it reached them and continued behind them after its next start.
+        unpublished: Number of messages that were never published. The sender skipped them, or
+            was killed before it reached them and continued after them at its next start.
         last: Largest number of a message that is known to exist. It is -1 before the first
             message.
         silence_ns: Longest time between two arrivals, in ns. It is 0 without arrival times.
@@ -179,7 +179,7 @@ class Account:
         self.unpublished = 0
         self.last = -1
         self.silence_ns = 0
-        # No member has the missing messages below this number.
+        # No member still has the missing messages below this number.
         self._abandoned_below = 0
         # Largest number that arrived without a request.
         self._newest = -1
@@ -269,15 +269,15 @@ class Account:
         """Notes that the missing numbers just below a number never had a message.
 
         This happens when the sender skips numbers, or is killed and started again. The missing
-        numbers form a range that ends just below `first`. Those of them from `published` on
+        numbers form a range that ends just below `first`. Those that are not below `published`
         count as unpublished instead of missing.
 
         Args:
             first: Number of the first message after the gap. It is the first message that the
                 sender published after its next start, or after the numbers that it skipped.
             published: Number of messages that are known to have been published before the gap.
-                They have the numbers below `published`. Those of them that were not received
-                stay missing.
+                These messages have the numbers below `published`, and stay missing if they were
+                not received.
 
         Returns:
             The lowest number that counts as unpublished from now on. It is `first` if there is
@@ -308,7 +308,7 @@ class Account:
         self.unpublished -= last + 1 - first
 
     def abandon_below(self, number: int) -> None:
-        """Gives up the missing messages below a number, because nobody can send them any more.
+        """Gives up the missing messages below a number, which no process can send any more.
 
         They are no longer requested, but still count as missing. Such a message still counts as
         received if it arrives.
@@ -322,7 +322,7 @@ class Account:
         """Finds the first missing messages that can still be requested from the sender.
 
         Messages that no member (process of a session) has any more are left out, so that they
-        are not requested again and again.
+        are not requested repeatedly.
 
         Args:
             number: Smallest number to consider.
@@ -342,23 +342,24 @@ class Account:
 
     @property
     def missing(self) -> int:
-        """Number of lost messages: published, but never received, not even on request."""
+        """Number of lost messages: those that were published but never received."""
         return self.expected - self.received
 
     @property
     def gaps(self) -> list[list[int]]:
         """Numbers of the messages that are missing, as pairs [first, last] in ascending order.
 
-        For example [[10, 12]] if the messages 10, 11 and 12 are missing. There are at most
-        `MAX_GAPS` pairs: those with the highest numbers.
+        The value is [[10, 12]], for example, if the messages 10, 11 and 12 are missing. At most
+        `MAX_GAPS` pairs with the highest numbers are included.
         """
         return [list(gap) for gap in self._gaps]
 
     @property
     def largest_gap(self) -> int:
-        """Number of messages in the longest series of missing messages. 0 if none is missing.
+        """Number of messages in the longest series of missing messages. 0 if there are none.
 
-        A long series means an interruption, while as many single losses may be harmless.
+        A long series indicates an interruption, while the same number of single losses may be
+        harmless.
         """
         return max((last - first + 1 for first, last in self._gaps), default=0)
 
@@ -391,7 +392,7 @@ class Account:
         if self.silence_ns:
             text += f", longest silence {self.silence_ns / 1e6:.1f} ms"
         if self.unpublished:
-            text += f", not made {self.unpublished}"
+            text += f", unpublished {self.unpublished}"
         if before:
             text += f", of {count_nouns(len(starts), 'start')}"
         return text
@@ -399,7 +400,8 @@ class Account:
     def format_gaps(self, most: int, base: int = 0) -> list[str]:
         """Formats the first ranges of missing numbers for a message to the user.
 
-        For example ["10-12", "40-40"] if the numbers 10 to 12 and 40 are missing.
+        The result is, for example, ["10-12", "40-40"] if the numbers 10 to 12 and 40 are
+        missing.
 
         Args:
             most: Largest number of ranges to return.
@@ -433,12 +435,12 @@ class StartGap:
     A site that is killed cannot state how many messages it published. After its next start it
     continues at a later tick (control period). The messages in between were either published
     and lost on the way to the recorder, or never published. Other sites may have received
-    samples of the earlier start. In that case these sites know a number of messages that the
-    earlier start published at least. Their reports may arrive before or after the next start. A
-    few messages were still in transit to the recorder when the site was killed. These count as
-    unpublished.
+    samples of the earlier start. In that case these sites know a lower limit of the number of
+    messages that the earlier start published. Their reports may arrive before or after the next
+    start. A few messages were still in transit to the recorder when the site was killed. These
+    count as unpublished.
 
-    The numbers of the gap are divided at one point, which only moves up:
+    The gap is divided at the number `_first_unpublished`, which never decreases:
 
         received | missing | unpublished | next start
                  ^         ^             ^
@@ -454,14 +456,14 @@ class StartGap:
     def __init__(self, account: Account, under_way: int) -> None:
         """Stores the account of a site's messages before the site was started again.
 
-        The number of messages that were lost between both starts is unknown at first.
+        The number of messages that were lost between both starts is initially unknown.
         """
         self._account = account
         self._under_way = under_way
-        # Largest number of messages that the earlier start published, as other sites report.
+        # Number of messages that the earlier start published, according to other sites.
         self._reported = 0
-        # First number of the gap: no message from this number on to the next start arrived. It
-        # is -1 until the next start is known.
+        # First number of the gap. No message from this number up to the next start has arrived.
+        # It is -1 until the next start is known.
         self._first_silent = -1
         # First number that counts as unpublished. It is -1 until the next start is known.
         self._first_unpublished = -1
@@ -474,13 +476,13 @@ class StartGap:
         The site (arm controller) was killed and has been started again. The missing messages
         just before the next start now count as unpublished in the account, except the messages
         that the site itself is known to have published. Reports of other sites that arrived
-        earlier are then evaluated. They may turn some of these numbers into missing ones again.
-        Only the first call has an effect.
+        earlier are then evaluated. Some of these numbers may then count as missing again. Only
+        the first call has an effect.
 
         Args:
             first: Number of the first message that belongs to the next start.
-            published: Number of messages of the earlier start, as that start itself stated when
-                it ended. It is 0 if the site was killed before it could state the number.
+            published: Number of messages that the earlier start itself stated when it ended. It
+                is 0 if the site was killed before it could state the number.
         """
         is_evaluated = self._next_first >= 0
         if is_evaluated:
@@ -491,7 +493,7 @@ class StartGap:
         self.note_published(self._reported)
 
     def note_published(self, published: int) -> None:
-        """Takes into account how many messages the site published before it was killed.
+        """Updates the gap with the number of messages that the killed site had published.
 
         Other sites (arm controllers) report this number, because they received samples, the
         states that a site sends. Missing messages before the next start first count as
@@ -504,8 +506,8 @@ class StartGap:
         it later.
 
         Args:
-            published: Number of messages that the site published at least. They have the
-                numbers below it.
+            published: Lower limit of the number of messages that the site published. These
+                messages have the numbers below it.
         """
         self._reported = max(self._reported, published)
         # Messages of the next start do not belong to the gap.
@@ -520,7 +522,7 @@ class StartGap:
 
 
 def describe_unknown_ends(sites: Sequence[str]) -> str:
-    """Returns a sentence for the user about sites of which the end is unknown.
+    """Returns a sentence for the user about sites whose end is unknown.
 
     A site (arm controller) publishes an "end" event when it ends. Without this event, nobody
     knows whether the site published further records (results of control periods) after the last
@@ -544,7 +546,8 @@ def parse_counts(account: str) -> dict[str, int]:
         account: The line, as a log stores it for each topic.
 
     Returns:
-        The numbers, under the keys "received" and "missing". Empty if the text is no such line.
+        The numbers, under the keys "received" and "missing". Empty if the text is not such a
+        line.
     """
     matches = re.findall(r"(received|missing) (\d{1,15})\b", account)
     return {name: int(digits) for name, digits in matches}
@@ -555,7 +558,7 @@ MIN_COVERAGE = 0.999
 
 
 class Coverage(NamedTuple):
-    """What part of a run was recorded, or checked by a tool, for each site.
+    """Part of a run that was recorded, or checked by a tool, for each site.
 
     A site is a process that runs one arm. A tick is one period of its control loop.
 
@@ -572,8 +575,8 @@ class Coverage(NamedTuple):
         """Smallest fraction of control periods of any site that were recorded, from 0 to 1.
 
         A run is known only as well as its worst site (arm controller). In the result of a
-        check, the fraction is that of checked periods. It is 0 if no site has any, and a single
-        site without any does not lower it.
+        check, the fraction is that of checked periods. It is 0 if no site has any periods. A
+        single site without periods does not reduce it.
         """
         if not any(self.expected.values()):
             return 0.0
@@ -599,7 +602,7 @@ class Coverage(NamedTuple):
         return f"{site} {self.judged.get(site, 0)} of {ticks} ({percent})"
 
     def describe(self, least: float) -> str:
-        """Tells in words how much of the run was recorded or checked.
+        """Describes for the user how much of the run was recorded or checked.
 
         Args:
             least: Smallest fraction of ticks (control periods) that is sufficient, from 0 to 1.

@@ -1,8 +1,8 @@
-"""Decides by the content of a message whether it is genuine, where no checksum covers it.
+"""Decides by the content of a message without a checksum whether the message is genuine.
 
 A log stores messages in compressed chunks, each with a checksum. If a recording was
 interrupted, for example by a power failure, the checksum of the last chunk is missing. The
-recovery of the log still wants to use the messages of this chunk. A log states the identity of
+recovery of the log should still use the messages of this chunk. A log states the identity of
 each message in four ways: by its position in the file, by its channel, by its sequence number,
 and in the message itself. If all four agree, damage can only have changed numbers inside that
 one message.
@@ -49,7 +49,8 @@ _CHECKED_MESSAGES = 20
 class MessageOrigins(NamedTuple):
     """Sessions and senders from which a set of messages comes.
 
-    A log has messages of a single session. Further sessions reveal parts of another file.
+    A log has messages of a single session. Messages of further sessions show that the file
+    contains parts of another file.
 
     Attributes:
         epochs_ns: Start times of the sessions, in Unix time, in ns.
@@ -61,13 +62,12 @@ class MessageOrigins(NamedTuple):
 
     @classmethod
     def find(cls, data: bytes, most: int = _SAMPLED_MESSAGES) -> "MessageOrigins":
-        """Finds out from which sessions and senders the first messages of a chunk come.
+        """Determines the sessions and senders of the first messages of a chunk.
 
         A damaged file may contain a chunk, a block of messages, of another file. Two facts
-        reveal
-        that: the start time (epoch) of the session, and the boots of the senders, random
-            numbers that identify the starts of their processes. A message shows the epoch in
-            one of two ways:
+        reveal such a chunk: the start time (epoch) of the session, and the boots of the
+        senders, random numbers that identify the starts of their processes. A message shows the
+        epoch in one of two ways:
 
         - An event that announces the start of a session states the epoch.
         - A record (result of one period of a control loop) or statistics message states its
@@ -140,8 +140,8 @@ def has_foreign_boots(about: Mapping[str, str], boots: set[tuple[str, int]]) -> 
 class ContentCheck:
     """Checks a session's messages against its scenario, its metadata and its earlier messages.
 
-    The recovery passes the messages in the order of the file: those that a checksum covers to
-    `accept`, the others to `check`.
+    The recovery passes the messages in the order of the file: messages with a valid checksum to
+    `accept`, all others to `check`.
 
     Args:
         scenario: Scenario of the session.
@@ -169,7 +169,7 @@ class ContentCheck:
         """Stores a message that a checksum covers, for the check of the next message.
 
         The numbers and times of the messages in a channel increase. A trusted message therefore
-        limits those of its successor.
+        limits the number and the times of its successor.
 
         Args:
             topic: Topic of the channel.
@@ -197,7 +197,7 @@ class ContentCheck:
         return key.member in self._scenario.sites and key.channel in SITE_CHANNELS
 
     def identify(self, payload: bytes) -> str:
-        """Finds out from the content of a message to which topic it belongs.
+        """Determines the topic of a message from its content.
 
         A recovery needs this for messages whose channel is damaged.
 
@@ -222,7 +222,7 @@ class ContentCheck:
     def describe_channel(self, topic: str) -> dict[str, str]:
         """Returns the description of a channel that a correct log of the session contains.
 
-        A recovery restores a lost description with it.
+        A recovery uses it to restore a lost description.
 
         Args:
             topic: Topic of the channel.
@@ -317,7 +317,7 @@ class ContentCheck:
             payload: Bytes of the message.
 
         Raises:
-            UnreadableRecord: It is not the next message, or contradicts the file.
+            UnreadableRecord: The message is not the next one, or contradicts the file.
         """
         message, identity = self._decode(topic, payload)
         member = topic.split("/")[-2]
@@ -361,7 +361,7 @@ class ContentCheck:
         Raises:
             UnreadableRecord: No examined message comes from the run of this log.
         """
-        # The decoding of messages is slow, and the boots of live sessions prove nothing.
+        # Decoding messages is slow, and the boots of live sessions prove nothing.
         if self._about.get("driver") != _VIRTUAL_DRIVER:
             return
         origins = MessageOrigins.find(data, _CHECKED_MESSAGES)
@@ -372,8 +372,8 @@ class ContentCheck:
         """Returns the number that identifies the present start of a process, or None.
 
         All messages of one start contain this number (boot). In virtual time, it is computed
-        from the scenario. Otherwise it is read from the latest accepted message. None if there
-        is no such message.
+        from the scenario. Otherwise it is read from the latest accepted message. The result is
+        None if there is no such message.
         """
         if self._about.get("driver") == _VIRTUAL_DRIVER:
             return compute_virtual_boot(self._about.get("scenario_sha256", ""), member)
@@ -387,7 +387,7 @@ class ContentCheck:
         return None
 
     def _check_number(self, topic: str, message: AnyMessage, number: int) -> None:
-        """Checks that a message has the next number of its channel, so that none is repeated.
+        """Checks that a message has the next number of its channel, and is not a repetition.
 
         Args:
             topic: Topic of the channel.

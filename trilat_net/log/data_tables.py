@@ -6,14 +6,14 @@ connections, and the events of the run. For example, a column of the first kind 
 angle of joint 1.
 
 Invariant:
-    - Every number is a number of the log, or follows from it exactly (an age is a difference of
-      time stamps). The only exceptions are orientations, which the table contains as unit
-      quaternions that do not jump (see `orientations`).
+    - Every number is taken from the log, or follows exactly from numbers of the log (an age is
+      a difference between time stamps). The only exceptions are orientations, which the table
+      contains as unit quaternions that do not jump (see `orientations`).
     - The name of a column ends in its unit. A missing value is null, never a number.
     - Units, names and meanings come from the message types and from the declarations of control
       laws. Thus nothing is described in two places.
-    - A number out of range, or a state from an arm that an arm does not follow, raises a
-      `LogError` that names the file.
+    - A number that is out of range, or a state from an arm that the receiver does not follow,
+      raises a `LogError` that names the file.
 """
 
 import dataclasses
@@ -109,8 +109,8 @@ class Column(NamedTuple):
     def numbers(self) -> NDArray[Any]:
         """Returns the values of a numeric column as an array, with NaN for missing values.
 
-        The shape is (K,). Exports to formats without missing values use it, such as NumPy
-        files.
+        The shape is (K,). Exports to formats without missing values, such as NumPy files, use
+        this array.
         """
         if self.known is None or self.known.all():
             return self.values
@@ -143,8 +143,7 @@ class Table:
 
     Attributes:
         name: Name of the site (arm controller) whose messages the table contains, or "events".
-        kind: What a row of a site's table is, one of `SITE_TABLE_KINDS`. Empty for other
-            tables.
+        kind: Kind of a site's table, one of `SITE_TABLE_KINDS`. Empty for other tables.
         about: Description of a row for the reader of the table.
         columns: The columns.
     """
@@ -200,7 +199,7 @@ class Table:
     def to_pandas(self) -> "pandas.DataFrame":
         """Converts a table of a log to a pandas data frame with the same columns.
 
-        A missing value is None in a column of texts, and NaN in a column of numbers.
+        Missing values become None in a column of texts, and NaN in a column of numbers.
 
         Raises:
             UsageError: pandas is not installed.
@@ -224,16 +223,17 @@ _COMPLETE_TEXTS = {
     "delay_max_us": (
         "per peer, largest one-way delay since the last statistics; -1 where nothing came"
     ),
+    "offset_us": "per peer, its clock minus this site's clock, as in force",
     "late": "per peer, samples that came after they were due",
     "duplicate": "per peer, samples that came twice",
     "refused": "per peer, samples whose stamp was out of range",
     "lost": "per peer, samples that the link's model lost",
 }
-"""Meanings of fields whose text in the docstring refers to the previous field."""
+"""Meanings of fields whose text in the docstring cannot be understood alone."""
 
 
 class _FieldDoc(NamedTuple):
-    """Name, unit and meaning of one field of a message, for the head of an exported table.
+    """Unit, meaning and type of one field of a message, for the head of an exported table.
 
     Attributes:
         unit: Unit of the field. Empty if it has no unit.
@@ -485,7 +485,8 @@ def _make_sent_columns(site: SiteLog) -> Iterator[Column]:
     """
     for n, entry in enumerate(site.channel.entries(site.peers)):
         (name, unit, length, _) = entry.vector
-        # The text names the receiver and the element, if there are several.
+        # The text names the receiver and the element, if there are several receivers or
+        # elements.
         stem = f"ch_{name}"
         if entry.peer:
             stem += f"_{entry.peer}"
@@ -523,8 +524,8 @@ def _make_hand_columns(site: SiteLog, arm: ArmModel, mode: str) -> Iterator[Colu
         text="how firmly the arm is held, 0 to 1",
     )
     meanings = {
-        "number": "number of the newest message of who holds the arm",
-        "source": "who holds the arm",
+        "number": "number of the newest message from the operator who holds the arm",
+        "source": "number that identifies the operator who holds the arm",
     }
     for n, (name, text) in enumerate(meanings.items(), 1):
         yield Column(
@@ -537,7 +538,7 @@ def _make_hand_columns(site: SiteLog, arm: ArmModel, mode: str) -> Iterator[Colu
             known=held,
         )
 
-    # The target and its rate of change follow, or the force alone.
+    # The next numbers are the target and its rate of change, or only the force.
     axes = arm.joint_names if mode == "joint" else TASK_AXES[:POSITION]
     units = {"tip": ("m", "m/s"), "joint": ("rad", "rad/s"), "force": ("N", "")}[mode]
     size = (site.layout.hand - 3) // 2
@@ -598,7 +599,7 @@ def _make_bodies_columns(site: SiteLog, bodies: Iterable[str]) -> Iterator[Colum
 
 
 def build_state_table(site: SiteLog, scenario: Scenario) -> Table:
-    """Builds a table of an arm's angles, torques and so on, one row per control period.
+    """Builds a table of an arm's angles, torques and other values, one row per control period.
 
     Args:
         site: Records (results of control periods) of the site (arm controller).
@@ -751,7 +752,7 @@ def build_link_table(site: SiteLog, timed: TimedMessages[LinkStats], source: str
     columns = list(_make_time_columns(tick, t_s, timed.log_ns, timed.publish_ns))
     for field, (unit, text, kind) in read_field_docs(LinkStats).items():
         if field in ("v", "site", "boot", "tick", "t_ns"):
-            continue  # the same in every row, or a column already
+            continue  # the same in every row, or already a column
         fields = [getattr(s, field) for s in stats]
         if kind == "object":
             keys: Iterable[str] = site.peers
@@ -771,10 +772,10 @@ def build_link_table(site: SiteLog, timed: TimedMessages[LinkStats], source: str
 
 
 def _list_reasons(dropped: Iterable[Mapping[str, int]]) -> list[str]:
-    """Returns the reasons why messages were dropped, of which each becomes a column.
+    """Returns the reasons why messages were dropped, each of which becomes a column.
 
-    They have the order in which they first occur. Reasons that lead to the same column name
-    count once.
+    The reasons are in the order in which they first occur. Reasons that give the same column
+    name are listed once.
 
     Args:
         dropped: Numbers of dropped messages by reason, for each statistics message.
@@ -794,10 +795,10 @@ def _to_word(text: str) -> str:
 def _make_entry_column(
     source: str, field: str, name: str, values: Sequence[Mapping[str, int]]
 ) -> Column:
-    """Makes the column of one entry of a statistics field whose values are maps.
+    """Creates the column of one entry of a statistics field whose values are maps.
 
     For example, the field `delay_us` maps each peer to a delay. Its entry of the peer m2
-    becomes the column delay_m2_us. A field without a unit counts something: the entry m2 of
+    becomes the column delay_m2_us. A field without a unit is a count: the entry m2 of
     `accepted` becomes accepted_m2_count.
 
     Args:
@@ -822,7 +823,7 @@ def _make_entry_column(
     known = np.array(
         [number is not None and number >= lowest_known for number in numbers], dtype=np.bool_
     )
-    # The documentation of a field describes all peers. The column is that of one peer.
+    # The documentation of a field describes all peers. The column belongs to one peer.
     meaning = meaning_of_field.removeprefix("per peer, ")
     return Column(
         name=f"{stem}_{_to_word(name)}_{ending}",

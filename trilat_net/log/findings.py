@@ -6,7 +6,8 @@ finding.
 
 Invariant:
     - A check with a problem has not passed.
-    - At most `_MAX_LISTED_PROBLEMS` problems of a check are stored. Further ones are counted.
+    - At most `_MAX_LISTED_PROBLEMS` problems of a check are stored. Further problems are only
+      counted.
 """
 
 from dataclasses import dataclass, field
@@ -39,9 +40,9 @@ class _ProblemPlace(NamedTuple):
 
 @dataclass(slots=True)
 class Finding:
-    """Result of one check of a log or a run, such as that of missing records.
+    """Result of one check of a log or a run, such as the check for missing records.
 
-    It has the problems that the check found.
+    It contains the problems that the check found.
 
     Attributes:
         check: Name of the check. Every file is checked for "whole", "checksums", "records" and
@@ -50,8 +51,9 @@ class Finding:
             is the subject of the comparison.
         text: The result in one line.
         passed: True if the check passed.
-        judged: True if the check could be made. It is False if the check would run code from
-            outside that the user has not permitted. The check has not passed then.
+        judged: True if the check could be carried out. It is False if the check would run code
+            from outside that the user has not permitted. In this case, the check has not
+            passed.
         places: The problems, at most `_MAX_LISTED_PROBLEMS`.
         wrong: Number of problems, including those that are not stored.
     """
@@ -70,7 +72,7 @@ class Finding:
 
         Args:
             file: Name of the file in which the problem was found.
-            offset: Place of the problem in the file, in bytes. None if it concerns the whole
+            offset: Offset of the problem in the file, in bytes. None if it concerns the whole
                 file.
             text: Description of the problem.
         """
@@ -108,8 +110,8 @@ class Finding:
     def to_row(self) -> dict[str, Any]:
         """Returns the result of one check of a log as plain values: its name, text and outcome.
 
-        "judged" is False if the check could not be made. The single problems are left out,
-        because their summary is in the text.
+        "judged" is False if the check could not be carried out. The individual problems are
+        left out, because the text summarises them.
         """
         return {
             "label": self.check,
@@ -122,8 +124,8 @@ class Finding:
 class Findings(dict[str, Finding]):
     """Results of several checks of a log, by name of the check, in the order of first use.
 
-    A name that does not exist yet gets a result without problems when it is read. Thus a check
-    can add a problem by `findings["records"]` at any place.
+    If a name that does not exist yet is read, a result without problems is created for it. Thus
+    a check can add a problem by `findings["records"]` at any point.
     """
 
     def __missing__(self, check: str) -> Finding:
@@ -134,8 +136,8 @@ class Findings(dict[str, Finding]):
 class CheckReport(Result):
     """Base class of the results of commands that check a log in several respects.
 
-    It derives from the results of the single checks whether the log passed, and the exit code
-    of the command.
+    From the results of the individual checks, it determines whether the log passed, and the
+    exit code of the command.
 
     Attributes:
         findings: The result of each check.
@@ -153,8 +155,8 @@ class CheckReport(Result):
         """Exit code with which a command that reports these checks ends.
 
         - 1 if a check failed.
-        - The exit code of `CodeWithheld` if no check failed, but a check could not be made.
-          Such a check would run code from outside that the user has not permitted.
+        - The exit code of `CodeWithheld` if no check failed, but a check could not be carried
+          out. Such a check would run code from outside that the user has not permitted.
         - 0 if every check passed.
         """
         if any(finding.judged and not finding.passed for finding in self.findings):

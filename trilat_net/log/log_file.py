@@ -1,8 +1,8 @@
 """Writes the file of a log so that it survives crashes, power failures and full disks.
 
 A log contains the messages of a run. While it is recorded, the file is called run.mcap.active,
-and after it is complete, run.mcap. Data are flushed when the operating system has them, and
-synced when they are on the disk.
+and after it is complete, run.mcap. Data are flushed once the operating system has them, and
+synced once they are on the disk.
 
 Invariant:
     - Flushed data survive the death of the process. Synced data survive a loss of power.
@@ -37,8 +37,8 @@ RESERVE_STEP_BYTES = 1 << 19
 class DiskReserve:
     """Disk space that is reserved by a temporary file without a name.
 
-    When the space is needed, the temporary file is closed, and the space can be used by another
-    file on the same disk.
+    When the space is needed, the temporary file is closed, and another file on the same disk
+    can use the space.
 
     Args:
         folder: Any folder on the disk.
@@ -56,7 +56,8 @@ class DiskReserve:
     def grow(self, size: int) -> None:
         """Reserves disk space, so that it cannot be used up by other programs.
 
-        Nothing happens if this disk does not support it, or if the space was released before.
+        Nothing happens if the disk does not support reservations, or if the space has been
+        released.
 
         Args:
             size: Number of bytes that must be reserved in total.
@@ -167,7 +168,7 @@ class _FileSync:
     def wait(self) -> None:
         """Waits until a thread has forced the written data of the log onto the disk.
 
-        The file must not be closed before, as the thread uses its descriptor.
+        The file must not be closed before that, because the thread uses its descriptor.
         """
         if self._thread is not None:
             self._thread.join()
@@ -176,7 +177,7 @@ class _FileSync:
 def _datasync(descriptor: int) -> None:
     """Forces the written data of a file onto the disk, so that a power failure loses nothing.
 
-    Where the system has `fdatasync`, it is preferred to `fsync`, because it leaves out metadata
+    If the system has `fdatasync`, it is used instead of `fsync`, because it leaves out metadata
     that are not necessary to read the file.
     """
     getattr(os, "fdatasync", os.fsync)(descriptor)
@@ -184,12 +185,12 @@ def _datasync(descriptor: int) -> None:
 
 RESERVE_MARGIN_BYTES = 1 << 16
 """Space that is reserved for the counts of messages at the end, in bytes."""
-_ELSEWHERE = "take another disk with -o"
+_ELSEWHERE = "choose another disk with -o"
 _ADVICE = {
     errno.ENOSPC: ("the disk is full", f"make room, or {_ELSEWHERE}"),
-    errno.EDQUOT: ("your quota of the disk is used up", f"make room, or {_ELSEWHERE}"),
+    errno.EDQUOT: ("your disk quota is used up", f"make room, or {_ELSEWHERE}"),
     errno.EFBIG: (
-        "the file system takes no longer file",
+        "the file system does not accept a longer file",
         "split the log, as in --split-size 1000",
     ),
     errno.EIO: ("the disk fails", _ELSEWHERE),
@@ -216,21 +217,21 @@ def sync_folder(folder: Path) -> None:
 
 
 class LogFile:
-    """File of a log that is written from its beginning to its end; a context manager.
+    """Context manager for the file of a log, which is written from its beginning to its end.
 
     Written data stay in memory until `flush`, so that the file always ends at the end of a
-    flush, whenever the process may be killed.
+    flush, even if the process is killed at any time.
 
     Args:
         path: Name of the complete file.
         force: True if the file may replace an existing one.
         durable: True to sync the file at every flush. Otherwise a thread syncs it once a
             second.
-        working: Name of the file until it is complete. None uses `active_path(path)`.
-        room: Space that is reserved for the end. None uses a `DiskReserve` in the file's
-            folder.
+        working: Name of the file until it is complete. If None, `active_path(path)` is used.
+        room: Space that is reserved for the end. If None, a `DiskReserve` in the file's folder
+            is created.
         opened: Function that opens a file without a buffer, by name and mode. For tests.
-        now_ns: Function that returns the time in ns. None uses the clock of the system.
+        now_ns: Function that returns the time in ns. If None, the clock of the system is used.
 
     Attributes:
         path: Name of the complete file.
@@ -279,12 +280,12 @@ class LogFile:
         self._written = 0
         # Number of bytes that the end of the file will need.
         self._end_bytes = 0
-        # The last bytes that were written, as many as the end mark has.
+        # The last bytes that were written, with the length of the end mark.
         self._tail = b""
-        # True if the disk accepted no data, even with the reserved space.
+        # True if the disk accepted no data, even after the reserved space was released.
         self._broken = False
         self._closed = False
-        # True if the file has got its final name.
+        # True once the file has its final name.
         self._published = False
 
     def write(self, data: bytes, /) -> int:
@@ -320,8 +321,8 @@ class LogFile:
         1. There was no error so far. Before the data are written, disk space is reserved for
            them and for the end of the file.
         2. The disk refuses the data for the first time. The reserved space is released, and the
-           data are written once more. If this succeeds, they are in the file, but the error is
-           raised nevertheless, so that the caller stops and writes only the end of the file.
+           data are written again. If this succeeds, they are in the file, but the error is
+           still raised, so that the caller stops and writes only the end of the file.
         3. The disk refuses the data even then. The file is cut off at the end of the previous
            flush. Every later call raises the first error.
 
@@ -350,7 +351,7 @@ class LogFile:
     def _write_pending(self) -> None:
         """Passes the bytes in memory to the operating system, and notes where the file ends.
 
-        After an error, the next call continues behind the bytes that were accepted.
+        After an error, the next call continues after the bytes that were accepted.
 
         Raises:
             OSError: The disk refuses the data.
@@ -360,7 +361,8 @@ class LogFile:
             if not accepted:
                 raise OSError(errno.EIO, os.strerror(errno.EIO))
             self._written += accepted
-        # The last bytes show whether the file is complete: it then ends with the end mark.
+        # The last bytes show whether the file is complete, that is, whether it ends with the
+        # end mark.
         mark_bytes = len(MAGIC)
         self._tail = bytes((self._tail + self._pending[-mark_bytes:])[-mark_bytes:])
         self.size += self._written
@@ -382,8 +384,8 @@ class LogFile:
     def whole(self) -> bool:
         """True if the log is complete: it ends with the end mark of the MCAP format.
 
-        Only such a file gets its final name. Another one keeps the suffix ".active", and can be
-        recovered.
+        Only a complete file gets its final name. Any other file keeps the suffix ".active", and
+        can be recovered.
         """
         return self._tail == MAGIC and self.size > len(MAGIC) and not self._broken
 
@@ -434,8 +436,8 @@ class LogFile:
             error: Exception that interrupted the writing. None if nothing interrupted it.
 
         Raises:
-            LogRefused: The disk refuses the last data, or `error` states that the disk has
-                refused data before. The text states which data are saved, and where.
+            LogRefused: The disk refuses the last data, or `error` states that it has refused
+                earlier data. The text states which data are saved, and where.
         """
         try:
             self.close()
@@ -455,7 +457,8 @@ class LogFile:
     def refused(self, error: OSError) -> LogRefused:
         """Composes the error for the user after the disk refused data.
 
-        The file must be closed before, because the text depends on what became of it:
+        The file must be closed before this call, because the text depends on the final state of
+        the file:
 
         - The reserved space was sufficient for the end: the log is finished, under its final
           name (`path`), with the data up to the error.
@@ -490,9 +493,9 @@ class LogFile:
                 f"{self.path}: {problem}; the finished log is {self.working}: give it a name"
             )
         return LogRefused(
-            f"{self.working}: {problem}, even for the end of the log; its "
-            f"{self.size / 1e6:.1f} MB up to the last whole chunk are kept; {advice}; "
-            f"make it whole with: trilat log recover {self.working}"
+            f"{self.working}: {problem}, even for the end of the log; the "
+            f"{self.size / 1e6:.1f} MB up to the last complete chunk are kept; {advice}; "
+            f"recover the log with: trilat log recover {self.working}"
         )
 
 

@@ -58,7 +58,7 @@ def describe_unfinished(path: Path) -> str:
         return ""
     return (
         f"; but there is {unfinished}, whose recording was not finished; "
-        f"make it whole with: trilat log recover {unfinished}"
+        f"recover the log with: trilat log recover {unfinished}"
     )
 
 
@@ -67,20 +67,20 @@ def part_path(path: Path, number: int) -> Path:
 
     Args:
         path: Name of the log.
-        number: Number of the part, from 1 on. For 0, the name of the log is returned.
+        number: Number of the part, from 1 on. If it is 0, the name of the log is returned.
     """
     return path.with_name(f"{path.stem}-{number:03}{path.suffix}") if number else path
 
 
 @dataclass(frozen=True, slots=True)
 class ChannelFilter:
-    """States which channels of a session are recorded, by key expressions of Zenoh.
+    """Selects the channels of a session that are recorded, by key expressions of Zenoh.
 
     A key expression is the key of a channel, in which wildcards may stand for names.
 
     Attributes:
-        include: Expressions of channels to record. If there are none, all channels are
-            recorded.
+        include: Expressions of channels to record. If there are no expressions, all channels
+            are recorded.
         exclude: Expressions of channels that are not recorded, even if they are included.
     """
 

@@ -5,7 +5,8 @@
 
 Here "m1" is the name of an arm, t_s is the time of each period of its control loop, and q has
 its joint angles, a row per period. A run may have several files, because a recorder can split
-its log, and because several recorders can record parts of one session. They are read as one.
+its log, and because several recorders can record parts of one session. These files are read as
+one log.
 
 `read_link_delays` extracts the measured network delays between two arms, so that a scenario
 with `model = "trace"` can reproduce them.
@@ -17,8 +18,8 @@ Invariant:
       the file. An invalid event or statistics message is skipped, and `Log.unreadable` reports
       it.
     - Channels of other sessions and members are ignored.
-    - A sample counts as lost only if records cover every tick at which it could have arrived,
-      up to the longest delay of the link. Samples whose arrival is unknown are left out.
+    - A sample counts as lost only if every tick in which it could have arrived, up to the
+      longest delay of the link, has a record. Samples whose arrival is unknown are left out.
 """
 
 import hashlib
@@ -174,7 +175,7 @@ class Log(Result, Mapping[str, SiteLog]):
 
     @property
     def why_empty(self) -> str:
-        """Clause for an error text which says that no site has a record in this log.
+        """Clause of an error text that says that no site has a record in this log.
 
         Empty if at least one site has a record.
         """
@@ -182,15 +183,13 @@ class Log(Result, Mapping[str, SiteLog]):
         return "" if has_records else "no site has a record in this log"
 
     def require_records(self) -> None:
-        """Raises an error if the log has no record, so that there is nothing to judge.
+        """Raises an error if the log has no record, because there is nothing to judge.
 
         Raises:
             LogError: No site has a record.
         """
         if self.why_empty:
-            raise LogError(
-                f"{self.source}: {self.why_empty}, so that there is nothing to judge"
-            )
+            raise LogError(f"{self.source}: {self.why_empty}, so there is nothing to judge")
 
     def _describe_records(self) -> str:
         """Returns the length of the session and the numbers of its records, as a string."""
@@ -210,8 +209,8 @@ class Log(Result, Mapping[str, SiteLog]):
     def to_dict(self) -> dict[str, Any]:
         """Returns a summary of the session, with the keys of `trilat sim --json`.
 
-        The entry "sites" has the numbers of each site (arm controller) by its name. The records
-        (results of control periods) themselves are not included.
+        The entry "sites" maps the name of each site (arm controller) to its summary figures.
+        The records (results of control periods) themselves are not included.
         """
         return {
             "files": list(self.sources),
@@ -264,7 +263,7 @@ class Log(Result, Mapping[str, SiteLog]):
         """Draws the run, or columns of the records over time, with a line per site.
 
         Without arguments, the figure is the overview of the run: errors, speeds, torques and
-        ages. A column has a panel of its own.
+        ages. Each column has its own panel.
 
         >>> log = tn.simulate("two_sites", duration_s=0.1)
         >>> figure = log.plot("q", "tau", sites="s", joints=1, from_s=0.05)
@@ -273,13 +272,13 @@ class Log(Result, Mapping[str, SiteLog]):
 
         Args:
             columns: Quantities such as "q", "tau", "theta_hat", "age" and "mode", the error
-                "e", or single columns of `table`, such as "q1_rad" or "q1". By default "q",
-                "e" and "tau" if another argument is given.
+                "e", or single columns of `table`, such as "q1_rad" or "q1". By default "q", "e"
+                and "tau" if another argument is given.
             sites: The sites to draw. None for all sites.
             joints: The joints to draw, by number from 1 or by name. None for all joints.
                 Columns that belong to no joint are not affected.
-            from_s: First time to draw, in s. None for the start of the run.
-            until_s: Last time to draw, in s. None for the end of the run.
+            from_s: First time to draw, in s. If None, the start of the run.
+            until_s: Last time to draw, in s. If None, the end of the run.
 
         Returns:
             A Matplotlib figure, which a notebook displays. Its method `savefig` writes it to a
@@ -375,7 +374,7 @@ class Log(Result, Mapping[str, SiteLog]):
     def diverged_s(self) -> float | None:
         """Time at which the first arm exceeded a safety limit, which ended the run, in s.
 
-        None if all arms stayed within their limits.
+        The value is None if all arms stayed within their limits.
         """
         times_s = [part.diverged_s for part in self.values()]
         known_times_s = [time_s for time_s in times_s if time_s is not None]
@@ -403,7 +402,7 @@ class Log(Result, Mapping[str, SiteLog]):
         limits_rad_s = np.asarray(self.scenario.sites[name].limits.qd_limit_rad_s)
         speeds_rad_s = np.abs(self[name].qd[-1])
         limits_rad_s = np.broadcast_to(limits_rad_s, speeds_rad_s.shape)
-        # argmax chooses a NaN, which is a speed beyond every limit too.
+        # argmax selects NaN if there is one, which also counts as a speed beyond every limit.
         joint = int(np.argmax(speeds_rad_s / limits_rad_s))
         speed = f"{speeds_rad_s[joint]:.3g} rad/s (limit {limits_rad_s[joint]:g} rad/s)"
         return f"{name} joint {joint + 1} reached {speed} at {diverged_s:.3f} s"
@@ -421,7 +420,7 @@ class Log(Result, Mapping[str, SiteLog]):
     def failed_hands(self) -> list[str]:
         """Sentences about programs that failed while they moved an arm, for reports on the log.
 
-        Each sentence tells which program failed, when, and why. Empty if none failed.
+        Each sentence states which program failed, when, and why. Empty if no program failed.
         """
         return [
             event.text
@@ -432,8 +431,8 @@ class Log(Result, Mapping[str, SiteLog]):
     def warn_of_failures(self) -> None:
         """Issues a Python warning if an arm left its limits, or if a user's program failed.
 
-        The program is one that moves an arm. The warning names the line of code that called the
-        caller of this method.
+        Such a program moves an arm. The warning names the line of code that called the caller
+        of this method.
         """
         for failure in self.failed_hands:
             warnings.warn(failure, RuntimeWarning, stacklevel=3)
@@ -451,8 +450,8 @@ class Log(Result, Mapping[str, SiteLog]):
 
         A recorder that crashes leaves an unfinished file. A log of several files is complete if
         all of them were finished. It is also complete if the last file was finished and no
-        record is missing, because another recorder may have recorded what an unfinished file
-        lacks.
+        record is missing, because another recorder may have recorded the messages that an
+        unfinished file lacks.
         """
         if self._contents.complete or len(self.sources) == 1:
             return self._contents.complete
@@ -494,9 +493,9 @@ class Log(Result, Mapping[str, SiteLog]):
         The recorder writes them at the end of a file. The dictionary is empty for a file that
         was not finished. If the log consists of several files, no file states the counts of all
         messages. Therefore the records (results of control periods), statistics and events of
-        all files are counted again. The counts that belong to no topic, such as those of
-        dropped messages, cannot be counted again. They are the sums of the files, which `merge`
-        has computed.
+        all files are counted again. Counts without a topic, such as those of dropped messages,
+        cannot be determined again. They are the sums over the files, which `merge` has
+        computed.
         """
         written_counts = self._contents.metadata.get(ACCOUNTS, {})
         has_one_file = len(self.sources) == 1
@@ -516,18 +515,19 @@ class Log(Result, Mapping[str, SiteLog]):
             for stats in self.link_stats(site):
                 accounts.receive(link_topic, stats.tick)
         for event in self.events:
-            has_number = event.n >= 0  # events of the oldest logs have none
+            has_number = event.n >= 0  # events of the oldest logs have no number
             if event.member in self.sites and has_number:
                 accounts.receive_event(self._topic(event.member, topics.EVENT), event.n, event)
-        # The sites state in their "end" events how many ticks they executed. Further records up
-        # to there are missing.
+        # The sites state in their "end" events how many ticks they executed. Records of these
+        # ticks that are not in the log are missing.
         for site, ticks in self._stated_ticks.items():
             accounts.add_expected_ticks(site, ticks)
-        # The recomputed counts precede those of no topic, such as the dropped messages.
+        # The recomputed counts come first, followed by counts without a topic, such as those of
+        # dropped messages.
         return {**accounts.format_accounts(), **written_counts}
 
     def account(self, site: str) -> str:
-        """Returns how many records of a site were received and how many are missing.
+        """Returns the numbers of received and missing records of a site.
 
         The recorder counted them. They need not agree with the file if the file is damaged.
 
@@ -564,8 +564,9 @@ class Log(Result, Mapping[str, SiteLog]):
     def _stated_ticks(self) -> dict[str, int]:
         """Number of control periods (ticks) that each site states when it ends, by site.
 
-        A site (arm controller) states it in its "end" event; sites without such an event are
-        missing. A number above that of the scenario is reduced to it.
+        A site (arm controller) states the number in its "end" event. Sites without such an
+        event are left out. A number above that of the scenario is reduced to the number of the
+        scenario.
         """
         ticks = {}
         for event in self.events:
@@ -596,10 +597,9 @@ class Log(Result, Mapping[str, SiteLog]):
 
         A tick is one period of the control loop. A process may be killed and started again, or
         may join a session late. For each start in `starts`, a range (first tick, last tick)
-        ends just before that start. The range begins after the last earlier tick that was
-        executed, as far as is known. Such a tick is known from a record, from the "end" event
-        of the earlier process, or because another site received the state that was sent in that
-        tick.
+        ends just before that start. The range begins after the last earlier tick that is known
+        to have been executed. Such a tick is known from a record, from the "end" event of the
+        earlier process, or because another site received the state that was sent in that tick.
         """
         return {site: self._find_absences(site, starts) for site, starts in self.starts.items()}
 
@@ -625,7 +625,7 @@ class Log(Result, Mapping[str, SiteLog]):
             The absences, as (first tick, last tick), in ascending order.
         """
         end_events = [event for event in self.events if event.kind == "end"]
-        # The ticks are counted from 0, so that the last one is one less than their number.
+        # The ticks are counted from 0, so the last tick is one less than their number.
         last_ticks = [event.ticks - 1 for event in end_events if event.member == site]
         executed_ticks = [*self[site].tick.tolist(), *last_ticks]
         executed = np.array(executed_ticks, dtype=np.int64)
@@ -642,7 +642,8 @@ class Log(Result, Mapping[str, SiteLog]):
             reported_ticks = min(start_tick, reported_ticks)
             # Some ticks may be reported but not recorded, because their records were still in
             # transit to the recorder when the process was killed. Such ticks count as not
-            # executed. More ticks than that were executed, and their records are missing.
+            # executed. If more ticks are reported than can have been in transit, they were
+            # executed, and their records are missing.
             unrecorded_ticks = reported_ticks - absence_begin
             if unrecorded_ticks > most_in_transit:
                 absence_begin = reported_ticks
@@ -662,8 +663,8 @@ class Log(Result, Mapping[str, SiteLog]):
 
         These are the ticks (control periods) between two starts of the site (`absences`), and
         the ticks that the site (arm controller) skipped because it was late, as its records
-        state. The site published nothing in these ticks, so that neither records nor samples of
-        these ticks are missing.
+        state. The site published nothing in these ticks, so their records and samples do not
+        count as missing.
 
         Args:
             site: Name of the site.
@@ -721,7 +722,7 @@ class Log(Result, Mapping[str, SiteLog]):
             site: Name of the site.
 
         Returns:
-            The number of missing records. It is 0 if none is known to be missing.
+            The number of missing records. It is 0 if no record is known to be missing.
         """
         site_log = self[site]
         after_last = max(0, self._stated_ticks.get(site, 0) - (site_log.last_tick + 1))
@@ -733,7 +734,7 @@ class Log(Result, Mapping[str, SiteLog]):
 
         The "end" event of a site (arm controller) states that tick (control period). Without
         this event, it is the tick of the last record of the site, or of the last sample of the
-        site that another site received, whichever is later. It is -1 if nothing is known.
+        site that another site received, whichever is later. It is -1 if no such tick is known.
         """
         stated = self._stated_ticks
         last_ticks = {}
@@ -747,7 +748,7 @@ class Log(Result, Mapping[str, SiteLog]):
                 index: peer for index, peer in enumerate(peers) if peer not in stated
             }
             if not peers_without_end:
-                continue  # spares the decoding of all records
+                continue  # avoids decoding all records
             for state in self[name].states:
                 for index, tick, _ in state.rx:
                     peer = peers_without_end.get(index)
@@ -785,7 +786,7 @@ class Log(Result, Mapping[str, SiteLog]):
         )
         ticks = self.scenario.ticks(site)
         last_tick = site_log.last_tick
-        # Counts and arrays grow with the last tick, so that a damaged tick could fill the
+        # Counts and arrays grow with the last tick, so a damaged tick number could fill the
         # memory.
         if last_tick >= ticks:
             raise LogError(
@@ -841,11 +842,11 @@ class Log(Result, Mapping[str, SiteLog]):
         return commands
 
     def shown(self, site: str) -> dict[str, Ints]:
-        """Returns which states of the other arms the user of a site saw on the screen.
+        """Returns the states of the other arms that the user of a site saw on the screen.
 
         The user usually sees the state that the control law uses. If the scenario has a table
-        `[sites.NAME.view]`, the picture has a delay of its own, like a video that arrives later
-        than the control signals. The user then sees the newest state that has arrived with that
+        `[sites.NAME.view]`, the picture has its own delay, like a video that arrives later than
+        the control signals. The user then sees the newest state that has arrived with that
         delay.
 
         Args:
@@ -997,7 +998,7 @@ def open_log(
     Args:
         source: A path, or a binary file opened for reading.
         more: Further parts of the session, in any order.
-        progress: Function that is called now and then with the number of bytes read and their
+        progress: Function that is called repeatedly with the number of bytes read and their
             total.
         law: Files of control laws that the log names and that may run when the log is executed,
             see docs/sessions/code-that-runs.md. Laws that this process has run itself need no
@@ -1008,8 +1009,9 @@ def open_log(
 
     Raises:
         UsageError: The log does not name one of the files of `law`.
-        LogError: A file is missing, is no MCAP file or no log of trilat-net. Also raised if the
-            files belong to different sessions or disagree on a message.
+        LogError: A file is missing, is not an MCAP file or is not a log of trilat-net. Also
+            raised if the files belong to different sessions or contain different versions of a
+            message.
     """
     log = Log(merge_parts(_read_parts((source, *more), progress)))
     allow_logged_code(log.scenario, law, other_version=other_version, remember=remember)
@@ -1021,7 +1023,7 @@ def open_logs(*sources: str | Path, progress: Progress | None = None) -> list[Lo
 
     Args:
         sources: Paths of logs, or of folders that contain logs.
-        progress: Function that is called now and then with the number of bytes read and their
+        progress: Function that is called repeatedly with the number of bytes read and their
             total over all files.
 
     Returns:
@@ -1094,7 +1096,7 @@ def _convert_errors(name: str) -> Iterator[None]:
         yield
     except OSError as error:
         raise LogError(
-            f"{name}: cannot be read: {error.strerror}{describe_unfinished(Path(name))}"
+            f"{name} cannot be read: {error.strerror}{describe_unfinished(Path(name))}"
         ) from None
 
 
@@ -1125,7 +1127,7 @@ def read_link_delays(path: Path, link: str) -> list[TracePoint]:
 
     Raises:
         OSError: The file cannot be opened.
-        ValueError: The file is no log, has no such link, or no sample arrived over the link.
+        ValueError: The file is not a log, has no such link, or no sample arrived over the link.
     """
     status = path.stat()  # raises the same errors as opening the file
     links = _read_links(path, status.st_mtime_ns, status.st_size)
@@ -1142,8 +1144,8 @@ def _read_links(path: Path, modified_ns: int, size: int) -> dict[str, list[Trace
     """Measures the network delays of all links of a log, by the name of the link ("m1->s").
 
     The result for the last file is cached, because a scenario reads the links of a log one
-    after the other. `modified_ns` and `size` are not used here, but they are part of the key of
-    the cache: if the file is written again, they change, and the file is read again.
+    after another. `modified_ns` and `size` are not used here, but are part of the key of the
+    cache. If the file is written again, they change, and the file is read again.
     """
     delays = {}
     try:
@@ -1186,7 +1188,7 @@ def _iterate_delays(log: Log, site: str, index: int, peer: str) -> Iterator[Trac
     rate_hz = log.scenario.sites[peer].rate_hz
     sent = log[peer].tick.tolist() if peer in log.sites else []
     # Samples that were sent before the first or after the last arrival were lost as well.
-    # Without records of the sender, all ticks up to the last arrival count as sent.
+    # Without records of the sender, samples of all ticks up to the last arrival count as sent.
     ticks = {*sent, *delays_us} if sent else range(max(delays_us) + 1)
     for tick in sorted(ticks):
         stamp_ns = tick * NS_PER_S // rate_hz

@@ -2,7 +2,7 @@
 
 A log contains digests of its contents (`running_digest`). The owner of a private key signs
 these digests with the method Ed25519, and stores the signature in a separate file beside the
-log. Whoever has the public key can check that the log is the one that was signed. A signature
+log. Anybody with the public key can check that the log is the one that was signed. A signature
 covers all messages and everything that describes them, but not the compression. It is therefore
 also valid for a copy of the log that was compressed differently.
 
@@ -53,8 +53,8 @@ class _LogSignature(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     Attributes:
         format: Name and version of the format.
         chain: The signed digests, as the log states them.
-        public_key: Public key of the signer, 32 bytes in base64. It is not trusted: whoever
-            checks the log supplies a key of a signer whom they trust.
+        public_key: Public key of the signer, 32 bytes in base64. It is not trusted. The person
+            who checks the log supplies the key of a trusted signer.
         signature: The signature, 64 bytes in base64.
     """
 
@@ -85,7 +85,7 @@ def create_signing_keys(path: str | Path) -> tuple[Path, Path]:
     path = Path(path)
     if not path.name:
         raise UsageError(
-            f"{path}: is not the name of a key; name the key as in: trilat keys pair lab"
+            f"{path} is not the name of a key; name the key as in: trilat keys pair lab"
         )
     private_path = path.with_name(f"{path.name}.key")
     public_path = path.with_name(f"{path.name}.pub")
@@ -145,11 +145,11 @@ def sign_log(
     integrity, chain = _read_chain(path, progress)
     if integrity.state is not DigestState.INTACT:
         advice = {
-            DigestState.OPEN: f"; make it whole first with: trilat log recover {path}",
+            DigestState.OPEN: f"; recover the log first with: trilat log recover {path}",
             DigestState.ABSENT: f"; trilat log recover {path} makes a copy with a digest chain",
         }
         raise LogError(
-            f"{path}: is not signed: {integrity.text}{advice.get(integrity.state, '')}"
+            f"{path} is not signed: {integrity.text}{advice.get(integrity.state, '')}"
         )
     public_key = key.public_key().public_bytes(
         serialization.Encoding.Raw, serialization.PublicFormat.Raw
@@ -170,8 +170,8 @@ def check_signatures(
 ) -> Finding:
     """Checks that logs are exactly those that the owner of a public key has signed.
 
-    A digest shows only accidental changes, as anybody can compute it again. A signature shows
-    who vouches for the log.
+    A digest reveals only accidental changes, because anybody can compute it again. A signature
+    shows who vouches for the log.
 
     Args:
         paths: The logs. The signature of a log is in a file beside it.
@@ -221,7 +221,7 @@ def _find_problem(path: Path, key: Ed25519PublicKey, progress: Progress | None) 
         return f"there is no signature file {signature_file}"
     except OSError as error:
         return f"{signature_file} cannot be read: {error.strerror}"
-    except ValueError as error:  # msgspec and base64 raise it
+    except ValueError as error:  # raised by msgspec and base64
         return f"{signature_file} is not a signature of this program: {error}"
 
     if stated_signature.format != _FORMAT:
@@ -233,7 +233,7 @@ def _find_problem(path: Path, key: Ed25519PublicKey, progress: Progress | None) 
     except InvalidSignature:
         return f"{signature_file} was not made by the owner of this key, or was changed"
 
-    # The signature is valid for the digests that it states. Does the log have these digests?
+    # The signature is valid for the digests in its file. The log must have the same digests.
     integrity, chain = _read_chain(path, progress)
     if chain != stated_signature.chain:
         return (
@@ -306,5 +306,5 @@ def _load_key(path: Path, kind: Any, expected: str) -> Any:
         else:
             key = serialization.load_pem_public_key(data)
     if not isinstance(key, kind):
-        raise UsageError(f"{path}: is not a {expected}")
+        raise UsageError(f"{path} is not a {expected}")
     return key

@@ -1,7 +1,7 @@
 """Writes the log of a session into one MCAP file or into several parts.
 
 The parts of run.mcap are called run-001.mcap, run-002.mcap and so on. A part ends when it
-reaches a size or a duration that the user has set.
+reaches the size or the duration that the user has set.
 
 Invariant (L5):
     - Every file can be understood without other files: the session, the scenario and the
@@ -9,8 +9,8 @@ Invariant (L5):
     - The messages are stored byte for byte as they were published.
     - The numbers of received and missing messages (the accounts) are at the end of the file.
     - Each part repeats the session, the scenario and the schemas, and names the previous part.
-    - Each message is in exactly one part: a new part begins between two messages, in the thread
-      that writes.
+    - Each message is in exactly one part, because the writing thread begins a new part between
+      two messages.
 """
 
 import glob
@@ -32,7 +32,7 @@ from .running_digest import ALGORITHM, DIGESTS_KEY, PREVIOUS_DIGEST_KEY
 from .session_scenario import SessionScenario
 
 Decoded = State | TickRecord | LinkStats | Event | None
-"""Decoded message, from which messages for viewers are derived. None if there are none."""
+"""Decoded message, from which messages for viewers are derived. None if no viewer needs it."""
 ReceiveMessage = Callable[[Any, int], None]
 """Function that receives one message of the session, and its arrival time in Unix ns."""
 PutMessage = Callable[[str, bytes, int, int], None]
@@ -99,20 +99,21 @@ writes a message.
 class LogWriter:
     """Writes the messages of a session, and everything that describes them, to one log file.
 
-    Besides the messages as they were published, it can write messages for viewers, which are
-    derived from them.
+    In addition to the messages as they were published, it can write messages for viewers, which
+    are derived from them.
 
     Args:
         stream: File or buffer that receives the bytes.
         scenario: Scenario of the session.
         session: Name of the session.
-        driver: "live" or "virtual", the session's kind of time.
+        driver: Kind of time in the session: "live" or "virtual".
         epoch_unix_ns: Unix time of tick 0, in ns. It is 0 in virtual time.
         provenance: Facts about the program that writes the log, see `provenance`.
         facts: Further metadata of the session.
         part: Metadata of the part, if the log has several files.
         choice: Filter of the channels that the log contains.
-        make_views: Creates the messages for viewers. With None, the log contains none.
+        make_views: Creates the messages for viewers. If None, the log contains no such
+            messages.
 
     Attributes:
         records_digest: Digest of the messages of a finished log. Empty before the end.
@@ -362,13 +363,13 @@ It is used for the accounts, and for the messages for viewers that follow from o
 
 @dataclass(frozen=True, slots=True)
 class LogStorage:
-    """Where a log is stored, and at which size or duration a new file of it begins.
+    """Path of a log, and the size or duration at which a new file of the log begins.
 
     Attributes:
         path: Name of the log. The name of a part also contains its number.
         force: True if the log may replace an existing one.
         durable: True if the file is forced onto the disk at every flush, so that a loss of
-            power does no harm.
+            power does not damage the log.
         split_bytes: Largest size of a part, in bytes. None if it is not limited.
         split_ns: Longest duration of a part, in ns. None if it is not limited.
         carry_on: True to continue an existing log of this name with a new part. The existing
@@ -441,7 +442,7 @@ class LogStorage:
         )
         if self.splits and parts and not self.force:
             raise UsageError(
-                f"{parts[max(parts)]}: already exists; choose another name, continue the log "
+                f"{parts[max(parts)]} already exists; choose another name, continue the log "
                 "with --continue, or replace it with --force"
             )
         return int(self.splits), ""
@@ -456,7 +457,7 @@ class LogParts:
         storage: Place of the log, and its division into parts.
         begin: Function that creates the `LogWriter` of a file, with the metadata of the part.
             The metadata are empty for a log in a single file.
-        opened: Function that opens a file by its path. None uses `LogFile`.
+        opened: Function that opens a file by its path. If None, `LogFile` is used.
 
     Attributes:
         current_accounts: Function that returns the accounts to write at the end of a full part.
@@ -474,7 +475,7 @@ class LogParts:
     ) -> None:
         """Creates the first of the files into which a long log is divided.
 
-        An error is raised before that if a file of the same name exists.
+        If a file of the same name exists, an error is raised before anything is created.
         """
         self._open_file = opened or (
             lambda path: LogFile(path, force=storage.force, durable=storage.durable)
@@ -484,8 +485,8 @@ class LogParts:
         self._begin_writer = begin
         self._number, self._previous = storage.find_first_part()
         self._previous_digest = ""
-        # All parts of a replaced log are removed. Those that remained would seem to belong to
-        # the new log.
+        # All parts of a replaced log are removed, because remaining parts would seem to belong
+        # to the new log.
         if storage.force and storage.splits:
             for number in (0, *storage.find_parts()):
                 path = log_layout.part_path(storage.path, number)
@@ -536,7 +537,7 @@ class LogParts:
         try:
             self._begin_part()
         except UsageError as error:
-            # The name was checked at the start, so that this is no error of the user.
+            # The name was checked at the start, so this is not a mistake of the user.
             raise LogRefused(f"{error}; the log ends with {self._previous}") from None
 
     def _is_part_full(self, payload_bytes: int, duration_ns: int) -> bool:
@@ -582,8 +583,7 @@ class LogParts:
     ) -> None:
         """Adds one message to the log.
 
-        If the current part has reached its largest size or duration, a new part is begun
-        before.
+        If the current part has reached its largest size or duration, a new part is begun first.
 
         Args:
             key: Key of the channel.
@@ -608,7 +608,8 @@ class LogParts:
     def flush(self) -> None:
         """Passes all messages so far to the operating system, so that a crash cannot lose them.
 
-        A loss of power still can, because the operating system writes to the disk later.
+        A loss of power can still lose messages, because the operating system writes to the disk
+        later.
 
         Raises:
             LogRefused: The disk refused the data.

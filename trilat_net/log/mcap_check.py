@@ -4,11 +4,11 @@ An MCAP file consists of records. Messages are packed into compressed chunks. Th
 end of the file states where the chunks are, and each chunk is followed by an index of its
 messages. This module recomputes all checksums, and builds the index again from the records to
 compare it with the index in the file. Other programs (pymcap-cli doctor) check that a file
-conforms with every rule of the format.
+conforms to every rule of the format.
 
 Invariant:
-    - Each problem is reported once, with its offset. Problems that follow from another one are
-      not reported.
+    - Each problem is reported once, with its offset. Problems that follow from another problem
+      are not reported.
     - An index is compared with the records in the file, and never used to find them.
     - Every MCAP file is accepted, not only logs of trilat-net.
 """
@@ -65,12 +65,13 @@ class FileCheck:
         self._end_records: dict[int, Any] = {}
         self._undefined_channels: set[int] = set()
         # Offset of the message index of each channel, for the last chunk. The indexes follow
-        # the chunk, and are added when they are read. None after a chunk that cannot be read.
+        # the chunk, and are added when they are read. The value is None after a chunk that
+        # cannot be read.
         self._message_indexes: dict[int, int] | None = None
         # Log times and offsets of each channel's messages in the last chunk, alternately, as a
         # message index contains them. An offset is that of the record in the unpacked chunk.
         self._entries: dict[int, array[int]] = {}
-        # An unreadable record may have defined a channel, so that undefined channels are not
+        # An unreadable record may have defined a channel, so undefined channels are not
         # reported after it.
         self._has_unreadable = False
 
@@ -99,7 +100,7 @@ class FileCheck:
         self._findings[check].add(self._file, offset, text)
 
     def _check_content(self, record: mcap_records.ScannedRecord) -> None:
-        """Checks one record of the MCAP file with the method for records of its kind.
+        """Checks one record of the MCAP file with the method for its kind.
 
         Raises:
             UnreadableRecord: The record cannot be decoded, or its checksum differs.
@@ -126,11 +127,12 @@ class FileCheck:
         """Stores metadata, attachments and index entries, which are compared at the end.
 
         Metadata and attachments must appear in the index at the end of the file. The entry that
-        they must have there is stored as expected. The entries of the index that are read later
-        are stored as stated. When the whole file has been read, `_compare_index` compares both.
-        An entry of a metadata record or an attachment is (size of the record, name). An entry
-        of a chunk is (size of the record, first and last log time, offsets of the message
-        indexes by channel), see `_check_chunk`. All other records are noted for `_compare_end`.
+        they must have there is stored in the expected entries. The index entries that are read
+        later are stored in the stated entries. When the whole file has been read,
+        `_compare_index` compares the two. An entry of a metadata record or an attachment is
+        (size of the record, name). An entry of a chunk is (size of the record, first and last
+        log time, offsets of the message indexes by channel), see `_check_chunk`. All other
+        records are noted for `_compare_end`.
 
         Args:
             frame: Kind and place of the record.
@@ -231,9 +233,9 @@ class FileCheck:
 
         Two indexes refer to a chunk. A message index of each channel follows the chunk, and is
         compared with the messages by `_check_message_index`. The entry of the chunk in the
-        index of the file states, besides its size and times, where these message indexes are.
-        They are read only after this method. Therefore the expected entry contains a dictionary
-        that `_check_message_index` fills.
+        index of the file states its size and its times, and where these message indexes are.
+        The message indexes are read only after this method. Therefore the expected entry
+        contains a dictionary that `_check_message_index` fills.
 
         Args:
             record: The chunk.
@@ -241,7 +243,7 @@ class FileCheck:
         Raises:
             UnreadableRecord: The chunk cannot be unpacked, or contains an invalid record.
         """
-        # If the chunk cannot be read (exception), its message indexes are not checked.
+        # If unpacking raises an exception, the message indexes of the chunk are not checked.
         self._message_indexes = None
         frame = record.frame
         head = record.head()
@@ -271,8 +273,8 @@ class FileCheck:
     def _check_message_index(self, frame: mcap_records.RecordFrame, content: bytes) -> None:
         """Compares the index of one channel's messages with the messages of the last chunk.
 
-        A chunk is a compressed block of messages. Behind it, the file has an index for each
-        channel, which states the time and the place of each message in the chunk.
+        A chunk is a compressed block of messages. After the chunk, the file has an index for
+        each channel, which states the time and the offset of each message in the chunk.
 
         Raises:
             UnreadableRecord: The length of the index is wrong.
@@ -298,8 +300,8 @@ class FileCheck:
     def finish(self) -> None:
         """Reports the damaged parts of the file, and compares its end with the data.
 
-        The end has an index and statistics. It is compared only if the file was finished and
-        has no damaged part, because everything would differ otherwise.
+        The end has an index and statistics. The end is compared only if the file was finished
+        and has no damaged part, because otherwise everything would differ.
         """
         scanner = self._scanner
         if not scanner.begins:

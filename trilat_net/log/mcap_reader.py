@@ -80,8 +80,8 @@ def shift_progress(progress: Progress | None, before: int, total: int) -> Progre
     present file, adds the sizes of the earlier files, and calls `progress`.
 
     Args:
-        progress: Function that receives the progress in all files, in bytes. None if nobody
-            needs the progress.
+        progress: Function that receives the progress in all files, in bytes. None if the
+            progress is not needed.
         before: Size of the files that were read before, in bytes.
         total: Size of all files, in bytes.
 
@@ -94,7 +94,7 @@ def shift_progress(progress: Progress | None, before: int, total: int) -> Progre
 
 
 class ChannelInfo(NamedTuple):
-    """Description of a channel in an MCAP file, that is of a sequence of messages of one kind.
+    """Description of a channel, a sequence of messages of one kind in an MCAP file.
 
     Attributes:
         topic: Topic of the channel, such as "/trilat/paper/m1/state".
@@ -209,21 +209,21 @@ def _make_single_block(message: McapMessage) -> _MessageBlock:
 
 
 _BLOCK_BYTES = 1 << 12
-"""Size of a chunk from which on its messages are read in blocks."""
+"""Smallest size of a chunk whose messages are read in blocks, in bytes."""
 
 
 class McapReader:
-    """Reads one MCAP file from its beginning to its end, also if the file is damaged.
+    """Reads one MCAP file from its beginning to its end, even if the file is damaged.
 
     `messages` yields the messages one by one, and `blocks` in blocks, which is much faster.
-    `scan` yields the records and the damaged parts of the file, for its check and its recovery.
+    `scan` yields the records and the damaged parts of the file, for checking and recovering it.
     `read_record` yields the messages of a record.
 
     Args:
         stream: The file, opened for reading.
         name: Name of the file for error messages.
         progress: Function that is called after every record of the file.
-        kept: True if the caller stores the messages. Their memory is limited then, see
+        kept: True if the caller stores the messages. The memory for them is then limited, see
             `KEPT_RATIO`.
 
     Attributes:
@@ -288,10 +288,10 @@ class McapReader:
 
     @property
     def damaged(self) -> list[mcap_records.Damage]:
-        """Parts of the file that could not be read, among the parts examined so far.
+        """Unreadable parts among the parts of the file that have been examined.
 
-        A channel of which only some messages were read is listed, too. This limit bounds the
-        memory.
+        A channel of which only some messages were read, because of the memory limit, is listed
+        as well.
         """
         return self.scanner.damaged + self._more_damage
 
@@ -299,16 +299,16 @@ class McapReader:
     def torn(self) -> mcap_records.Damage | None:
         """Unreadable rest of a file whose end is missing, such as a record that is cut off.
 
-        The rest extends to the last byte of the file. None if the file ends properly, or if its
-        end has not been reached yet.
+        The rest extends to the last byte of the file. The value is None if the file ends
+        properly, or if its end has not been reached yet.
         """
         return self.scanner.torn
 
     def messages(self) -> Iterator[McapMessage]:
         """Yields every message in the order of the file.
 
-        A part that cannot be read is added to `damaged`, and the reading continues behind it,
-        until there are too many damaged parts.
+        A part that cannot be read is added to `damaged`, and reading continues after it, until
+        there are too many damaged parts.
 
         Raises:
             LogError: The file is no MCAP file, or unpacks to far too much for its size.
@@ -317,7 +317,8 @@ class McapReader:
         for item in self._walk():
             if isinstance(item, mcap_records.Damage) or item.frame.opcode not in _READ:
                 continue
-            # Not by `read_record`: a further generator would delay every message.
+            # `read_record` is not used here, because a further generator would slow down every
+            # message.
             try:
                 yield from self._read_messages(item)
             except mcap_records.UnreadableRecord as error:
@@ -348,18 +349,19 @@ class McapReader:
         """Checks that the file begins with the eight bytes with which every MCAP file begins.
 
         Raises:
-            LogError: The file begins with other bytes, so that it is no MCAP file.
+            LogError: The file begins with other bytes, and is therefore not an MCAP file.
         """
         if not self.scanner.begins:
             reason = "is empty" if not self.size else "does not begin with the mark of MCAP"
-            raise LogError(f"{self._source}: is not an MCAP file: the file {reason}")
+            raise LogError(f"{self._source} is not an MCAP file: the file {reason}")
 
     def scan(self) -> Iterator[mcap_records.ScannedRecord | mcap_records.Damage]:
         """Yields the records and the damaged parts of the file, see `RecordScanner.scan`.
 
-        The file may begin with anything, and is scanned to its end. The caller passes each
-        record to `read_record`, also if it needs no messages: the metadata and the digests of
-        the file are found there. After too many damaged parts, `read_record` does nothing.
+        The file may begin with any bytes, and is scanned to its end. The caller passes each
+        record to `read_record`, even if it does not need the messages, because `read_record`
+        collects the metadata and the digests of the file. After too many damaged parts,
+        `read_record` does nothing.
         """
         self._is_scanned = True
         yield from self._walk()
@@ -409,8 +411,8 @@ class McapReader:
             frame: Place of the record.
             error: The reason.
         """
-        # The scanner stops if its own list is too long. A scan must go on to the end of the
-        # file, so that the damage is added to another list.
+        # The scanner stops if its own list is too long. A scan must continue to the end of the
+        # file. Therefore the damage is added to another list.
         damaged = self._more_damage if self._is_scanned else self.scanner.damaged
         damaged.append(mcap_records.Damage(frame.offset, frame.size, str(error)))
 
@@ -425,13 +427,15 @@ class McapReader:
     def _unpack(self, record: mcap_records.ScannedRecord) -> bytes:
         """Processes a record of the file, and returns the messages and definitions in it.
 
-        What happens depends on the kind of the record:
+        The action depends on the kind of the record:
 
         - A chunk, a compressed block of messages and definitions, is counted and unpacked.
-        - A message or definition outside of chunks is returned in the same form as in a chunk.
+        - A message or definition outside of chunks is returned in the same format as in a
+          chunk.
         - Metadata, attachments and the header are stored in the attributes of the reader. They
-          contain no messages. They are added to the digest here, the checksum that is compared
-          with the one in the file. `_read_messages` adds what this method returns.
+          contain no messages. This method adds them to the digest, the checksum that is
+          compared with the one in the file. `_read_messages` adds the returned messages and
+          definitions.
 
         Args:
             record: The record, of a kind in `_READ`.
@@ -521,7 +525,7 @@ class McapReader:
                     raise mcap_records.UnreadableRecord("a message is shorter than its header")
                 channel, sequence, log_time_ns, publish_time_ns = parse_head(data, begin)
 
-                # Messages of the session will be decoded, the others will not.
+                # Messages of the session will be decoded, but other messages will not.
                 if channel in session_channels:
                     cost = _DECODED_BYTES
                     if length > _LONG_BYTES:
@@ -573,7 +577,7 @@ class McapReader:
     def _finish_record(
         self, partly_read: "_PartlyReadRecord", messages: int, memory: int
     ) -> None:
-        """Concludes the reading of a record, of which all messages have been read.
+        """Concludes the reading of a record after all of its messages have been read.
 
         The messages after the last definition are added to the digest (checksum) of all
         messages, and the memory of all messages is subtracted from the memory that may still be
@@ -596,7 +600,7 @@ class McapReader:
         """Yields the messages of a record in blocks, and stores its schemas and channels.
 
         Compiled code (`walk_messages`) finds the messages up to the next definition of a schema
-        or channel. The definition is then read, and the search continues behind it. If compiled
+        or channel. The definition is then read, and the search continues after it. If compiled
         code cannot continue, or if the record is short, the remaining messages are read one by
         one.
 
@@ -640,8 +644,8 @@ class McapReader:
     def _clear_run(self) -> chunk_walk.MessageRun:
         """Returns the arrays that receive the next messages of a chunk, with counts of zero.
 
-        A chunk is a compressed block of messages. The large arrays are used again and again.
-        There is a count for each slot, a small number that stands for a channel.
+        A chunk is a compressed block of messages. The large arrays are reused. There is a count
+        for each slot, a small number that stands for a channel.
         """
         sums = np.zeros((4, len(self._slots)), np.int64)
         self._run = self._run._replace(
@@ -709,7 +713,7 @@ class McapReader:
                 yield _MessageBlock(topic, chunk, run, count, slot)
 
     def judge_digest(self) -> Integrity:
-        """Finds out by digests in the file whether the file was changed after it was written.
+        """Determines from the digests in a file whether the file was changed later.
 
         The file must have been read to its end.
 
@@ -762,7 +766,7 @@ class McapReader:
             schema_data=schema_data,
         )
         # A channel with a slot is read in blocks. If a topic has two channels, their messages
-        # alternate, so that they must be read one by one.
+        # alternate and must be read one by one.
         if topic not in self.channels:
             self._slot_of_channel[record.id] = len(self._slots)
             self._slots.append(record.id)
@@ -823,7 +827,7 @@ class McapReader:
         self._memory_left -= amount
         if self._memory_left < 0:
             raise LogError(
-                f"{self._source}: needs too much memory for a file of "
+                f"{self._source} needs too much memory for a file of "
                 f"{count_nouns(self.size, 'byte')}: the data up to byte {frame.end} alone "
                 f"would need more than {KEPT_RATIO} times the size of the file, and more than "
                 f"{KEPT_BYTES >> 20} MiB"
@@ -913,7 +917,7 @@ class ChannelMessages:
         return self._data
 
     def add(self, payload: bytes, log_ns: int, publish_ns: int) -> None:
-        """Appends a message to those of the topic, in the order of the file.
+        """Appends a message to the messages of the topic, in the order of the file.
 
         Args:
             payload: The message, encoded as published.
@@ -939,7 +943,7 @@ class ChannelMessages:
         self.publish_ns.frombytes(publish_ns.tobytes())
 
     def times(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Returns when each of the topic's K messages was sent and recorded, as arrays.
+        """Returns the arrival and sending times of the topic's K messages, as arrays.
 
         Returns:
             The times of arrival and of sending, shape (K,) each, in Unix time, in ns. A time of
@@ -949,7 +953,7 @@ class ChannelMessages:
 
 
 def _clip_times(times: "array[int]") -> NDArray[np.int64]:
-    """Converts unsigned times to signed ones. Times that are too late are reduced."""
+    """Converts unsigned times to signed times. Times that are too late are reduced."""
     unsigned = np.array(times, dtype=np.uint64)
     return np.minimum(unsigned, _LAST_SIGNED_NS).astype(np.int64)
 
@@ -1010,7 +1014,7 @@ class LogContents:
                 well.
 
         Raises:
-            LogError: The file is no MCAP file, or no log of trilat-net.
+            LogError: The file is not an MCAP file, or not a log of trilat-net.
         """
         reader = McapReader(stream, name, progress, kept=not trusted)
         channels: dict[str, ChannelMessages] = {}
@@ -1053,7 +1057,7 @@ def check_log(stream: BinaryIO, name: str) -> None:
         LogError: The file cannot be opened as a log. The text states the reason.
     """
     reader = McapReader(stream, name)
-    deque(reader.blocks(_is_log_topic), maxlen=0)  # reads all messages, and stores none
+    deque(reader.blocks(_is_log_topic), maxlen=0)  # reads all messages, but stores no message
     _check_head(reader, name)
     try:
         parse_embedded(reader.attachments[SCENARIO].decode(), f"{name}: scenario")

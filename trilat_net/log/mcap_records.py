@@ -1,4 +1,4 @@
-"""Finds and decodes the records of MCAP files, also of damaged files.
+"""Finds and decodes the records of MCAP files, including damaged files.
 
 An MCAP file is a sequence of records. A record is an opcode (1 byte), the length of its content
 (8 bytes) and the content, see the specification at mcap.dev. A chunk is a record whose content
@@ -9,7 +9,7 @@ Invariant:
     - No number in a file is trusted. Nothing outside the file is read. A chunk is unpacked only
       if its head agrees with its data, and only up to a size that is reasonable for its
       compressed size.
-    - Every function raises `UnreadableRecord` for bytes that make no sense.
+    - Every function raises `UnreadableRecord` for bytes that are not a valid record.
     - After such bytes, the scan of a file continues at the next readable chunk.
 """
 
@@ -65,7 +65,7 @@ _MAX_HEAD_BYTES = _COMPRESSION_NAME_OFFSET + 4 + 32 + 8
 # length of the compression's name. The name and the compressed size follow.
 _FIXED_HEAD = struct.Struct("<QQQII")
 _SIZE = struct.Struct("<Q")
-# Number of bytes that are read together in the search for a chunk.
+# Number of bytes that are read at once in the search for a chunk.
 _SCAN_BYTES = 1 << 20
 # Name of a supported compression, preceded by its length.
 _COMPRESSION_NAME = re.compile(
@@ -74,7 +74,7 @@ _COMPRESSION_NAME = re.compile(
 
 
 class UnreadableRecord(Exception):  # noqa: N818 - describes a part of a file
-    """Error: a part of an MCAP file makes no sense. The text of the error states the reason.
+    """Error: a part of an MCAP file cannot be read. The text of the error states the reason.
 
     It is used only within the package `log`: a scan catches it and continues at the next
     readable part, and a check reports it.
@@ -139,7 +139,7 @@ class ChunkHead(NamedTuple):
 def unpack_chunk(content: bytes) -> bytes:
     """Unpacks the compressed records of a chunk, and checks them against its head.
 
-    The head may lie. Therefore no more is unpacked than its stated size, within reasonable
+    The head may be wrong. Therefore at most its stated size is unpacked, within reasonable
     limits.
 
     Args:
@@ -160,7 +160,7 @@ def unpack_chunk(content: bytes) -> bytes:
         )
     data = _unpack(head, memoryview(content)[head.data_offset :])
     if len(data) != head.size:
-        # The unpacking of longer data may end early, so that their length is not known.
+        # Unpacking of longer data may end early, so their length is not known.
         actual_size = "more" if len(data) > head.size else str(len(data))
         raise UnreadableRecord(
             f"a chunk states an unpacked size of {count_nouns(head.size, 'byte')}, but unpacks "
@@ -321,7 +321,7 @@ class ScannedRecord:
     def unpack(self) -> bytes:
         """Returns the decompressed records of a chunk, a compressed block of messages.
 
-        It is decompressed once, however often this is called.
+        The chunk is decompressed only in the first call.
 
         Raises:
             UnreadableRecord: The chunk cannot be unpacked, or its checksum is wrong.
@@ -353,8 +353,8 @@ class RecordScanner:
         finished: True if the file was finished and has been read to its end.
         trailing: Number of bytes after the end mark, if the mark has been read.
         damaged: Damaged parts that were found so far, except a missing end.
-        torn: The part from which the end of the file is missing. None if it is not missing, or
-            has not been reached yet.
+        torn: The incomplete part at the end of the file. None if the file is not cut off, or if
+            its end has not been reached yet.
     """
 
     def __init__(self, stream: BinaryIO) -> None:
@@ -370,14 +370,14 @@ class RecordScanner:
         self.torn: Damage | None = None
 
     def read(self, offset: int, length: int) -> bytes:
-        """Reads some bytes of the file; fewer are returned at the end of the file.
+        """Reads some bytes of the file. Fewer bytes are returned at the end of the file.
 
         Args:
             offset: Offset of the first byte in the file.
             length: Number of bytes to read.
 
         Returns:
-            The bytes. They are fewer than `length` if the file ends before.
+            The bytes. There are fewer than `length` if the file ends before.
         """
         self._stream.seek(self._base + offset)
         return self._stream.read(max(0, min(length, self.size - offset)))
@@ -392,7 +392,7 @@ class RecordScanner:
                 yield item.frame
 
     def scan(self) -> Iterator[ScannedRecord | Damage]:
-        """Yields the records and the damaged parts of the file in the order of their places.
+        """Yields the records and the damaged parts of the file in the order of their offsets.
 
         Bytes that cannot be a record are skipped, added to `damaged`, and yielded as a damaged
         part. If the end of the file is missing, `torn` is set. Every call starts at the
@@ -415,8 +415,8 @@ class RecordScanner:
                         "not the length of a footer"
                     )
             except UnreadableRecord as error:
-                # The length of the previous record may be wrong, so that the search includes
-                # it.
+                # The length of the previous record may be wrong, so the search includes that
+                # record.
                 damaged_before = len(self.damaged)
                 resumed_at = self._resume(search_start, offset, str(error))
                 yield from self.damaged[damaged_before:]
@@ -430,7 +430,8 @@ class RecordScanner:
             if frame.opcode == Opcode.FOOTER:
                 self._end_at(frame.end)
                 return
-            # The length of a readable chunk is trusted. That of any other record may be wrong.
+            # The length of a readable chunk is trusted. The length of any other record may be
+            # wrong.
             search_start = frame.end if frame.opcode == Opcode.CHUNK else frame.offset + 1
             offset = frame.end
         self.torn = Damage(
@@ -456,8 +457,8 @@ class RecordScanner:
     def _resume(self, search_start: int, offset: int, problem: str) -> int | None:
         """Notes a damaged part, and finds the next readable chunk.
 
-        If there is none, the rest of the file is damaged. The end of the file still counts as
-        present if the file ends with a footer.
+        If no readable chunk follows, the rest of the file is damaged. The end of the file still
+        counts as present if the file ends with a footer.
 
         Args:
             search_start: Offset at which the search for a chunk starts.
@@ -533,7 +534,7 @@ class RecordScanner:
     def _find_chunk(self, offset: int) -> int | None:
         """Finds the first readable chunk at or after an offset.
 
-        A chunk is recognised by the name of its compression, which has a fixed place in its
+        A chunk is recognised by the name of its compression, which has a fixed offset in its
         head. Therefore uncompressed chunks are not found.
 
         Returns:
@@ -541,7 +542,8 @@ class RecordScanner:
         """
         lead_bytes = RECORD_HEAD_BYTES + _COMPRESSION_NAME_OFFSET
         for window_offset in range(offset, self.size, _SCAN_BYTES):
-            # The window is so long that it contains the head of a chunk that begins at its end.
+            # The window includes the head of a chunk that begins at the end of the searched
+            # bytes.
             window = self.read(window_offset, _SCAN_BYTES + lead_bytes + 8)
             for match in _COMPRESSION_NAME.finditer(window):
                 start = window_offset + match.start() - lead_bytes
@@ -613,7 +615,8 @@ def has_right_crc(attachment: bytes) -> bool:
 def parse_record(opcode: int, content: bytes) -> Any:
     """Decodes the content of a record with the `mcap` package.
 
-    The package raises various errors for damaged content. Here they become a single kind.
+    The package raises various errors for damaged content. They are converted to a single kind
+    of error here.
 
     Args:
         opcode: Number of the kind of record, which must be in `KINDS`.

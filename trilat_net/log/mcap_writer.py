@@ -1,10 +1,10 @@
 """Writes MCAP files, in which logs store their messages.
 
 Messages are collected into chunks, which are compressed and written to a stream. The index,
-which states where the chunks are, is written at the end of the file. The package `mcap` has a
-writer as well, but that writer keeps a dictionary for every chunk, which takes 46 MiB an hour
-at ten chunks a second with twelve channels, and needs three times the computing time. The tests
-read the files of this writer with that package.
+which states where the chunks are, is written at the end of the file. The package `mcap` also
+contains a writer, but that writer keeps a dictionary for every chunk, which takes 46 MiB per
+hour at ten chunks per second with twelve channels, and needs three times the computing time.
+The tests use that package to read the files of this writer.
 
 Invariant:
     - The same calls produce the same bytes.
@@ -26,7 +26,7 @@ from .mcap_records import MAGIC, OP_MESSAGE, RECORD_HEAD
 from .running_digest import DIGESTS, RunningDigest
 
 _CHUNK_BYTES = 1 << 20
-"""Size of the messages in a chunk, in bytes before compression, from which it is closed."""
+"""Size of the messages at which a chunk is closed, in bytes before compression."""
 
 # Fields of fixed size, in the order of the specification at mcap.dev.
 _MESSAGE = struct.Struct("<BQHIQQ")
@@ -44,7 +44,7 @@ _SUMMARY = (
 """Kinds of the records in the summary at the end of a file, in the order of the file."""
 _COMPRESSION = "zstd"
 _FIXED_END_BYTES = 512
-"""Upper bound of the size of those records at the end whose number does not grow, in bytes.
+"""Upper bound of the size of the records at the end whose number is fixed, in bytes.
 
 These are the statistics without the counts of channels, the offsets of six groups of records,
 the end of the data, the footer and the end mark.
@@ -52,7 +52,7 @@ the end of the data, the footer and the end mark.
 
 
 class Sink(Protocol):
-    """Where the writer puts the bytes of the file: a file, or a buffer that waits for `flush`.
+    """Destination of the bytes of the file: a file, or a buffer that waits for `flush`.
 
     If the sink has a method `reserve(size)`, the writer calls it with the number of bytes that
     the end of the file will need. Disk space for them can then be reserved.
@@ -122,7 +122,7 @@ class McapWriter:
             complete.
         library: Name of the program, which the file states.
         profile: MCAP profile, which the file states.
-        chunk_bytes: Size of the messages in a chunk from which the chunk is closed, in bytes.
+        chunk_bytes: Size of the messages at which a chunk is closed, in bytes.
 
     Attributes:
         position: Number of bytes written.
@@ -139,7 +139,7 @@ class McapWriter:
         self._reserve: Callable[[int], None] | None = getattr(stream, "reserve", None)
         self._chunk_bytes = chunk_bytes
         self._compressor = zstandard.ZstdCompressor()
-        # Messages that were not written yet, in the form of records.
+        # Messages that were not written yet, encoded as records.
         self._open_chunk = bytearray()
         # Index of the open chunk: for each channel log time, offset, log time, offset, ...
         self._entries: dict[int, list[int]] = {}
@@ -189,8 +189,8 @@ class McapWriter:
         if not self._open_chunk:
             return 0
         messages = self.messages - self._chain.messages
-        # An index entry has 16 bytes, the index of a channel 25 bytes more, and the head of the
-        # chunk and its entry in the summary less than 200 bytes.
+        # An index entry has 16 bytes, the index of a channel has 25 more bytes, and the head of
+        # the chunk and its entry in the summary together have less than 200 bytes.
         index_bytes = 16 * messages + 25 * len(self._entries) + 200
         # Zstandard may expand data that it cannot compress, by less than 1/128.
         data_bytes = len(self._open_chunk) + len(self._open_chunk) // 128
@@ -326,7 +326,7 @@ class McapWriter:
         """Ends the open chunk, if it contains messages, and flushes the stream.
 
         All messages so far can then be read from the file, even if the program ends now.
-        Frequent calls make small chunks, which are compressed less well.
+        Frequent calls produce small chunks, which compress less well.
         """
         if self._open_chunk:
             self._close_chunk()
@@ -358,8 +358,8 @@ class McapWriter:
            and the compressed messages.
         2. Message index, one for each channel with messages in the chunk: the log time of each
            message, and its offset in the unpacked chunk.
-        3. Chunk index: where the chunk and its message indexes are. It is only added to the
-           summary, which `finish` writes at the end of the file.
+        3. Chunk index: the offsets of the chunk and its message indexes. It is only added to
+           the summary, which `finish` writes at the end of the file.
 
         The messages are also added to the running digest, a checksum of all messages.
         """
@@ -432,7 +432,7 @@ class McapWriter:
         self._stream.flush()
 
     def _pack_statistics(self) -> bytes:
-        """Encodes the MCAP record from which readers learn the size of the log.
+        """Encodes the MCAP record with the statistics of the file.
 
         It contains the numbers of all kinds of records, and the first and last arrival time.
         """

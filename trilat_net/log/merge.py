@@ -1,13 +1,13 @@
 """Merges the parts of a session's log into one log.
 
 A log contains the messages of a session, a joint run of several arms. It has several files, the
-parts, if the recorder split it, or if several recorders recorded the session after one another
+parts, if the recorder split it, or if several recorders recorded the session one after another
 or at the same time.
 
 Invariant:
     - A message that several parts contain is written once.
     - Parts of different sessions are refused. Parts that contain different messages with the
-      same number are refused as well.
+      same number are also refused.
     - The order in which the user names the parts does not matter.
 """
 
@@ -40,8 +40,8 @@ def merge_parts(parts: Sequence[LogContents]) -> LogContents:
         The contents of all parts, as if they were one file.
 
     Raises:
-        LogError: The parts belong to different sessions or disagree on a message, or a part
-            cannot be read.
+        LogError: The parts belong to different sessions or contain different versions of a
+            message, or a part cannot be read.
     """
     if len(parts) == 1:
         return parts[0]
@@ -88,7 +88,7 @@ def _check_same_session(first: LogContents, other: LogContents) -> None:
     ]
     if differences:
         session = f"the session in {first.source}: {'; '.join(differences)}"
-        raise LogError(f"{other.source}: is not a part of {session}")
+        raise LogError(f"{other.source} is not a part of {session}")
 
 
 def _check_digests(parts: Sequence[LogContents]) -> None:
@@ -108,13 +108,13 @@ def _check_digests(parts: Sequence[LogContents]) -> None:
             continue
         if previous_part.metadata[DIGESTS].get("records") != stated_digest:
             raise LogError(
-                f"{part.source}: is not the continuation of {previous_part.source}: it was "
+                f"{part.source} is not the continuation of {previous_part.source}: it was "
                 "recorded after another file"
             )
 
 
 def _first_time(part: LogContents) -> tuple[int, str]:
-    """Returns a sorting key for parts: the first message's arrival time, and the name."""
+    """Returns a sort key for parts: the arrival time of the first message, and the name."""
     first_times = [channel.log_ns[0] for channel in part.channels.values() if channel.log_ns]
     return min(first_times, default=1 << 63), part.source
 
@@ -210,7 +210,8 @@ def _merge_channel(topic: str, parts: Sequence[LogContents]) -> ChannelMessages:
     for part in topic_parts:
         channel = part.channels[topic]
         payloads = channel.payloads
-        # Messages are compared with earlier parts only: a part may repeat its own messages.
+        # Messages are compared only with earlier parts, because a part may repeat its own
+        # messages.
         new_indices: dict[Hashable, int] = {}
         keys = _list_keys(topic, payloads, part.source)
         for number, (key, payload) in enumerate(zip(keys, payloads, strict=True)):
@@ -255,7 +256,8 @@ def _list_keys(topic: str, payloads: Sequence[bytes], source: str) -> Sequence[H
                 events = [decode(payload, Event, READABLE) for payload in payloads]
                 keys: list[Hashable] = []
                 for event, payload in zip(events, payloads, strict=True):
-                    # Events have no number before version 3. Then their content is the key.
+                    # Events have no number before version 3. In this case, their content is the
+                    # key.
                     keys.append((event.boot, event.n) if event.n >= 0 else payload)
                 return keys
         statistics = [decode(payload, RecorderStats, READABLE) for payload in payloads]

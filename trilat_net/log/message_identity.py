@@ -27,9 +27,9 @@ AnyMessage = State | LinkStats | Event | RecorderStats
 
 
 class MessageIdentity(NamedTuple):
-    """Who sent a network message, in which channel, with which number, and when.
+    """Sender, channel, number and sending time of a network message.
 
-    Lost and repeated messages are recognised by this.
+    Lost and repeated messages are recognised by this identity.
 
     Attributes:
         sender: Name of the member of the session, a site (arm controller) or the recorder, that
@@ -51,7 +51,7 @@ class MessageIdentity(NamedTuple):
 
     @classmethod
     def of_message(cls, message: AnyMessage, rate_hz: int) -> "MessageIdentity":
-        """Finds out from a message who sent it, in which channel and with which number.
+        """Determines the sender, the channel and the number of a message from its content.
 
         Args:
             message: The decoded message.

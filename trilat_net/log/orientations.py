@@ -4,7 +4,7 @@ A log contains an orientation as a rotation vector: the axis of a rotation times
 which is at most half a turn. When the angle passes half a turn, as it does for a tool that
 points down, the vector jumps by a whole turn, although the orientation changes smoothly. Adding
 whole turns to the vector cannot avoid these jumps for every motion. Time series that leave the
-program therefore have one of these forms:
+program therefore have one of these formats:
 
 - Unit quaternions w, x, y, z. A quaternion and its negative are the same orientation. The sign
   is chosen so that each quaternion is nearest to the previous one, and the first has w >= 0. A
@@ -46,7 +46,7 @@ def compute_quaternion_parts(turns: Array) -> tuple[Array, Array]:
     """
     angle = np.linalg.norm(turns, axis=1, keepdims=True)
     w = np.cos(0.5 * angle)
-    # This is sin(a / 2) / a, also for a = 0, because sinc(x) = sin(pi x) / (pi x).
+    # This is sin(a / 2) / a, even for a = 0, because sinc(x) = sin(pi x) / (pi x).
     sine_by_angle = 0.5 * np.sinc(angle / (2.0 * np.pi))
     return w, sine_by_angle * turns
 
@@ -71,7 +71,7 @@ def align_signs(quaternions: Array) -> Array:
     """Chooses the signs of unit quaternions so that a time series of them does not jump.
 
     A quaternion and its negative are the same orientation. Each quaternion gets the sign with
-    which it is nearest to the previous one. The sign of the first one stays.
+    which it is nearest to the previous one. The sign of the first quaternion is kept.
 
     Args:
         quaternions: The quaternions in the order of time, shape (K, 4).
@@ -123,8 +123,8 @@ def compute_matrix_columns(turns: Array) -> Array:
 def expand_poses(x: Array) -> Array:
     """Replaces the rotation vectors of poses by six numbers.
 
-    An environment for training observes poses in this form, and a user's hand gets the same
-    numbers from `HandView`:
+    An environment for training observes poses in this format, and a user's operator class
+    receives the same numbers from `HandView`:
 
     >>> import numpy as np
     >>> quarter_turn = np.array([0.5, 0.0, 0.2, 0.0, 0.0, np.pi / 2])
@@ -194,7 +194,7 @@ def compute_continuous_vectors(turns: Array) -> Array:
 
 
 class QuaternionSigns:
-    """Chooses the signs of unit quaternions that arrive one after another, so that none jumps.
+    """Chooses the signs of unit quaternions that arrive one after another, to avoid jumps.
 
     A quaternion and its negative are the same orientation. Each quaternion gets the sign with
     which it is nearest to the previous one, and the first one gets the sign with w >= 0.
@@ -209,7 +209,7 @@ class QuaternionSigns:
         self._last: tuple[float, ...] = ()
 
     def align(self, quaternion: Sequence[float]) -> tuple[float, ...]:
-        """Chooses the sign of the next quaternion in a time series, so that it does not jump.
+        """Chooses the sign of the next quaternion in a time series, to avoid a jump.
 
         The sign is the one with which the quaternion is nearest to the quaternion of the
         previous call. In the first call, it is the sign with w >= 0.

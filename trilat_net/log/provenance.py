@@ -1,6 +1,7 @@
 """Collects the versions of the program and its packages, which are stored in every log.
 
-With them, a run can be repeated later with the same program (law L5 of docs/develop/design.md).
+With these versions, a run can be repeated later with the same program (law L5 of
+docs/develop/design.md).
 
 Invariant:
     - The provenance contains versions, commit and platform, but no path, time or host name, so
@@ -27,7 +28,7 @@ def _run_git(*arguments: str) -> str | None:
         *arguments: Arguments of git, such as "rev-parse", "HEAD".
 
     Returns:
-        The output. None if the source tree is no checkout, or if git fails.
+        The output. None if the source tree is not a git checkout, or if git fails.
     """
     root = Path(__file__).resolve().parents[2]
     if not (root / ".git").exists():

@@ -67,8 +67,8 @@ def decode_ints(payloads: Sequence[bytes], *fields: str) -> Ints:
         fields: Names of F integer fields of `State`.
 
     Returns:
-        The values, shape (K F,). The F values of the first record come first, in the order of
-        `fields`, then those of the second record, and so on.
+        The values, shape (K F,): the F values of the first record in the order of `fields`,
+        then the values of the second record, and so on.
     """
     values = _decode_fields(payloads, *fields)
     if len(fields) > 1:
@@ -156,7 +156,7 @@ def decode_per_peer(
         For each peer the integers of all records, shape (K,).
     """
     # A struct with an attribute per peer is decoded faster than a dict. The name of a peer need
-    # not be a valid identifier, so that the attributes have other names.
+    # not be a valid identifier, so the attributes have other names.
     attributes = [f"peer{n}" for n in range(len(peers))]
     peer_struct = msgspec.defstruct(
         "Peers",
@@ -167,7 +167,7 @@ def decode_per_peer(
     decoder = _make_decoder({field: peer_struct})
     paths = [f"{field}.{attribute}" for attribute in attributes]
     get_numbers = attrgetter(*paths)
-    # Nothing is decoded yet: the iterators are consumed in `_to_array`.
+    # Nothing is decoded yet, because the iterators are consumed in `_to_array`.
     records = map(decoder.decode, payloads)
     values: Iterator[Any] = map(get_numbers, records)
     if len(peers) > 1:
@@ -228,7 +228,7 @@ def _find_decoder(
 
     Args:
         fields: Names of the fields.
-        layout: Lengths that vectors must have. None accepts all lengths.
+        layout: Lengths that vectors must have. If None, all lengths are accepted.
     """
     types = {field.name: field.type for field in msgspec.structs.fields(State)}
     types.update(_TYPES)
@@ -287,8 +287,8 @@ def _find_error(
 ) -> WireError:
     """Finds the first payload that is not a valid record, to name the reason in an error.
 
-    The fast decoding of single fields cannot tell which record was wrong. Therefore the records
-    are decoded once more as a whole.
+    The fast decoding of single fields does not show which record was wrong. Therefore the
+    records are decoded again as a whole.
 
     Args:
         payloads: The encoded records.

@@ -8,10 +8,10 @@ Invariant:
     - Everything that can be read is copied byte for byte: messages with their times and
       numbers, metadata and attachments. Everything else is left out and reported.
     - Nothing is invented. A message of a trilat-net log is copied only if a valid checksum
-      covers it or if its content proves it (`content_check`), and only from a chunk that is in
-      its original place (`recovery_survey`).
-    - The new file is never empty: if nothing can be saved, no file is created.
-    - The new file is read once more. If no command of trilat-net can open it, this is reported.
+      covers it or if its content proves that it is genuine (`content_check`), and only from a
+      chunk that is in its original place (`recovery_survey`).
+    - The new file is never empty. If nothing can be saved, no file is created.
+    - The new file is read again. If no command of trilat-net can open it, this is reported.
     - The source file is not changed.
 """
 
@@ -70,7 +70,7 @@ _REGENERATED = frozenset(
     {Opcode.MESSAGE_INDEX, Opcode.CHUNK_INDEX, Opcode.ATTACHMENT_INDEX, Opcode.STATISTICS}
     | {Opcode.METADATA_INDEX, Opcode.SUMMARY_OFFSET, Opcode.DATA_END, Opcode.FOOTER}
 )
-"""Kinds of records that the writer computes from the content; losing them loses no data."""
+"""Kinds of records that the writer computes from the content. Losing them loses no data."""
 
 
 @dataclass(repr=False)
@@ -111,7 +111,8 @@ class Recovery(Result):
     def lossless(self) -> bool:
         """True if the recovered file contains everything that the damaged file contains.
 
-        False if some bytes could not be read or assigned. `lost` then describes them.
+        The value is False if some bytes could not be read or assigned. `lost` then describes
+        them.
         """
         return not self.lost
 
@@ -151,7 +152,7 @@ class Recovery(Result):
         self.lost_bytes += size
 
     def facts(self) -> dict[str, str]:
-        """Returns what was recovered and lost as strings by name, for the recovered file.
+        """Returns the recovered data and the losses as strings by name, for the recovered file.
 
         They are stored as metadata of this file: the source file, the losses and the missing
         records. A reader can thus recognise it as a recovered log.
@@ -214,13 +215,13 @@ def recover(
     """
     path = Path(file)
     if not path.name:
-        raise LogError(f"{path}: cannot be read: Is a directory")
+        raise LogError(f"{path} cannot be read: Is a directory")
     output = recovered_path(path) if out is None else Path(out)
     if not output.name:
-        raise UsageError(f"{output}: is a directory; name a file with -o")
+        raise UsageError(f"{output} is a directory; name a file with -o")
     if output.exists() and path.exists() and output.samefile(path):
         raise UsageError(
-            f"{output}: is the source file, which is never changed; choose another name with -o"
+            f"{output} is the source file, which is never changed; choose another name with -o"
         )
     try:
         with open_regular(path) as stream:
@@ -229,7 +230,7 @@ def recover(
         if error.filename not in (None, str(path)):
             raise describe_write_error(Path(error.filename), error) from None
         raise LogError(
-            f"{path}: cannot be read: {error.strerror}{describe_unfinished(path)}"
+            f"{path} cannot be read: {error.strerror}{describe_unfinished(path)}"
         ) from None
 
 
@@ -346,17 +347,18 @@ class _FileCopy:
         library = f"{survey.library or 'unknown'}, recovered by trilat-net {version}"
         self._out = McapWriter(file, library, survey.profile)
         self._accounts = SessionAccounts.open(survey.metadata, survey.attachments)
-        # Check of messages by their content. None without a readable scenario, which the check
-        # needs, and for files of other programs.
+        # Check of messages by their content. None for files of other programs, and if there is
+        # no readable scenario, which the check needs.
         self._content = _create_content_check(survey, self._accounts)
-        # Offset of the record that ends the data. Until it is read, all records are data.
+        # Offset of the record that ends the data. Until this record is read, all records are
+        # data.
         self._data_end = reader.size + 1
         self.is_session_log = survey.is_session_log
         # True until a message, metadata or an attachment is copied.
         self._is_empty = True
         # Schemas and channels of the source, by opcode and number.
         self._definitions: dict[tuple[int, int], Any] = {}
-        # Numbers that the source defines in two ways.
+        # Numbers that the source defines in two different ways.
         self._contradicted: set[int] = set()
         # Schema number in the new file, by the number in the source.
         self._new_schemas: dict[int, int] = {}
@@ -364,7 +366,8 @@ class _FileCopy:
         self._session_schemas: dict[str, int] = {}
         # Channel number in the new file, and topic, by the number in the source.
         self._new_channels: dict[int, tuple[int, str]] = {}
-        # The same by topic, for the channels of the session's members.
+        # Channel number in the new file, and topic, by topic, for the channels of the session's
+        # members.
         self._new_topics: dict[str, tuple[int, str]] = {}
         # Topics of channels whose schema is missing.
         self._topics_without_schema: list[str] = []
@@ -443,8 +446,8 @@ class _FileCopy:
     def _report_damage(self, damage: Damage) -> None:
         """Adds a damaged part of the file to the losses that the report on the recovery states.
 
-        A part after the end of the data contains only the index, which is rebuilt, and is no
-        loss.
+        A damaged part after the end of the data is not a loss, because it contains only the
+        index, which is rebuilt.
         """
         if damage.offset <= self._data_end:
             self._result.add_loss(str(damage), damage.length)
@@ -462,7 +465,7 @@ class _FileCopy:
         content = record.content
         opcode = frame.opcode
         if opcode == Opcode.HEADER or opcode in mcap_records.DEFINITIONS:
-            return  # the survey has read them already
+            return  # already read by the survey
         if opcode in _REGENERATED:
             self._check_regenerated(frame, content)
         elif opcode == Opcode.CHUNK:
@@ -477,7 +480,7 @@ class _FileCopy:
             raise UnreadableRecord(f"this record has the unknown kind {opcode}")
 
     def _copy_metadata(self, content: bytes) -> None:
-        """Copies a named dictionary from the damaged file, unless it is written anew anyway.
+        """Copies a named dictionary from the damaged file, unless it is written again later.
 
         Raises:
             UnreadableRecord: The metadata are those of another session.
@@ -494,8 +497,8 @@ class _FileCopy:
     def _copy_attachment(self, content: bytes) -> None:
         """Copies a file that is attached to the log, such as the scenario.
 
-        A damaged attachment is renamed with the suffix `_DAMAGED_SUFFIX`. If it kept its name,
-        nobody would notice the damage, because the writer adds a valid checksum.
+        A damaged attachment is renamed with the suffix `_DAMAGED_SUFFIX`. If the attachment
+        kept its name, nobody would notice the damage, because the writer adds a valid checksum.
         """
         entry = mcap_records.parse_record(Opcode.ATTACHMENT, content)
         name = entry.name
@@ -542,16 +545,16 @@ class _FileCopy:
             )
 
     def _copy_chunk(self, chunk: ScannedRecord) -> None:
-        """Copies the records of an unpacked chunk, if there is evidence that they are right.
+        """Copies the records of an unpacked chunk, if there is evidence that they are correct.
 
         A chunk is a block of records, mostly with a checksum. There are four cases:
 
-        - The chunk has a checksum, which is valid: its records are copied. If the log contains
-          its scenario, the first messages must also belong to the run of the log.
+        - The chunk has a valid checksum: its records are copied. If the log contains its
+          scenario, the first messages must also belong to the run of the log.
         - There is no checksum, but the scenario can be read: each message is checked by its
           content (`content_check`).
         - There is no checksum, and the log of a session has lost its scenario: nothing shows
-          that the messages are right, and none is copied.
+          that the messages are correct, so no message is copied.
         - There is no checksum, and the file is from another program, which need not write
           checksums: its records are copied.
 
@@ -675,8 +678,8 @@ class _FileCopy:
 
         In the log of a session, a message states its sender, its number and its time, which
         must agree with its channel, with the previous messages and with the scenario
-        (`content_check`). Messages of other programs state nothing of this kind. Of them, only
-        the arrival time is compared with the time range of the chunk.
+        (`content_check`). Messages of other programs contain no such statements. For these
+        messages, only the arrival time is compared with the time range of the chunk.
 
         Args:
             opcode: Kind of the record.
@@ -744,7 +747,7 @@ class _FileCopy:
         self._define(opcode, content)
 
     def _define(self, opcode: int, content: bytes) -> None:
-        """Stores a definition of a message format (schema) or topic (channel) until needed.
+        """Stores the definition of a message format (schema) or topic (channel) for later use.
 
         If the file defines the same number twice, the first definition counts.
 
@@ -769,11 +772,11 @@ class _FileCopy:
     def _find_channel(self, number: int, payload: bytes) -> tuple[int, str] | None:
         """Finds the channel of the new file for a message of the source, or registers it.
 
-        In the log of a session, the first message of a channel decides, because a message names
-        its sender and its kind. The definition of the channel is less reliable, because no
-        checksum covers it in a file that was not finished. If the two contradict each other,
-        the channel is defined anew from the message, and its topic is noted as a loss. The
-        further messages of the channel then go to the same channel.
+        In the log of a session, the first message of a channel determines the channel, because
+        a message names its sender and its kind. The definition of the channel is less reliable,
+        because no checksum covers it in a file that was not finished. If the two contradict
+        each other, a new channel is defined from the message, and its topic is noted as a loss.
+        Further messages of the channel are then assigned to the same new channel.
 
         Args:
             number: Channel number in the source.
@@ -841,7 +844,7 @@ class _FileCopy:
         return self._register_copy(number, new_number, definition.topic)
 
     def _open_session_channel(self, topic: str) -> tuple[int, str]:
-        """Defines a channel of the session in the recovered file, as `LogWriter` would do it.
+        """Defines a channel of the session in the recovered file, as `LogWriter` does.
 
         Args:
             topic: Topic of the channel.
@@ -885,19 +888,19 @@ class _FileCopy:
         if self._content is not None and self._content.owns_channel(topic):
             self._new_topics.setdefault(topic, channel)
         if self._accounts is not None:
-            # Missing messages are then noticed even if no message of the channel is left.
+            # Missing messages are then noticed even if all messages of the channel are lost.
             self._accounts.open_channel(topic)
         return channel
 
     def _copy_torn_chunk(self, torn: Damage) -> None:
         """Copies the messages that can be read from the last chunk, if it is incomplete.
 
-        The rest of the chunk is added to the losses, or the whole record if it is not a chunk.
-        An incomplete index is no loss, because the index of the new file is computed again.
+        The rest of the chunk, or the whole record if it is not a chunk, is added to the losses.
+        An incomplete index is not a loss, because the index of the new file is computed again.
 
         Args:
-            torn: The part from which the end of the file is missing: the last record, which is
-                incomplete. Its length is 0 if the file ends between two records.
+            torn: The incomplete last record of the file. Its length is 0 if the file ends
+                between two records.
         """
         # The first byte of a record states its kind.
         opcode = int.from_bytes(self._scanner.read(torn.offset, 1), "little")
@@ -925,9 +928,9 @@ class _FileCopy:
         """Copies the records of an incomplete chunk that can still be unpacked.
 
         The chunk was compressed in blocks, which can be unpacked one after another up to the
-        place where the file ends. The checksum of the chunk covers the missing part as well, so
-        that it is of no use. Therefore each message must be checked by its content. In the log
-        of a session this requires the scenario.
+        place where the file ends. The checksum of the chunk also covers the missing part, so it
+        cannot be used. Therefore each message must be checked by its content. In the log of a
+        session this requires the scenario.
 
         Args:
             offset: Offset of the chunk in the source file.
@@ -951,7 +954,7 @@ class _FileCopy:
     def _report_final_losses(self) -> None:
         """Adds the losses that are known only after the whole damaged file was read.
 
-        For example, messages of a channel that no record defines, because a definition may
+        Messages of a channel without a definition are an example, because a definition may
         follow its messages.
         """
         result = self._result
@@ -969,8 +972,8 @@ class _FileCopy:
             )
         self._report_missing_head()
 
-        # The file states how many messages it contains. A difference is a loss of its own only
-        # if no other loss explains it.
+        # The file states how many messages it contains. A difference is reported as a separate
+        # loss only if no other loss explains it.
         stated = self._survey.count
         if stated is not None and self._out.messages < stated and result.lossless:
             missing = stated - self._out.messages
@@ -1000,7 +1003,7 @@ class _FileCopy:
     def _finish(self) -> None:
         """Finishes the new file, and the result of the recovery, after all messages are copied.
 
-        The following is written at the end of the new file:
+        These are written at the end of the new file:
 
         - the accounts: how many messages of each channel are in the new file, and how many are
           missing (only if the source is the log of a session with a readable scenario),
@@ -1048,7 +1051,7 @@ class _FileCopy:
         """Returns True if the message counts in the source differ from those of its records.
 
         They can be compared only if the source is a finished log in one file without losses.
-        Otherwise they may include records that the new file lacks.
+        Otherwise the counts may include records that the new file lacks.
 
         Args:
             accounts: Counts that were computed from the copied messages.
@@ -1074,11 +1077,11 @@ class _FileCopy:
         A definition is stored twice: among the data, and in the summary at the end of the file.
         If it was damaged among the data, but is intact in the summary, the second digest
         differs, although no message was changed. The recovery then uses the intact definition,
-        so that the source counts as damaged (OPEN) and not as changed by somebody.
+        so the source counts as damaged (OPEN) and not as changed by somebody.
 
         Returns:
-            The result, see `DigestState`. OPEN also if the file lacks its first bytes, which
-            mark it as an MCAP file.
+            The result, see `DigestState`. It is also OPEN if the file lacks its first bytes,
+            which mark it as an MCAP file.
         """
         has_first_mark = self._scanner.begins
         if not has_first_mark:

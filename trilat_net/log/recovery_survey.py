@@ -12,11 +12,12 @@ Invariant:
     - If a file contains several sessions and scenarios, the survey selects a session and a
       scenario that refer to each other. A session whose start time contradicts all messages
       with a checksum belongs to another log and is rejected. In simulated time all sessions
-      start at 0. There, the numbers that identify the starts of the sites are compared instead.
+      start at 0. In this case, the numbers that identify the starts of the sites are compared
+      instead.
     - A chunk with a valid checksum may still be outdated, from another file, or in the wrong
       place. In a finished file, the index shows which chunks belong to it. In an unfinished
-      file, the times of the chunks show this, because they never decrease. The index has a
-      checksum of its own.
+      file, the times of the chunks show this, because they never decrease. The index has its
+      own checksum.
 """
 
 import hashlib
@@ -59,19 +60,19 @@ class RecoverySurvey:
         profile: Profile in the header of the MCAP file.
         library: Program that wrote the file, as stated in the header.
         definitions: Schemas and channels that are defined outside of chunks.
-        metadata: Metadata by name. If a name occurs repeatedly, the last one counts. Of several
-            sessions, the one that names the scenario counts.
-        attachments: Attachments by name. If a name occurs repeatedly, the first one counts. Of
-            several scenarios, the one that the session names counts.
+        metadata: Metadata by name. If a name occurs repeatedly, the last entry counts. Of
+            several sessions, the one that names the scenario counts.
+        attachments: Attachments by name. If a name occurs repeatedly, the first entry counts.
+            Of several scenarios, the one that the session names counts.
         count: Number of messages that the file states. None if no valid checksum covers it.
         is_redefined: True if a definition among the data differs from that in the summary at
             the end of the file, which a checksum covers.
-        is_foreign_session: True if the session that the file names is not that of its messages.
+        is_foreign_session: True if the file names another session than its messages.
         misplaced: Description of the problem for each chunk that is not in its original place,
             by the offset of the chunk.
         is_chunked: True if the file contains chunks.
         is_session_log: True if anything in the file shows that it is the log of a session.
-        why_empty: Reason why there is nothing to recover. Empty if there is something.
+        why_empty: Reason why there is nothing to recover. Empty if something can be recovered.
     """
 
     def __init__(self, scanner: mcap_records.RecordScanner) -> None:
@@ -147,7 +148,7 @@ class RecoverySurvey:
         has_messages = False
         for record in scanner.scan():
             if isinstance(record, mcap_records.Damage):
-                continue  # the copy reports it
+                continue  # the copying step reports the damage
             frame = record.frame
             has_messages |= frame.opcode in (Opcode.CHUNK, Opcode.MESSAGE)
             if frame.opcode in mcap_records.DEFINITIONS:
@@ -164,7 +165,7 @@ class RecoverySurvey:
         self._choose_definitions(definitions_by_kind)
 
         if summary_offset == scanner.size:
-            # The summary is missing or damaged, so that its statements are not used.
+            # The summary is missing or damaged, so its statements are not used.
             self.count = None
             self._chunk_indexes = {}
         return has_messages
@@ -239,8 +240,8 @@ class RecoverySurvey:
         scenario is in the file is chosen, together with that scenario.
 
         If there is no such pair, the first session and the first scenario that a checksum
-        covers are chosen. A checksum of 0 covers nothing: a page of zeros in the file may have
-        replaced the original one.
+        covers are chosen. A checksum of 0 covers nothing, because a page of zeros may have
+        replaced the original page of the file.
         """
         self.attachments.pop(SCENARIO, None)
         scenarios_by_digest = {
@@ -268,9 +269,9 @@ class RecoverySurvey:
         starts of the processes. Only chunks with a checksum are evidence against the named
         session. Any chunk may show that the file is the log of a session at all.
 
-        If the epochs differ, the session is another one with, as a rule, another name. If only
-        the boots differ, as in simulated time, where all epochs are 0, it may have the same
-        name.
+        If the epochs differ, the named session is a different one, usually with a different
+        name. If only the boots differ, as in simulated time, where all epochs are 0, the two
+        sessions may have the same name.
         """
         covered_origins = MessageOrigins(set(), set())
         for frame, head in self._chunks[:_SAMPLED_CHUNKS]:
@@ -306,7 +307,7 @@ class RecoverySurvey:
             session: Metadata of the foreign session.
             is_renamed: True if the session of the messages has another name. All definitions of
                 channels with the name of the foreign session are then foreign. If the names may
-                be equal, only those in the same page as the foreign metadata are removed.
+                be equal, only definitions in the same page as the foreign metadata are removed.
         """
         self.is_foreign_session = True
         foreign_pages = {
@@ -321,8 +322,9 @@ class RecoverySurvey:
         def is_genuine(definition: Definition) -> bool:
             """Returns True if a definition may belong to the session of the messages.
 
-            Definitions under a checksum do. Others are foreign if they name another session,
-            and either lie in a part of the disk with foreign data or the session was renamed.
+            Definitions with a valid checksum do. Other definitions are foreign if they name the
+            rejected session, and if they lie in a page with foreign data or the session was
+            renamed.
             """
             offset = self._uncovered_offsets.get(definition)
             if offset is None:  # a checksum covers the definition
@@ -357,7 +359,7 @@ class RecoverySurvey:
     def _find_unnamed_chunks(self) -> dict[int, str]:
         """Finds the chunks (blocks of messages) that the index of the file does not name.
 
-        Such a chunk may come from an older file at the same place of the disk. If bytes were
+        Such a chunk may come from an older file in the same part of the disk. If bytes were
         inserted or removed, chunks have other offsets than the index states. Therefore a chunk
         is also accepted if the index names a missing chunk with the same sizes and times at
         another offset.
@@ -437,7 +439,8 @@ def _find_longest_ordered(spans_ns: Sequence[tuple[int, int]]) -> set[int]:
     Returns:
         The indices of the spans that belong to the sequence.
     """
-    # For each length, the increasing sequence of that length with the earliest last span.
+    # Entry n is the last index of the increasing sequence of length n + 1 with the earliest
+    # last span.
     last_spans: list[tuple[int, int]] = []
     last_indices: list[int] = []
     # For each index, the index before it in its sequence. It is -1 for the first one.

@@ -3,8 +3,8 @@
 A log contains two SHA-256 digests: one of all messages in order, and one of everything that
 describes the messages (metadata, scenario, schemas and channels). If a log has several parts,
 each part repeats the digest of the previous one. Therefore the digests form a chain. The
-digests reveal alterations. They cannot show that a whole file was written anew with new
-digests. Signatures protect against that (`log_signature`).
+digests reveal alterations. They cannot show that a whole file was rewritten with new digests.
+Signatures protect against this (`log_signature`).
 
 Invariant:
     - The digests depend on the records of the file, and not on their division into chunks or on
@@ -68,7 +68,7 @@ class Integrity(NamedTuple):
         """False only if something in the file was changed or removed after it was recorded.
 
         A file without digests, or a file that was not finished, cannot be compared. It passes,
-        because nothing speaks against it.
+        because there is no evidence against it.
         """
         return self.state is not DigestState.CHANGED
 
@@ -85,12 +85,12 @@ class RunningDigest:
     def __init__(self) -> None:
         self.messages = 0
         self._records = hashlib.sha256()
-        # A digest of each record that describes the messages. A set, because such a record may
-        # be repeated, and because the order of these records does not matter.
+        # A digest of each record that describes the messages. The digests form a set, because
+        # such a record may be repeated, and because the order of these records does not matter.
         self._descriptions: set[bytes] = set()
 
     def add_records(self, data: bytes | bytearray | memoryview, messages: int) -> None:
-        """Updates the hash of all messages of a file by further ones, in the order of the file.
+        """Updates the hash of a file's messages with further messages, in the file's order.
 
         Args:
             data: The messages with their headers, as in an unpacked chunk of the MCAP file.
@@ -128,7 +128,7 @@ class RunningDigest:
     def judge(
         self, metadata: Mapping[str, Mapping[str, str]], *, finished: bool, damaged: bool
     ) -> Integrity:
-        """Decides whether a file was changed, by the hashes that the file itself contains.
+        """Decides from the hashes that a file contains whether the file was changed.
 
         Args:
             metadata: All metadata of the file, by name. They contain its digests.
@@ -157,7 +157,8 @@ class RunningDigest:
             )
             return Integrity(DigestState.INTACT, agrees)
 
-        # If a part of the file is damaged, messages are missing without any change.
+        # If a part of the file is damaged, messages are missing although nobody changed the
+        # file.
         lacks_messages = (
             stated.get("about") == computed["about"]
             and stated.get("messages") != computed["messages"]
@@ -193,4 +194,4 @@ _COVERED = {
     "records": "its messages",
     "about": "its metadata, scenario, schemas or channels",
 }
-"""What has changed if an entry of the digests differs, as a noun phrase."""
+"""Part of the log that has changed if an entry of the digests differs, as a noun phrase."""

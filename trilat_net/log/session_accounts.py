@@ -5,7 +5,7 @@ A channel contains the numbered messages of one kind and sender. `SessionAccount
 periods exist: when an arm began, which periods it skipped, and when it ended.
 
 Invariant:
-    - To count the messages of a file, only the events are decoded.
+    - Only the events of a file are decoded, because they suffice to count its messages.
     - If a log is divided into several files, a later file is counted from its first message on.
 """
 
@@ -70,7 +70,7 @@ class SessionAccounts:
         self._end_ticks: dict[str, int] = {}
         self._numbered_channels = SITE_CHANNELS if events else (topics.STATE, topics.LINK)
 
-        # Counts of the messages, by topic. That of events is the one of the newest start.
+        # Counts of the messages, by topic. The account of events is that of the newest start.
         self._accounts: dict[str, Account] = {}
         # Accounts of events, by topic and by the boot, a random number that identifies a start
         # of the member. Every start numbers its events from 0.
@@ -87,7 +87,7 @@ class SessionAccounts:
     def open_channel(self, topic: str) -> None:
         """Starts to count the messages of a channel, before its first message has arrived.
 
-        If no message ever arrives, the losses are noticed nevertheless. Nothing happens if the
+        The losses are then noticed even if no message ever arrives. Nothing happens if the
         topic does not belong to the session, or if the messages of its channel are not
         numbered.
 
@@ -135,11 +135,11 @@ class SessionAccounts:
         """Counts an event, and evaluates what it states about the ticks of a site.
 
         Each start of a site (arm controller) numbers its events from 0. Therefore each start
-        has an account of its own, the object that counts its events. The boot in the event, a
-        random number, identifies the start. The first start uses the account that
-        `open_channel` created, and `_accounts` refers to that of the newest start. If there are
-        more than `_MAX_STARTS` starts, which only a faulty sender causes, the newest account
-        counts the events of all further ones.
+        has its own account, the object that counts its events. The boot in the event, a random
+        number, identifies the start. The first start uses the account that `open_channel`
+        created, and `_accounts` refers to the account of the newest start. If there are more
+        than `_MAX_STARTS` starts, which only a faulty sender causes, the newest account counts
+        the events of all further starts.
 
         Args:
             topic: Topic of the event.
@@ -159,8 +159,8 @@ class SessionAccounts:
         account = starts.get(event.boot, self._accounts[topic])
 
         # In a later part of a log, only the first start can have events in an earlier part. It
-        # is counted from its first event in this part, which `count_message` notes. Any further
-        # start is counted from 0.
+        # is counted from its first event in this part, which `count_message` notes. All further
+        # starts are counted from 0.
         first_account = next(iter(starts.values()))
         if account is first_account:
             is_new = self.count_message(topic, number, account)
@@ -170,12 +170,13 @@ class SessionAccounts:
         return is_new
 
     def apply_event(self, event: Event) -> None:
-        """Learns from an event how many ticks the sites (arm controllers) executed or skipped.
+        """Updates the executed and skipped ticks of the sites (arm controllers) from an event.
 
         These kinds of events state something about ticks, the periods of the control loop:
 
         - "end": number of ticks that the sender executed until it ended. A number beyond the
-          duration of the scenario is reduced to it, because the site has ended in any case.
+          duration of the scenario is reduced to that duration, because the site has certainly
+          ended.
         - "join": first tick of the sender when it joins the running session. An impossible tick
           is ignored, because it would leave a gap up to that tick.
         - `_OVERRUN`: ticks that the sender skipped because it was late.
@@ -205,7 +206,8 @@ class SessionAccounts:
         """Handles the event "join" of a site that joins the running session at a stated tick.
 
         The site (arm controller) published no messages for the ticks (periods of the control
-        loop) before, or none since its previous start ended. These must not count as missing.
+        loop) before that tick, at least since its previous start ended. These messages must not
+        count as missing.
         """
         site = event.member
         published_ticks = self._end_ticks.pop(site, 0)
@@ -217,7 +219,7 @@ class SessionAccounts:
             gap.begin_next_start(first, published)
 
     def _apply_overrun(self, event: Event) -> None:
-        """Notes that a site skipped ticks (control periods), so that no record is missing.
+        """Notes that a site skipped ticks (control periods), so no record of them is missing.
 
         The site reports this in an event, because its computer was too slow.
 
@@ -227,7 +229,7 @@ class SessionAccounts:
                 ticks that have passed. Ranges that are not below this number are not valid, and
                 are ignored.
         """
-        # More than 12 digits are no number of a tick.
+        # The number of a tick has at most 12 digits.
         ranges = re.findall(r"(\d{1,12})-(\d{1,12})", event.command)
         for first_digits, last_digits in ranges:
             first = int(first_digits)
@@ -240,8 +242,8 @@ class SessionAccounts:
     def _apply_last(self, event: Event) -> None:
         """Handles the event that states how many ticks of a peer's earlier start arrived.
 
-        It shows how many messages the peer published at least before it was killed, which
-        decides whether missing ones were lost or never sent.
+        It gives a lower limit of the number of messages that the peer published before it was
+        killed, which shows whether missing messages were lost or never sent.
         """
         site = event.about
         for channel, gap in self._find_start_gaps(site, event.boots.get(site, 0)):
@@ -279,11 +281,11 @@ class SessionAccounts:
         Args:
             topic: Topic of the message.
             number: Number of the message in its channel.
-            account: Object that counts the message. None uses the object that counts the
-                messages of the topic.
+            account: Object that counts the message. If None, the object that counts the
+                messages of the topic is used.
 
         Returns:
-            False if a message with this number had been received before. True otherwise, also
+            False if a message with this number had been received before. True otherwise, even
             for a message that is ignored.
         """
         first_number = self._bases.setdefault(topic, number if self._continued else 0)
@@ -296,7 +298,7 @@ class SessionAccounts:
         """Yields, for each numbered channel of a site, the gap in its numbers before a start.
 
         While a site (arm controller) was away, it published nothing. The gap keeps these
-        numbers from counting as missing. It is created when it is needed first. The number of
+        numbers from counting as missing. It is created when it is first needed. The number of
         gaps is limited, so that forged events with invented starts cannot fill the memory.
 
         Args:
@@ -317,7 +319,7 @@ class SessionAccounts:
                 yield channel, gap
 
     def add_expected_ticks(self, site: str, ticks: int) -> None:
-        """Takes into account that a site executed at least a given number of ticks.
+        """Updates the accounts for a site that executed at least a given number of ticks.
 
         Records and statistics of these ticks (control periods) that have not been received
         count as missing from now on.
@@ -348,8 +350,8 @@ class SessionAccounts:
         Returns:
             A line of text for each topic, such as "/trilat/paper/m1/state", whose last two
             parts are the member (process of a session) and the channel. A member that is not a
-            site (arm controller), such as a recorder, has no line if no message is expected of
-            it.
+            site (arm controller), such as a recorder, has no line if no message is expected
+            from it.
         """
         texts = {}
         for topic, account in self._accounts.items():
@@ -357,8 +359,9 @@ class SessionAccounts:
             is_site = member in self._rates_hz
             if not account.expected and not is_site:
                 continue
-            # Whenever a member is started again, it numbers its events from 0 again, and they
-            # get a new account. `account` is the last one, that of the newest start.
+            # Whenever a member is started again, it numbers its events from 0 again, and these
+            # events get a new account. `account` is the last account, which belongs to the
+            # newest start.
             accounts_of_starts = list(self._starts.get(topic, {}).values())
             earlier_accounts = accounts_of_starts[:-1]
             first_number = self._bases.get(topic, 0)
@@ -382,8 +385,8 @@ class SessionAccounts:
     def list_gaps(self, topic: str) -> list[tuple[int, int]]:
         """Lists the ranges of missing numbers of a topic, over all starts of its sender.
 
-        Events are numbered from 0 again at each start of their sender. Each start then has an
-        account of its own, and all of them are considered.
+        Events are numbered from 0 again at each start of their sender. Each start then has its
+        own account, and all accounts are considered.
 
         Args:
             topic: Topic of the channel.
@@ -400,7 +403,7 @@ class SessionAccounts:
         return gaps
 
     def coverage(self) -> Coverage:
-        """Computes how many ticks of every site were executed, and how many were recorded.
+        """Computes how many ticks every site executed, and how many of them were recorded.
 
         If it is unknown when a site (arm controller) ended, all ticks (control periods) of the
         scenario count as executed.
@@ -421,7 +424,7 @@ class SessionAccounts:
         return Coverage(records, ticks)
 
     def describe_missing(self) -> Iterator[str]:
-        """Tells the user how many records are missing, one line for each site that lacks some.
+        """Describes how many records are missing, with a line for each incomplete site.
 
         Yields:
             A line such as "m1: 3 of 5000 records: ...", with the first ranges of missing ticks
@@ -440,7 +443,7 @@ class SessionAccounts:
 
     @property
     def unknown_ends(self) -> list[str]:
-        """Names of the sites of which the end is unknown.
+        """Names of the sites whose end is unknown.
 
         A site publishes an "end" event when it ends, which states how many ticks (periods of
         the control loop) it executed. For these sites, no such event has been received.

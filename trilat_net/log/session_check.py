@@ -1,13 +1,13 @@
 """Checks a log: its bytes, its completeness, and its agreement with its scenario.
 
-It does the work of `trilat log check`. The bytes of any MCAP file are checked. The content is
-checked only if the file is a log of trilat-net: each message is compared with the place in the
-file where it is stored, with the scenario (the description of the experiment), and with the
-earlier messages. The control laws are not executed again; `trilat_net.execution.verification`
-does that.
+It implements `trilat log check`. The bytes of any MCAP file are checked. The content is checked
+only if the file is a log of trilat-net: each message is compared with the place in the file
+where it is stored, with the scenario (the description of the experiment), and with the earlier
+messages. The control laws are not executed again. That is the task of
+`trilat_net.execution.verification`.
 
 Invariant:
-    - Each check produces one finding, with the places where the check failed.
+    - Each check produces one finding, with the places at which the check failed.
     - Missing messages are listed as ranges of their numbers.
 """
 
@@ -73,8 +73,8 @@ class LogCheckResult(CheckReport):
     Attributes:
         files: Names of the files.
         findings: The result of each check, with the problems that it found.
-        ours: True if the files are a log of trilat-net. Otherwise they are other MCAP files, of
-            which only the bytes were checked.
+        ours: True if the files are a log of trilat-net. Otherwise they are other MCAP files,
+            and only their bytes were checked.
     """
 
     files: list[str]
@@ -85,7 +85,7 @@ class LogCheckResult(CheckReport):
         """Returns the result of all checks, with the keys of `trilat log check --json`.
 
         The entry "kind" is "trilat" for a log of this program and "mcap" for another MCAP file,
-        whose bytes alone were checked.
+        of which only the bytes were checked.
         """
         kind = "trilat" if self.ours else "mcap"
         return {
@@ -124,7 +124,7 @@ def check_file(*files: str | Path, progress: Progress | None = None) -> LogCheck
 
     Args:
         files: The file, or the parts of the log.
-        progress: Function that is called now and then with the number of bytes read and their
+        progress: Function that is called repeatedly with the number of bytes read and their
             total.
 
     Raises:
@@ -142,7 +142,7 @@ def check_file(*files: str | Path, progress: Progress | None = None) -> LogCheck
     except OSError as error:
         name = error.filename or " ".join(map(str, paths))
         hint = describe_unfinished(Path(name))
-        raise LogError(f"{name}: cannot be read: {error.strerror}{hint}") from None
+        raise LogError(f"{name} cannot be read: {error.strerror}{hint}") from None
     return LogCheckResult(
         [path.as_posix() for path in paths], list(check.findings()), check.ours
     )
@@ -262,8 +262,9 @@ class _ChannelCheck:
     def check_message(self, stored: McapMessage, offset: int) -> None:
         """Checks one message: that it can be decoded, is in its place, and has a possible time.
 
-        A message states its sender, its number and its sending time. They must agree with those
-        that the file states for the message. Problems are added to the findings.
+        A message states its sender, its number and its sending time. They must agree with the
+        sender, number and time that the file states for the message. Problems are added to the
+        findings.
 
         Args:
             stored: The message, with its times and its sequence number in the file.
@@ -280,7 +281,8 @@ class _ChannelCheck:
         number = identity.number
         sequence = identity.sequence
         if self.kind == topics.STATS:
-            # The recorder's statistics contain no number. They are counted instead.
+            # The recorder's statistics contain no number. Their position in the channel is used
+            # instead.
             number = self._in_file[message.boot].expected
             sequence = number
         if message.v != self._version:
@@ -397,7 +399,7 @@ def _read_checked(reader: McapReader, structure: FileCheck) -> Iterator[McapMess
 
 
 def _parse_number(about: Mapping[str, str], key: str) -> int:
-    """Returns a number of the metadata. It is 0 if it is missing or is not a number."""
+    """Returns a number from the metadata, or 0 if the entry is missing or not a number."""
     text = about.get(key, "")
     return int(text) if re.fullmatch(r"\d{1,19}", text) else 0
 
@@ -447,7 +449,7 @@ class _SessionCheck:
         Args:
             file: Name of the file.
             stream: The file, opened for reading.
-            progress: Function that is called now and then with the number of bytes read and
+            progress: Function that is called repeatedly with the number of bytes read and
                 their total.
 
         Raises:
@@ -507,19 +509,20 @@ class _SessionCheck:
     def _begin_file(self, reader: McapReader) -> None:
         """Prepares the check of a file, once its metadata and its scenario were read.
 
-        The files of a log must belong to one session, which is checked by its metadata. It is
-        counted how many files there are and how many of them are parts, because a recorder can
-        divide a log into several files. The scenario, the description of the experiment, is
-        checked too. For the first file, the counts of the messages are prepared.
+        The files of a log must belong to one session, which is checked by its metadata. The
+        files, and those that are parts of a log, are counted, because a recorder can divide a
+        log into several files. The scenario, the description of the experiment, is also
+        checked. For the first file, the counts of the messages are prepared.
 
-        Nothing happens if no file so far, including this one, is a log of trilat-net. `ours`
+        Nothing happens if neither this file nor an earlier one is a log of trilat-net. `ours`
         remains False in this case.
 
         Args:
             reader: Reader of the file.
 
         Raises:
-            LogError: The file belongs to another session than the previous files, or to none.
+            LogError: The file belongs to another session than the previous files, or to no
+                session.
         """
         about = reader.metadata.get(SESSION, {})
         has_metadata = {"session", "driver"} <= about.keys()
@@ -527,7 +530,7 @@ class _SessionCheck:
         if not is_session_log:
             if self.ours:
                 raise LogError(
-                    f"{self._file}: is not a part of the same log as the previous files; check "
+                    f"{self._file} is not a part of the same log as the previous files; check "
                     "this file separately"
                 )
             return
@@ -537,7 +540,7 @@ class _SessionCheck:
         )
         if self.ours and is_other_session:
             raise LogError(
-                f"{self._file}: belongs to another session than the previous files; check this "
+                f"{self._file} belongs to another session than the previous files; check this "
                 "file separately"
             )
 
@@ -622,7 +625,7 @@ class _SessionCheck:
 
         Returns:
             The check of the messages, which is continued from the previous file of the log.
-            None if the channel is not one of a member of this session.
+            None if the channel does not belong to a member of this session.
         """
         topic = channel.topic
         shown_topic = topic[:80]  # a damaged file may contain a topic of any length
@@ -633,7 +636,7 @@ class _SessionCheck:
             return None
 
         key = topics.parse_key(topic.removeprefix("/"))
-        # A key with a boot announces the presence of a process, and carries no messages.
+        # A key with a boot only announces the presence of a process, and has no messages.
         is_of_member = (
             key is not None
             and key.channel in CHANNEL_TYPES
@@ -675,7 +678,7 @@ class _SessionCheck:
 
         If the files contain no session of trilat-net, only the checks of the file format are
         yielded. If checksums show that the session was removed from the file, the result
-        "chain" is yielded too.
+        "chain" is also yielded.
         """
         counts = self._counts
         findings = self._findings
@@ -707,7 +710,7 @@ class _SessionCheck:
         yield findings["scenario"].conclude(text)
 
     def _check_sequence(self) -> Finding:
-        """Returns the finding on missing and repeated messages, as the numbers show them.
+        """Returns the finding about missing and repeated messages, which their numbers reveal.
 
         The recorder's statistics are not counted, because they are not numbered.
         """
@@ -831,12 +834,12 @@ class _SessionCheck:
 
 
 def judge_integrity(log: Log) -> Integrity:
-    """Finds out whether a log was changed after it was recorded.
+    """Determines whether a log was changed after it was recorded.
 
     The contents are compared with the digests, the checksums that the log contains. In
     addition, the records (results of control periods) are compared with the message counts and
-    the statistics of the recorder. This also reveals changes to a log that was written anew
-    with new digests.
+    the statistics of the recorder. This also reveals changes to a log that was rewritten with
+    new digests.
 
     Args:
         log: The log.
@@ -860,14 +863,14 @@ def _describe_unexplained_gap(log: Log, site: str) -> str:
 
     The recorder states how many records it received and missed, in the account of the site at
     the end of the file and in its statistics during the recording. Other gaps show that records
-    were removed, or that two logs were joined. Two tests are made:
+    were removed, or that two logs were joined. There are two tests:
 
     1. The account must agree with the records. This is not tested if there is no account (the
        file was not finished), if the file is only a part of a log (the account includes other
        parts), or if the log consists of several files (see below).
-    2. The ticks must be consecutive, except for ticks that the site did not execute, and for as
-       many records as the recorder states to have missed. This is not tested if the digests,
-       checksums of all messages, show that nothing was changed.
+    2. The ticks must be consecutive, except for ticks that the site did not execute, and for
+       the number of records that the recorder states as missing. This is not tested if the
+       digests, checksums of all messages, show that nothing was changed.
 
     Args:
         log: The log.
@@ -894,7 +897,7 @@ def _describe_unexplained_gap(log: Log, site: str) -> str:
             f"{stated_text}, but the file has {counted_text}"
         )
 
-    # Number of ticks between the first and the last record that have no record.
+    # Number of ticks without a record between the first and the last record.
     ticks_without_record = int(ticks[-1] - ticks[0]) + 1 - records if records else 0
     not_executed = min(ticks_without_record, log.absent_ticks(site))
     missing = ticks_without_record - not_executed

@@ -1,4 +1,4 @@
-"""Lists the few facts about an experiment that a log and its recorder need.
+"""Defines the few facts about an experiment that a log and its recorder need.
 
 A recorder stores the messages of a session without understanding the experiment. For example,
 it needs the names of the arms and the duration of the run, but no control law. It therefore
@@ -40,7 +40,7 @@ class SessionScenario(Protocol):
 
     @property
     def duration_s(self) -> float:
-        """Planned duration of the run, in s. It ends earlier if an arm leaves its limits."""
+        """Planned duration of the run, in s. The run is shorter if an arm leaves its limits."""
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -68,13 +68,13 @@ class SessionScenario(Protocol):
     def sites_may_return(self) -> bool:
         """True if sites may leave the session and return while it runs.
 
-        The recorder and the checks of a log then accept that a site begins again.
+        The recorder and the checks of a log then accept that a site starts again.
         """
 
     def ticks(self, site: str) -> int:
         """Returns how many control periods (ticks) a site executes in the whole run.
 
-        It is the duration times the rate of the control loop.
+        The number is the duration times the rate of the control loop.
 
         Args:
             site: Name of the site.

@@ -43,7 +43,7 @@ HEAVY_BYTES = 12 << 20
 _HEAVY_RATIO = 10
 """The records of a site are heavy if their decoded form is larger than `HEAVY_BYTES`, and also
 larger than `_HEAVY_RATIO` times their encoded form. Only few heavy records are kept decoded,
-because a file that was made to do harm could otherwise fill the memory.
+because a malicious file could otherwise fill the memory.
 """
 _HEAVY_BLOCK = 128
 """Number of heavy records that are decoded together."""
@@ -75,7 +75,7 @@ def freeze(value: T) -> T:
 
 
 def compute_task_errors(x: Array, x_des: Array, axes: Sequence[float]) -> Array:
-    """Computes by how much the poses of an end effector differ from their references.
+    """Computes the differences between the poses of an end effector and their references.
 
     The error of a position is x - x_des. The error of an orientation is the rotation vector
     (axis times angle) of the shortest rotation from the reference to the orientation.
@@ -83,7 +83,7 @@ def compute_task_errors(x: Array, x_des: Array, axes: Sequence[float]) -> Array:
     Args:
         x: Positions x, y, z in m, or poses, which are positions and rotation vectors in rad,
             shape (K, m), for K records (results of control periods).
-        x_des: Their references, in the same form, shape (K, m).
+        x_des: Their references, in the same format, shape (K, m).
         axes: For each of the m coordinates, 1 if the site (arm controller) follows its
             reference along that axis. For the other axes it is 0, and the error is set to 0.
 
@@ -113,7 +113,7 @@ def _compute_rotation_errors(rotation: Array, reference: Array) -> Array:
 
     Args:
         rotation: Orientations as rotation vectors, shape (K, 3), in rad.
-        reference: Reference orientations in the same form.
+        reference: Reference orientations in the same format.
 
     Returns:
         Rotation vectors of at most half a turn, shape (K, 3), in rad.
@@ -234,8 +234,8 @@ def _estimate_bytes(state: State) -> int:
 class RecordsByTick(Mapping[int, State]):
     """Read-only mapping from ticks (control periods) to the records of a site (arm controller).
 
-    It is used for long logs: a record is decoded only when it is accessed. If several records
-    have the same tick, the mapping contains the last of them.
+    It is used for long logs, because a record is decoded only when it is accessed. If several
+    records have the same tick, the mapping contains the last of them.
 
     Args:
         states: The K records, in the order of their ticks.
@@ -390,7 +390,7 @@ class SiteLog:
         self.log_time_ns, self.publish_time_ns = times or (zeros, zeros)
 
         is_unordered = (self.tick[1:] < self.tick[:-1]).any()
-        if is_unordered:  # late records are stored behind later ones
+        if is_unordered:  # records that arrived late are stored after later ones
             order = np.argsort(self.tick, kind="stable")
             self.tick = self.tick[order]
             self.payloads = self.payloads.select(order)
@@ -453,7 +453,7 @@ class SiteLog:
     def prepare(self, *fields: str) -> None:
         """Decodes several fields of all records together, before they are accessed.
 
-        The fields are vectors such as joint angles. This is three times as fast as to decode
+        The fields are vectors such as joint angles. This is three times as fast as decoding
         them one by one.
 
         Args:
@@ -537,8 +537,8 @@ class SiteLog:
     def states(self) -> Sequence[State]:
         """The whole records in the order of their ticks, decoded and checked.
 
-        If there are many, a record is decoded only when it is accessed. To compute with a
-        single quantity, the arrays such as `q` are much faster.
+        If there are many records, a record is decoded only when it is accessed. To compute with
+        a single quantity, the arrays such as `q` are much faster.
         """
         return decode_records(self.payloads, self.decode)
 
@@ -555,7 +555,7 @@ class SiteLog:
 
     @property
     def last_tick(self) -> int:
-        """Number of the control period (tick) of the last record; -1 if there are no records.
+        """Number of the control period (tick) of the last record, or -1 without records.
 
         Ticks are counted from 0 at the start of the run.
         """
@@ -565,8 +565,8 @@ class SiteLog:
     def diverged_s(self) -> float | None:
         """Time at which the arm exceeded a safety limit, which ended the run, in s.
 
-        It is the time of the last record if its mode is "diverged". None if the arm stayed
-        within its limits, or if there are no records.
+        This is the time of the last record if its mode is "diverged". The value is None if the
+        arm stayed within its limits, or if there are no records.
         """
         if not len(self):
             return None
@@ -582,8 +582,8 @@ class SiteLog:
         """
         if not len(self):
             return 0
-        # There are `last_tick` ticks before the last record. The ticks of the log, without
-        # repetitions and without the last one, are as many as the changes of the tick.
+        # There are `last_tick` ticks before the last record. The number of different recorded
+        # ticks before it equals the number of changes of the tick from record to record.
         recorded_ticks = int(np.count_nonzero(np.diff(self.tick)))
         return self.last_tick - recorded_ticks
 
@@ -591,7 +591,7 @@ class SiteLog:
     def skipped(self) -> int:
         """Number of ticks that the site skipped because it was late, as its records state.
 
-        Only a site with an external arm skips ticks: a real arm cannot catch up.
+        Only a site with an external arm skips ticks, because a real arm cannot catch up.
         """
         return sum(last - first + 1 for first, last in self.skipped_ranges)
 
@@ -750,8 +750,9 @@ class SiteLog:
     def busy_us(self) -> Ints:
         """Computing time of each tick except the last one, shape (K - 1,), in us.
 
-        A record contains the computing time of the tick before, because its own is not known
-        yet when the record is published. The values are moved by one row accordingly.
+        A record contains the computing time of the previous tick, because the time of its own
+        tick is not known yet when the record is published. The values are shifted by one row
+        accordingly.
         """
         return self.numbers("busy_us")[1:]
 
@@ -770,7 +771,7 @@ class SiteLog:
 
     @cached_property
     def arrivals(self) -> tuple[Ints, Ints]:
-        """Messages from other arms that had arrived at this one, with their delays.
+        """Messages from other arms that arrived at this arm, with their delays.
 
         The first array contains the number of messages (samples) in each record, shape (K,).
         The second array contains all arrivals in order, shape (N, 3), with the columns of `rx`:
@@ -802,7 +803,7 @@ class SiteLog:
         return {tick: list(texts) for tick, texts in self._changes.items()}
 
     def age_s(self, peer: str, rate_hz: int) -> Array:
-        """Computes how old the sample of a peer is that the control law uses at each record.
+        """Computes the age of the peer's sample that the control law used in each record.
 
         The age is the time of the record minus the stamp of the sample. The stamp is the
         nominal time of the tick (control period) in which the peer computed the sample.

@@ -1,13 +1,14 @@
 """Recovers messages from a compressed block of a log that was cut off.
 
 An MCAP file stores messages in compressed chunks. If a recording is interrupted, the last chunk
-may be incomplete. Its checksum proves nothing then, because it covers all messages of the
-chunk, including those at the missing end. But the compressed data consist of blocks, which can
-be unpacked one by one, and the messages of all complete blocks can be used.
+may be incomplete. The checksum of such a chunk proves nothing, because it covers all messages
+of the chunk, including those at the missing end. But the compressed data consist of blocks,
+which can be unpacked one by one, and the messages of all complete blocks can be used.
 
 Invariant:
     - The messages of a block are used together or not at all, because damage in the compressed
-      bytes of a block may falsify any of its messages, including some that still look right.
+      bytes of a block may falsify any of its messages, including messages that still look
+      correct.
     - Compressed bytes are read up to the first doubtful page. A page that contains only zeros
       was never written to the disk. A page that is equal to another page of the file was
       written to the wrong place.
@@ -77,7 +78,8 @@ class TornChunk(NamedTuple):
         Raises:
             UnreadableRecord: The head of the chunk contains impossible values.
         """
-        # Missing bytes are replaced by zeros, so that an incomplete head is refused below.
+        # Missing bytes are replaced by zeros, so that the code below refuses an incomplete
+        # head.
         record_head = scanner.read(offset, RECORD_HEAD_BYTES).ljust(RECORD_HEAD_BYTES, b"\0")
         _, length = RECORD_HEAD.unpack(record_head)
         begin = offset + RECORD_HEAD_BYTES
@@ -91,7 +93,7 @@ class TornChunk(NamedTuple):
         return cls(head, packed, begin + head.data_offset)
 
     def iterate_blocks(self) -> Iterator[list[InnerRecord]]:
-        """Unpacks the chunk block by block, as far as it is intact.
+        """Unpacks the intact part of the chunk block by block.
 
         A block is a piece of the compressed data that can be unpacked as a whole. A record that
         continues in the next block is yielded with the block that contains its end.
@@ -112,8 +114,8 @@ class TornChunk(NamedTuple):
     def _unpack(self) -> Iterator[bytes]:
         """Yields the unpacked blocks, until a block is damaged or incomplete.
 
-        It also stops if the blocks are larger together than the head of the chunk states.
-        Without a compression, a block is a page of the file.
+        It also stops if the total size of the blocks exceeds the size that the head of the
+        chunk states. If the chunk is not compressed, a block is a page of the file.
         """
         unpackers: dict[str, Callable[[bytes], Iterator[bytes]]] = {
             "": partial(_iterate_pages, offset=self.offset),
@@ -200,7 +202,7 @@ def _split_records(data: bytearray) -> tuple[list[InnerRecord], int]:
 
 
 def _iterate_pages(packed: bytes, offset: int = 0) -> Iterator[bytes]:
-    """Splits bytes where the pages of their file begin, as disks lose whole pages at once.
+    """Splits bytes at the page boundaries of their file, as disks lose whole pages at once.
 
     Args:
         packed: The bytes.
@@ -214,7 +216,7 @@ def _iterate_pages(packed: bytes, offset: int = 0) -> Iterator[bytes]:
 
 
 def _unpack_zstd(packed: bytes) -> Iterator[bytes]:
-    """Yields the unpacked blocks of a Zstandard frame, as far as they are complete.
+    """Yields the unpacked complete blocks of a Zstandard frame.
 
     A frame consists of a header and blocks (RFC 8878, section 3.1.1.2). The head of a block has
     3 bytes: bit 0 marks the last block, bits 1 and 2 are the kind, and the others the size.
@@ -238,7 +240,7 @@ def _unpack_zstd(packed: bytes) -> Iterator[bytes]:
 
 
 def _unpack_lz4(packed: bytes) -> Iterator[bytes]:
-    """Yields the unpacked data of an LZ4 frame, page by page, as far as they are complete."""
+    """Yields the unpacked data of an LZ4 frame by pages, up to the first incomplete part."""
     unpacker = lz4.frame.LZ4FrameDecompressor()
     for page in _iterate_pages(packed):
         yield unpacker.decompress(page)

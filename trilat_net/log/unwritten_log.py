@@ -1,9 +1,9 @@
-"""A log whose records are arrays that were never encoded as messages.
+"""Provides logs of simulations whose records stay in arrays and are not encoded as messages.
 
 A simulated run can be judged by the same functions as a recorded one, because they read the
 columns of a log, such as the joint angles of all records. `UnwrittenLog` offers these columns
-for numbers that a simulation left in memory. To encode them as messages and to decode these
-again would take twenty times as long as the simulation.
+for numbers that a simulation left in memory. Encoding these numbers as messages and decoding
+them again would take twenty times as long as the simulation.
 
 Invariant:
     - A column that was not given raises an error when it is read.

@@ -1,4 +1,4 @@
-"""Connects a program to a site: the driver of a real arm, its dead-man switch, or an operator.
+"""Connects a program to a site: the driver of a real arm, a dead-man switch, or an operator.
 
 A site is a process that computes the torque of one arm. If the arm is external (`plant =
 "external"` in the scenario), its driver sends the measured joint positions to the site, and
@@ -21,8 +21,9 @@ Invariant:
     - A client accepts only records that continue those that it has received: from the same
       process of the site, newer, and not implausibly far in the future. Otherwise a second
       process of the same name, or a forged message, could move the arm.
-    - While an operator does not move, a thread repeats the last message. If the messages end,
-      the site knows that the operator's program has died, and releases the arm.
+    - While an operator sends no new target, a thread repeats the last message. If no more
+      messages arrive, the site knows that the operator's program has died, and releases the
+      arm.
 """
 
 import math
@@ -45,7 +46,7 @@ from .wire import decode, encode, split_states
 from .zenoh_config import OPERATOR
 
 FRESH_NS = 100_000_000
-"""Largest age of a usable record, in ns. If it is older, the site is late or gone."""
+"""Largest age of a usable record, in ns. If the record is older, the site is late or gone."""
 AHEAD_NS = 1_000_000_000
 """Largest time by which a record may be ahead of its expected time, in ns.
 
@@ -56,7 +57,7 @@ _BRAKE_NS = 100_000_000
 """Time from a fault, or from the release of the dead-man switch, until the brakes hold, in ns.
 """
 _HEARTBEAT_S = SILENCE_NS / 4e9
-"""Period with which the last message of an operator who does not move is repeated, in s."""
+"""Period with which an operator's last message is repeated, in s."""
 _ACTIONS = {
     TorqueKind.LIVE_TIP: "move",
     TorqueKind.LIVE_JOINT: "turn",
@@ -226,8 +227,8 @@ class SiteClient:
     def record(self) -> State | None:
         """Newest record of the arm controller (site) that has arrived, with angles and torque.
 
-        A record is the result of one period of the control loop. None before the first one has
-        arrived.
+        A record is the result of one period of the control loop. The value is None before the
+        first record has arrived.
         """
         self._read_messages()
         return self._record
@@ -297,7 +298,7 @@ class SiteClient:
                 self._received_ns = received_ns
 
         for event in read_messages(self._events, Event):
-            # Only the process that sent the records can end the run, not another one of the
+            # Only the process that sent the records can end the run, not another process of the
             # same name.
             newest = self._record
             if event.kind == "end" and newest is not None and event.boot == newest.boot:
@@ -364,7 +365,7 @@ class _OutsideClient(SiteClient):
             connect: Endpoints of the site, which the site prints while it waits for its arm.
             keys: Folder with the keys of one member, as `trilat keys new` creates it. The
                 program of an arm uses the keys of its site. The program of a dead-man switch
-                uses the keys of the operator. None connects without keys.
+                uses the keys of the operator. If None, the connection uses no keys.
 
         Returns:
             The client.
@@ -437,11 +438,11 @@ class ArmClient(_OutsideClient):
             tau_x: Torque of the operator and the environment in N m per joint, if the arm
                 measures it. The sign is that of the paper: the torque that acts ON the arm is
                 the negative of `tau_x`.
-            stamp_ns: Time of the measurement in ns, on any monotonic clock of the arm. None
-                uses the present time of this program's monotonic clock.
+            stamp_ns: Time of the measurement in ns, on any monotonic clock of the arm. If None,
+                the present time of this program's monotonic clock is used.
 
         Raises:
-            ValueError: `tau_x` is not as long as `q`, or a number is not finite.
+            ValueError: `tau_x` and `q` have different lengths, or a number is not finite.
         """
         vectors = {"q": q, "qd": qd, "tau_x": tau_x}
         vectors_by_name = {
@@ -454,7 +455,7 @@ class ArmClient(_OutsideClient):
         """Returns the torque to apply now, or None if the arm must brake.
 
         The torque is that of the newest record, the result of one tick (period of the control
-        loop) of the site (arm controller). The arm must brake
+        loop) of the site (arm controller). The arm must brake in these cases:
 
         - before the first tick and after the run,
         - if the newest record is older than `FRESH_NS`,
@@ -492,9 +493,9 @@ class Hand(SiteClient):
     """Connection of a person or a program that moves an arm as its operator.
 
     `tn.hand` and the commands of the live page create it. The first call of `move`, `turn` or
-    `push` starts to move the arm. Which of them is permitted depends on the operator in the
-    scenario: one with a target position, with target angles, or with a force. `release` ends
-    the operator's influence. The object is a context manager that releases the arm at its end.
+    `push` starts to move the arm. Which of them is permitted depends on whether the operator in
+    the scenario has a target position, target angles, or a force. `release` ends the operator's
+    influence. The object is a context manager that releases the arm at its end.
 
     Args:
         bus: Network connection.
@@ -541,7 +542,7 @@ class Hand(SiteClient):
     def __exit__(self, *_: object) -> None:
         """Releases the arm, and waits until its record shows that nobody holds it any more.
 
-        The wait takes at most twice the time in which the grip fades, also if no record (result
+        The wait takes at most twice the time in which the grip fades, even if no record (result
         of a control period) arrives. The bus stays open, because the caller opened it.
         """
         try:
@@ -621,7 +622,7 @@ class Hand(SiteClient):
 
     @property
     def number(self) -> int:
-        """Number of the message of this program that the arm followed in its newest record.
+        """Number of the message from this program that the arm followed in its newest record.
 
         It is the number that `move`, `turn` or `push` returned, or -1 if this program does not
         move the arm at present.
@@ -636,8 +637,8 @@ class Hand(SiteClient):
         """Operator who moves the arm in the newest record, with the present target or force.
 
         A record contains the state of the site in one period of its control loop. The operator
-        may be this program or another program. None if nobody moves the arm, or if there is no
-        record yet.
+        may be this program or another program. The value is None if nobody moves the arm, or if
+        there is no record yet.
         """
         record = self.record
         if record is None or not record.hand:
@@ -670,7 +671,7 @@ class Hand(SiteClient):
         operator = self._operator
         hand = HandInForce.read(record.hand)
 
-        pull = list(hand.target)  # for an operator who pushes, the target is the force
+        pull = list(hand.target)  # for an operator with a force, the target is the force
         if operator.kind is not TorqueKind.LIVE_FORCE:
             pose = self._compute_pose(record.q)
             pose_rate = self._compute_pose_rate(record)
@@ -747,8 +748,8 @@ class Hand(SiteClient):
     def _repeat_messages(self) -> None:
         """Repeats the last message while the program holds the arm, in a thread of its own.
 
-        Without it, the site would take a program that has no new target for one that has died,
-        and release the arm. The thread ends when the object is closed.
+        Without the repeated messages, the site would assume that a program without a new target
+        has died, and would release the arm. The thread ends when the object is closed.
         """
         while not self._ended.wait(_HEARTBEAT_S):
             with self._lock:

@@ -1,6 +1,6 @@
 """Defines the interface of a process's network connection, and the queues of waiting messages.
 
-The control loop of an arm must never wait for the network, and should lose little time to it.
+The control loop of an arm must never wait for the network, and should spend little time on it.
 The network connection, the `Bus`, therefore puts arriving messages into queues, from which the
 loop removes them when it has time. It also publishes messages under keys, and sends and answers
 queries. `zenoh_bus` implements the interface over Eclipse Zenoh. Tests implement it within one
@@ -89,8 +89,8 @@ class Bus(Protocol):
         Args:
             key: The key, without wildcards.
             patient: False if a payload is dropped when the network is too slow. True if the
-                function waits instead, for some seconds at most. That is for senders without a
-                control loop that must not lose messages.
+                function waits instead, for some seconds at most. Senders that have no control
+                loop and must not lose messages use True.
         """
 
     def inbox(self, key: str, capacity: int = RING_CAPACITY) -> Inbox:
@@ -240,7 +240,7 @@ class BoundedRing(Generic[T]):
         self._entries: deque[T] = deque(maxlen=capacity)
 
     def put(self, entry: T) -> None:
-        """Adds an entry to the queue without waiting; a full queue drops its oldest entry."""
+        """Adds an entry to the queue without waiting. A full queue drops its oldest entry."""
         self._entries.append(entry)
 
     def poll(self) -> T | None:

@@ -27,7 +27,7 @@ class Clock(Protocol):
     def monotonic_ns(self) -> int:
         """Returns the reading of a clock that never steps, in ns, to measure durations.
 
-        The zero of this clock is arbitrary, so that only differences of readings have a
+        The zero of this clock is arbitrary, so only differences between readings have a
         meaning.
         """
 
@@ -56,7 +56,7 @@ class Clock(Protocol):
 class SystemClock:
     """The monotonic clock and the time of day of the operating system.
 
-    Live processes use this class. Tests put other clocks in its place.
+    Live processes use this class. Tests replace it by other clocks.
     """
 
     monotonic_ns = staticmethod(time.perf_counter_ns)
@@ -115,7 +115,7 @@ class SkewedClock:
         self._start_ns = clock.monotonic_ns()
 
     def monotonic_ns(self) -> int:
-        """Returns the time of a clock that is wrong on purpose, in ns, to test synchronisation.
+        """Returns the time of a deliberately wrong clock, in ns, to test synchronisation.
 
         true time + offset + drift * (time since the clock was created)
         """
@@ -126,7 +126,7 @@ class SkewedClock:
     def unix_ns(self) -> int:
         """Returns the correct time of day in ns since 1970, without offset and drift.
 
-        Only the monotonic time of this class is wrong on purpose.
+        Only the monotonic time of this class is deliberately wrong.
         """
         return self._clock.unix_ns()
 

@@ -132,13 +132,13 @@ def _bind_ports(stack: ExitStack, ports: Sequence[int], *, shared: bool) -> list
     """Reserves ports of this machine for sites (arm controllers) that will listen at them.
 
     A port is reserved by a socket that is bound to it but does not listen. The operating system
-    then gives the port to nobody who asks for any free port.
+    then assigns the port to no program that asks for any free port.
 
     Args:
         stack: Closes the sockets, and thereby ends the reservation.
         ports: Numbers of the ports. 0 stands for any free port.
         shared: True if the site can listen at its port while the port is still reserved. False
-            reserves the port exclusively.
+            to reserve the port exclusively.
 
     Returns:
         The endpoints of the reserved ports, in the order of the ports.
@@ -156,7 +156,7 @@ def _bind_ports(stack: ExitStack, ports: Sequence[int], *, shared: bool) -> list
 
 
 ENDS_SOON = timedelta(days=7)
-"""Time before the end of the keys' validity from which on the user is warned."""
+"""The user is warned if the validity of the keys ends within this time."""
 _DATE = "%Y-%m-%d %H:%M:%S UTC"
 """Format of the end of validity in messages to the user."""
 RETRY_NS = 200_000_000
@@ -218,7 +218,7 @@ class Connection:
 
         Raises:
             UnknownHost: A host name cannot be resolved. This is checked first, because Zenoh
-                would try to resolve the name for ever.
+                would try to resolve the name forever.
             RouterSilent: This process is a client, and no router answers.
             UsageError: Zenoh cannot use an endpoint.
         """
@@ -397,12 +397,12 @@ class Connection:
             The connection, with the keys.
 
         Raises:
-            UsageError: One of three cases: The keys cannot be used. There are keys, but an
-                endpoint is not encrypted or the user's settings contradict the keys. There are
-                no keys, although other machines can reach an endpoint.
+            UsageError: The keys cannot be used or contradict the user's settings, an endpoint
+                is not encrypted although there are keys, or other machines can reach an
+                endpoint although there are no keys.
         """
         if isinstance(keys, str | Path):
-            from .member_keys import read_member_keys  # loads the cryptography package
+            from .member_keys import read_member_keys  # takes time: it loads cryptography
 
             keys = read_member_keys(keys)
 
@@ -440,7 +440,7 @@ class Connection:
         Args:
             clock: Clock of the caller.
             stopped: Function that returns True to give up.
-            timeout_s: Longest wait for a router, in s. None waits without a limit.
+            timeout_s: Longest wait for a router, in s. If None, there is no limit.
             say: Function that prints a line for the user.
 
         Returns:
@@ -449,7 +449,7 @@ class Connection:
         Raises:
             UsageError: An endpoint cannot be used.
             UnknownHost: A host name cannot be resolved at the first attempt. In later attempts
-                this is ignored, because the name service may be away for some time.
+                this is ignored, because the name service may be unavailable for some time.
             SessionError: No router answered in time.
         """
         begun_ns = clock.monotonic_ns()
@@ -533,7 +533,7 @@ def _check_open_endpoints(connection: Connection, *, insecure: bool) -> None:
         if not is_safe:
             raise UsageError(
                 f"--listen {address}: anybody on that network could take part: give "
-                "--keys DIR (make the keys with trilat keys new), or --insecure if you trust "
+                "--keys DIR (create the keys with trilat keys new), or --insecure if you trust "
                 "everybody on that network"
             )
 
@@ -660,8 +660,8 @@ def run_router(
         clock: Clock of this process.
         stopped: Function that returns True to end the router.
         say: Function that prints a line for the user.
-        until_idle_s: Time after which the router ends once the last member has left, in s. None
-            means never.
+        until_idle_s: Time after which the router ends once the last member has left, in s. If
+            None, the router does not end by itself.
     """
     presence = bus.presence(topics.presence_key("*", "*"))
     present: set[topics.KeyParts] = set()

@@ -43,7 +43,7 @@ REPLY_TIMEOUT_S = 3.0
 _NAME_CHECK_S = 0.7
 """Time for which a playback looks for sites of a session with the same name, in s.
 
-Sites try to connect every half a second.
+Sites try to connect every half second.
 """
 
 SiteNamesOf = Callable[[str], tuple[str, ...]]
@@ -82,7 +82,7 @@ class SessionMembers:
 
         Args:
             stopped: Function that returns True to end the search.
-            timeout_s: Duration of the search, in s. None searches without a limit.
+            timeout_s: Duration of the search, in s. If None, there is no limit.
 
         Yields:
             The identity of a member, as soon as a reply has arrived.
@@ -225,7 +225,7 @@ def connect_to_session(
         names: Function that returns the names of the sites in a scenario. If it returns no
             names, only the first site is connected.
         stopped: Function that returns True to give up.
-        timeout_s: Longest wait for the first site or for a router, in s. None waits without a
+        timeout_s: Longest wait for the first site or for a router, in s. If None, there is no
             limit.
         say: Function that prints a line for the user.
         recorder_boot: Random number that identifies this start of the caller, if the caller is
@@ -244,7 +244,7 @@ def connect_to_session(
         def connect(target: Connection) -> Bus | None:
             """Opens a network connection, which is closed at the end of the `with` block.
 
-            Returns None if `stopped` has returned True.
+            The yielded connection is None if `stopped` has returned True.
             """
             bus = target.open_bus(clock=clock, stopped=stopped, timeout_s=timeout_s, say=say)
             return None if bus is None else stack.enter_context(closing(bus))
@@ -296,7 +296,8 @@ def _query_sites(
         parse_site_names: Function that returns the names of the sites in the text of a
             scenario. It raises `ScenarioError` if the text is not a scenario.
         stopped: Function that returns True to give up.
-        timeout_s: Longest wait for a reply, in s. None waits until `stopped` returns True.
+        timeout_s: Longest wait for a reply, in s. If None, the wait lasts until `stopped`
+            returns True.
 
     Returns:
         The names, from the first reply that contains a scenario. None if `stopped` returned
@@ -314,7 +315,7 @@ def _query_sites(
             continue
 
     # The search has ended, because the caller has stopped it or because the time is over. The
-    # second case cannot occur without a limit, so that `timeout_s` is a number below.
+    # second case cannot occur without a limit, so `timeout_s` is a number below.
     if stopped():
         return None
     raise SessionError(

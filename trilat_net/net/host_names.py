@@ -1,9 +1,9 @@
 """Refuses misspelt host names before a network connection is opened.
 
-Zenoh, the library that transports the messages, would try to connect to a misspelt host for
-ever, without an error. `check_hosts` therefore asks the name service for the host name of each
-endpoint, a network address such as tcp/host:10241, and opens no connection. Endpoints without a
-host name, such as numeric addresses and socket files, need no check.
+Zenoh, the library that transports the messages, would try to connect to a misspelt host
+forever, without an error. `check_hosts` therefore asks the name service for the host name of
+each endpoint, a network address such as tcp/host:10241, and opens no connection. Endpoints
+without a host name, such as numeric addresses and socket files, need no check.
 """
 
 import ipaddress
@@ -27,7 +27,7 @@ class UnknownHost(UsageError):  # noqa: N818 - it names an outcome
 def check_hosts(endpoints: Iterable[str]) -> None:
     """Checks that the host names of all endpoints can be resolved to addresses.
 
-    Zenoh would try to resolve an unknown name for ever, so the names are checked before a
+    Zenoh would try to resolve an unknown name forever, so the names are checked before a
     connection is opened. IP addresses need no check.
 
     Args:

@@ -169,8 +169,8 @@ def find_known_sites(session: str) -> list[_KnownSite]:
 def _is_alive(pid: int) -> bool:
     """Returns True if a process with this number exists.
 
-    The file of a site (arm controller) without a process is left over from a crash. On other
-    systems than POSIX, the process is assumed to exist, because asking for it could end it.
+    The file of a site (arm controller) without a process is left over from a crash. On systems
+    other than POSIX, the process is assumed to exist, because the check could end it.
     """
     with suppress(PermissionError):
         try:
@@ -198,13 +198,13 @@ def _list_endpoints(known_sites: Sequence[_KnownSite]) -> list[Endpoint]:
 def find_known_endpoints(session: str, connection: "Connection") -> list[Endpoint] | None:
     """Finds the endpoints of a session whose sites (arm controllers) all run on this machine.
 
-    Every running site stores its endpoints in a file, so that no search in the network is
-    needed.
+    Every running site stores its endpoints in a file, so no search in the network is needed.
 
     Args:
         session: Name of the session.
-        connection: Network connection of this process. Sites with another mode are ignored, and
-            so are sites that use keys if this process does not, or the reverse.
+        connection: Network connection of this process. Sites with another mode are ignored.
+            Sites with keys are ignored if this process has no keys, and sites without keys if
+            it has.
 
     Returns:
         The endpoints. None if not all sites of the session are known.
@@ -227,16 +227,16 @@ def find_known_endpoints(session: str, connection: "Connection") -> list[Endpoin
 def stop_at_once(arguments: Sequence[str]) -> int | list[str]:
     """Stops arms immediately, as the command line of `trilat stop` requests.
 
-    Only the sites that run on this machine can be stopped in this way, because files on this
-    machine state their endpoints. The other parts of the program are not loaded before, so that
-    the arms stop without delay.
+    Only sites that run on this machine can be stopped in this way, because their endpoints are
+    read from local files. No other part of the program is loaded first, so that the arms stop
+    without delay.
 
     Args:
         arguments: Command line after `trilat stop`.
 
     Returns:
-        If all arms have been stopped, or if the keys are missing: the exit code of the command.
-        Otherwise: the arguments for the full command, which continues, for example by searching
+        The exit code of the command if all arms have been stopped or if the keys are missing.
+        Otherwise the arguments for the full command, which continues, for example by searching
         the network for the remaining sites.
     """
     options, sites, is_simple = _parse_arguments(arguments)

@@ -12,9 +12,9 @@ access rules are derived. No other user of the machine can read the private key 
 in the folder. The private key of the authority has a separate folder, which should be stored
 safely.
 
-The validity of the keys ends one day earlier than that of their certificate. During this day,
-no member can start with the keys, but `trilat stop` can still connect and stop the arms. Zenoh
-needs a valid certificate for each new connection, and each time a connection is opened again.
+The keys expire one day earlier than their certificate. During this day, no member can start
+with the keys, but `trilat stop` can still connect and stop the arms. Zenoh needs a valid
+certificate for each new connection, and each time a connection is opened again.
 """
 
 import datetime
@@ -69,7 +69,7 @@ _RENEWAL = (
     "renew the keys with trilat keys renew, or make new keys for all members with trilat keys "
     "new"
 )
-"""Advice to the user for keys that have ended."""
+"""Advice to the user for keys that have expired."""
 _DATE = "%Y-%m-%d %H:%M UTC"
 """Format of dates in messages to the user."""
 _MOST_DAYS = 3_650
@@ -87,8 +87,8 @@ class MemberKeys(NamedTuple):
         ends: Time at which the validity of the keys ends, in UTC. The certificate is valid for
             `STOPPING_TIME` longer, so that the keys can still be used to stop arms.
         settings: Zenoh settings that use the keys, see `make_zenoh_config`.
-        hosts: Names and addresses at which other members can reach the member. A member that
-            listens elsewhere gets no connection.
+        hosts: Names and addresses at which other members can reach the member. Nobody can
+            connect to a member at any other address.
     """
 
     member: str
@@ -107,7 +107,7 @@ def create_keys(
     """Creates a folder of keys for each member of a session, as `trilat keys new` does.
 
     With keys, the members encrypt their messages and prove their identities. The keys are
-    signed by an authority, which is created too and can renew them later.
+    signed by an authority, which is also created and can renew them later.
 
     >>> [folder.name for folder in tn.create_keys("keys", ["m", "s", "recorder"])]
     ['m', 's', 'recorder']
@@ -137,7 +137,7 @@ def create_keys(
     is_occupied = folder.exists() and not is_empty_folder
     if not folder.name or is_occupied:
         raise UsageError(
-            f"{folder}: already exists; keys are never replaced: name a new folder, or add "
+            f"{folder} already exists, and keys are never replaced: name a new folder, or add "
             "members to this one with trilat keys add"
         )
 
@@ -149,13 +149,13 @@ def create_keys(
 
 
 def _find_name_fault(members: Sequence[Any]) -> str:
-    """Checks names of members (processes of a session), and returns what is wrong with them.
+    """Checks names of members (processes of a session), and describes the first fault.
 
     Args:
         members: The names.
 
     Returns:
-        The first fault, as a sentence for the user. Empty if all names are valid.
+        The fault, as a sentence for the user. Empty if all names are valid.
     """
     for name in members:
         has_valid_letters = isinstance(name, str) and re.fullmatch("[A-Za-z0-9_-]+", name)
@@ -229,7 +229,7 @@ def renew_keys(folder: str | Path, members: Sequence[str] = (), days: int = 30) 
     missing = [name for name in names if name not in present]
     if missing:
         raise UsageError(
-            f"{folder}: has no keys for {', '.join(missing)}; the folder has keys for "
+            f"{folder} has no keys for {', '.join(missing)}; the folder has keys for "
             f"{', '.join(present)}"
         )
 
@@ -261,7 +261,7 @@ def _read_authority(folder: Path) -> tuple[x509.Certificate, Any]:
         UsageError: The authority is missing or damaged.
     """
     if not folder.is_dir():
-        raise UsageError(f"{folder}: there is no such folder of keys made by `trilat keys new`")
+        raise UsageError(f"{folder} is not a folder of keys made by `trilat keys new`")
     authority_folder = folder / _AUTHORITY_FOLDER
     try:
         authority = x509.load_pem_x509_certificate(_read_trusted(authority_folder / AUTHORITY))
@@ -329,7 +329,8 @@ def add_keys(
             )
 
     ends = datetime.datetime.now(datetime.UTC) + datetime.timedelta(days=days)
-    # The certificate of the authority must hold for as long as those that it signs.
+    # The certificate of the authority must be valid for as long as the certificates that it
+    # signs.
     needs_longer = authority.not_valid_after_utc < ends + STOPPING_TIME
     if needs_longer:
         authority = _sign_authority(authority_key, ends)
@@ -367,7 +368,7 @@ def _read_member_lists(folder: Path) -> dict[str, dict[str, Any]]:
     lists: dict[str, dict[str, Any]] = {}
     unread_members = sorted(path.parent.name for path in folder.glob(f"*/{MEMBERS}"))
     if not unread_members:
-        raise UsageError(f"{folder}: has no keys made by `trilat keys new`")
+        raise UsageError(f"{folder} has no keys made by `trilat keys new`")
 
     while unread_members:
         name = unread_members.pop(0)
@@ -382,8 +383,8 @@ def _read_member_lists(folder: Path) -> dict[str, dict[str, Any]]:
     for name, entry in lists.items():
         if set(entry["members"]) != set(first_list):
             raise UsageError(
-                f"{folder / name / MEMBERS}: lists other members than the other folders: copy "
-                "the newest folder of each member here"
+                f"{folder / name / MEMBERS} lists different members than the other folders: "
+                f"copy the newest folder of each member to {folder}"
             )
     return lists
 
@@ -407,13 +408,13 @@ def _read_member_list(folder: Path, name: str) -> dict[str, Any]:
         is_valid = entry["member"] == name and not _find_name_fault(entry["members"])
     except OSError:
         raise UsageError(
-            f"{folder}: has no folder of the member {name}, whose list of members must "
-            f"change too: copy {name}/{MEMBERS} back from its machine"
+            f"{folder} has no folder for {name}, but the list of members of {name} must be "
+            f"updated too: copy {name}/{MEMBERS} from the machine of {name} to {folder}"
         ) from None
     except (ValueError, TypeError, KeyError):
         is_valid = False
     if not is_valid:
-        raise UsageError(f"{path}: is damaged, or was not made by `trilat keys new`")
+        raise UsageError(f"{path} is damaged, or was not made by `trilat keys new`")
     return entry
 
 
@@ -423,7 +424,7 @@ def _add_folders(
     files: dict[Path, str],
     write: Callable[[Path], None],
 ) -> None:
-    """Adds folders of members (processes of a session) and replaces files, all of them or none.
+    """Adds folders of members (processes of a session) and replaces files, or changes nothing.
 
     Args:
         folder: Folder of the keys of all members.
@@ -578,7 +579,7 @@ def _sign_authority(
 ) -> x509.Certificate:
     """Returns the certificate of the authority that signs the certificates of all members.
 
-    The authority has no higher authority, so that it signs its own certificate.
+    No higher authority exists, so the authority signs its own certificate.
 
     Args:
         key: Private key of the authority.
@@ -630,7 +631,7 @@ def _start_certificate(
 
     Args:
         subject: Name of the member (process of a session), or of the authority.
-        public_key: Its public key.
+        public_key: Public key of the member or the authority.
         ends: Time at which the keys expire. The certificate expires `STOPPING_TIME` later.
     """
     return (
@@ -728,7 +729,7 @@ def _write_new_file(path: Path, content: bytes) -> None:
 def _read_trusted(path: Path) -> bytes:
     """Reads a key file, after a check that no other user of the machine can change it.
 
-    A changed file would let a stranger into the session.
+    With a changed file, an unknown process could join the session.
 
     Raises:
         UsageError: Another user can change the file.
@@ -743,7 +744,7 @@ def _check_permissions(path: Path, status: os.stat_result) -> None:
     """Checks that no other user can change a file or folder.
 
     In a folder with the sticky bit, users cannot change the files of others. Therefore such a
-    folder may be shared. On Windows, permission bits do not tell who can write, and nothing is
+    folder may be shared. On Windows, permission bits do not show who can write, and nothing is
     checked.
 
     Args:
@@ -759,7 +760,7 @@ def _check_permissions(path: Path, status: os.stat_result) -> None:
     user = os.geteuid()
     if user != 0 and status.st_uid not in (0, user):
         raise UsageError(
-            f"{path}: belongs to another user, who can change the keys: use keys of your own"
+            f"{path} belongs to another user, who can change the keys: use keys of your own"
         )
 
     is_sticky_folder = stat.S_ISDIR(status.st_mode) and status.st_mode & stat.S_ISVTX
@@ -792,7 +793,7 @@ def read_member_keys(folder: str | Path, *, stops: bool = False) -> MemberKeys:
     folder = Path(folder)
     if (folder / _AUTHORITY_FOLDER).is_dir():
         raise UsageError(
-            f"{folder}: has the keys of all members; name the folder of one member, as in "
+            f"{folder} has the keys of all members; name the folder of one member, as in "
             f"{folder}/m1"
         )
 
@@ -915,7 +916,7 @@ def _make_settings(folder: Path, members: Sequence[str]) -> dict[str, Any]:
         "root_ca_certificate": str(folder / AUTHORITY),
         "enable_mtls": True,
         "verify_name_on_connect": True,
-        # The end of a certificate ends no session; see `Connection.require_keys_until`.
+        # Expiry of a certificate does not end a session, see `Connection.require_keys_until`.
         "close_link_on_expiration": False,
         "listen_certificate": str(folder / CERTIFICATE),
         "connect_certificate": str(folder / CERTIFICATE),

@@ -1,4 +1,4 @@
-"""Finds out which processes take part in a session, and which of them are present.
+"""Determines which processes take part in a session, and which of them are present.
 
 These processes are called members. A member is a site, which runs one arm and its control loop,
 or a recorder, which writes the log. Members find each other in two ways. Each member declares a
@@ -131,7 +131,7 @@ def read_records(inbox: Inbox, layout: Layout | None = None) -> Iterator[State]:
     Args:
         inbox: Inbox of the records of one site.
         layout: Expected numbers of joints and peers (other sites). A record that differs counts
-            as undecodable. None accepts all numbers.
+            as undecodable. If None, all numbers are accepted.
     """
     while (message := inbox.poll()) is not None:
         _key, block = message
@@ -311,7 +311,7 @@ class Membership:
         sites: Sequence[str],
         late: LateSites,
     ) -> None:
-        """Subscribes to the presence of the processes of a session. None is known yet."""
+        """Subscribes to the presence of a session's processes, none of which is known yet."""
         self.others: dict[str, Info] = {}
         self.alive: set[str] = set()
         self.gone: set[str] = set()
@@ -321,7 +321,8 @@ class Membership:
         self._sites = tuple(sites)
         self._late = late
 
-        # Liveliness tokens show who is present, and replies to queries show who they are.
+        # Liveliness tokens show which processes are present, and replies to queries identify
+        # them.
         self._presence = bus.presence(topics.presence_key(session, "*"))
         self._query = MemberQuery(bus, clock, session)
         self._refused_boots: set[int] = set()  # members whose refusal was published
@@ -399,7 +400,7 @@ class Membership:
         return [name for name in awaited_members if name not in known_members]
 
     def has_restarted(self, name: str, boot: int) -> bool:
-        """Returns True if a process is gone, and another one has taken its name.
+        """Returns True if a process is gone, and another process has taken its name.
 
         Args:
             name: Name of the member.
@@ -440,8 +441,8 @@ class Membership:
 
         Args:
             may_have_started: True if this member has published that it is ready. From then on
-                the session may start before this member knows. Therefore the identity of a
-                running site (arm controller) is no reason to refuse the session.
+                the session may start before this member is informed. Therefore this member does
+                not give up if a site (arm controller) is already running.
 
         Raises:
             SessionError: This member cannot be part of the session.
@@ -517,7 +518,7 @@ class Membership:
 
         known = self.others.get(info.member, info)
         if is_recorder and known.boot != info.boot:
-            return  # of several recorders, only the first one is a member
+            return  # of several recorders, only the first is a member
         is_in_scenario = not self._sites or info.member in self._sites
         if is_in_scenario or is_recorder:
             self.others[info.member] = info
@@ -534,7 +535,7 @@ class Membership:
         return self._late.may_join_late and info.member != self.local_info.member
 
     def _describe_difference(self, info: Info) -> str:
-        """Returns a phrase on the settings in which the scenario of another member differs.
+        """Returns a phrase about the settings in which the scenario of another member differs.
 
         It begins with a semicolon. It is empty if no settings can be named.
 
@@ -553,7 +554,7 @@ class Membership:
         The scenario of the leader, the first site (arm controller), is that of the session. If
         this member (process of a session) is the leader, it publishes once that the other
         member is refused. If the other member is the leader, this member gives up. If neither
-        is the leader, nothing happens here.
+        member is the leader, nothing happens.
 
         Args:
             info: Identity of the other member.

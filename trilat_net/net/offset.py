@@ -63,7 +63,7 @@ _WEIGHTING_ROUNDS = 3
 
 
 class OffsetLimit(NamedTuple):
-    """Limit of the offset between two clocks, which the time stamps of one message give.
+    """Limit of the offset between two clocks that follows from the time stamps of one message.
 
     A message cannot arrive before it was sent. A message in one direction therefore gives an
     upper limit (ceiling), one in the other direction a lower limit (floor).
@@ -99,7 +99,7 @@ class OffsetEstimate(NamedTuple):
     def extrapolate_ns(self, local_ns: int) -> int:
         """Returns the estimated offset between two clocks at another time, in ns.
 
-        One clock may run slightly faster (drift), so that the offset is assumed to grow at the
+        One clock may run slightly faster (drift), so the offset is assumed to grow at the
         estimated rate.
 
         Args:
@@ -112,7 +112,7 @@ class OffsetEstimate(NamedTuple):
 
         Args:
             *limits: Upper and lower limits of the true offset, from the time stamps of
-                messages. None is ignored.
+                messages. Limits that are None are ignored.
 
         Returns:
             A new estimate with the same offset and drift. The range from `low_ns` to `high_ns`
@@ -183,9 +183,9 @@ class OffsetEstimator:
     upper limit (ceiling) and its highest lower limit (floor).
 
     Attributes:
-        broken: Number of times that the limits contradicted each other. The older half of them
-            was discarded each time. Such a contradiction shows that a clock has stepped, or has
-            drifted by more than DRIFT_LIMIT.
+        broken: Number of times that the limits contradicted each other. The older half of the
+            limits was discarded each time. Such a contradiction shows that a clock has stepped,
+            or has drifted by more than DRIFT_LIMIT.
     """
 
     def __init__(self) -> None:
@@ -224,8 +224,8 @@ class OffsetEstimator:
                 the stored limits.
 
         Returns:
-            The estimate. None if there is no ceiling or no floor: the offset is then not
-            limited on both sides.
+            The estimate. None if there is no ceiling or no floor, because the offset is then
+            limited on one side at most.
         """
         while self._ceilings and self._floors:
             lines = _AdmissibleLines(self._ceilings, self._floors, now_ns)
@@ -265,7 +265,7 @@ class _AdmissibleLines:
     ) -> None:
         """Computes the steepest and the flattest line that the limits of a clock offset permit.
 
-        A line is a possible course of the offset over time; its slope is the drift of the
+        A line describes how the offset may change over time. Its slope is the drift of the
         clock.
         """
         self._now_ns = now_ns
@@ -398,7 +398,7 @@ class _SlewSegment:
     """Smoothed offset of another clock from one estimate to the next, as two straight lines.
 
     The first line leads from the previous value of the offset to the estimate, within SLEW_NS.
-    The second line is the estimate with its drift.
+    The second line follows the estimate and its drift.
 
     Args:
         start_ns: Time on the local clock at which the segment begins, in ns.
@@ -414,7 +414,7 @@ class _SlewSegment:
     def __init__(self, start_ns: int, offset_ns: int, estimate: OffsetEstimate) -> None:
         """Computes how the clock offset in use gradually approaches an estimate.
 
-        It also computes the largest error of the offset meanwhile.
+        It also computes the largest error of the offset during the approach.
         """
         self.start_ns = start_ns
         self.estimate = estimate
@@ -460,13 +460,13 @@ class _SlewSegment:
 
 
 class SlewedOffset:
-    """Offset between two clocks (the other one minus the local one) that changes without steps.
+    """Offset between two clocks (other clock minus local clock) that changes without steps.
 
     Delays are computed with this offset and not with the latest estimate, because a new
     estimate would appear as a step of all delays. The smoothed offset instead approaches each
-    estimate along a straight line. Two segments are stored: for the latest estimate, and for
-    the estimate before. The offset is therefore defined only from the start of the earlier
-    segment on.
+    estimate along a straight line. Two segments are stored: one for the latest estimate and one
+    for the estimate before it. The offset is therefore defined only from the start of the
+    earlier segment on.
 
     Args:
         estimate: First estimate. The smoothed offset equals it from the beginning.
@@ -496,7 +496,7 @@ class SlewedOffset:
         return self._segment.bound_ns
 
     def slew_to(self, local_ns: int, estimate: OffsetEstimate) -> None:
-        """Lets the offset approach a new estimate gradually, instead of jumping to it.
+        """Makes the offset approach a new estimate gradually, instead of jumping to it.
 
         The offset reaches the estimate after the time SLEW_NS, and then follows its drift.
 
@@ -512,8 +512,9 @@ class SlewedOffset:
         """Returns the clock offset in use at a time, which changes only gradually, in ns.
 
         Args:
-            local_ns: The time on the local clock, in ns. It must not be earlier than the time
-                at which the offset began to approach the estimate before the latest one.
+            local_ns: The time on the local clock, in ns. It must not be earlier than the start
+                of the stored segments, at which the offset began to approach the second latest
+                estimate.
 
         Returns:
             The other clock minus the local clock, in ns.
@@ -532,8 +533,8 @@ class SlewedOffset:
     def _select_segment(self, local_ns: int) -> _SlewSegment:
         """Returns the segment of the smoothed offset that holds at a local time.
 
-        There are two segments: the present approach to the latest estimate, and the one before,
-        for times that lie before the start of the present one.
+        There are two segments: the approach to the latest estimate, and the previous segment
+        for earlier times.
         """
         if local_ns >= self._segment.start_ns:
             return self._segment

@@ -66,7 +66,7 @@ class RepeatedQuery:
         return True
 
     def poll(self) -> tuple[int, str, bytes] | None:
-        """Returns the next reply to the query that has arrived, without waiting.
+        """Returns the next reply that has arrived for the query, without waiting.
 
         Returns:
             The time at which the query was sent in ns, the key and the payload of the reply.
@@ -154,8 +154,8 @@ def answer_backfill(
             messages, and the number of messages that the member has published.
 
     Returns:
-        The number of messages in the reply. 0 if the query cannot be decoded; it then gets no
-        reply.
+        The number of messages in the reply. 0 if the query cannot be decoded, in which case no
+        reply is sent.
     """
     try:
         request = decode(query.payload, BackfillRequest)
@@ -237,8 +237,8 @@ class RoundTrips:
     def _close_window(self, now_ns: int) -> None:
         """Estimates the offset from the tightest limits of the window, and starts a new one.
 
-        Limits of different times are compared after their extrapolation to the present, with
-        the last estimate of the drift.
+        Limits from different times are extrapolated to the present with the last estimate of
+        the drift, and then compared.
 
         Args:
             now_ns: Present time on the local clock, in ns.
@@ -258,7 +258,7 @@ class RoundTrips:
         highest_floor = max(floors, key=extrapolate_limit)
         self.estimator.add(lowest_ceiling, highest_floor)
         estimate = self.estimator.estimate(now_ns)
-        if estimate is None:  # the clock has stepped: earlier round trips do not count
+        if estimate is None:  # the clock has stepped, so earlier round trips no longer count
             self._agreeing = 0
             return
         self._agreeing += PINGS_PER_WINDOW
@@ -289,7 +289,7 @@ class Pinger:
         session: str,
         required: int = PINGS,
     ) -> None:
-        """Prepares the measurement of round trips to other processes. None is measured yet."""
+        """Prepares to measure round trips to other processes, but sends no ping yet."""
         self.trips: dict[int, RoundTrips] = {}
         self._clock = clock
         self._required = required
@@ -306,14 +306,14 @@ class Pinger:
         suffices to keep the estimates up to date.
 
         Args:
-            boots: Members whose replies are evaluated, given by their boots. A boot is a number
-                that identifies one start of a process. If there are none, no ping is sent.
+            boots: Boots of the members whose replies are evaluated. A boot is a number that
+                identifies one start of a process. If there are no boots, no ping is sent.
         """
         period_ns = PING_REST_NS if self.knows_clocks(boots) else PING_PACE_NS
         was_ping_sent = bool(boots) and self._query.repeat(period_ns)
         if was_ping_sent:
-            # Until this time, `pause_ns` lets the caller poll often: the arrival of a reply is
-            # measured when it is polled, so that late polling makes the measurement worse.
+            # Until this time, `pause_ns` makes the caller poll often. The arrival of a reply is
+            # measured when it is polled, so late polling makes the measurement worse.
             longest_reply_ns = 2 * self.slowest_ns() + _LATE_REPLY_NS
             self._reply_expected_until_ns = self._clock.monotonic_ns() + longest_reply_ns
         while (reply := self._query.poll()) is not None:

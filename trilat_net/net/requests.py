@@ -8,7 +8,7 @@ A log contains only published messages: the state of each arm in each period of 
 (its record), and events. The messages of this module appear in a log by their effects:
 
 - A change is logged as an event.
-- A lost message that was sent again is logged like all others.
+- A lost message that was sent again is logged like all other messages.
 - A measurement is logged as `q` and `qd` (joint angles and velocities) of the record that used
   it. In each period, an arm uses the newest measurement.
 - A target or force of an operator is logged as `hand` of the records in which it acts.
@@ -42,7 +42,7 @@ class DirectMessage(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fi
 class Pong(DirectMessage, frozen=True, kw_only=True):
     """Reply of a process to a ping, with two of the four time stamps of a round trip.
 
-    The offset between two clocks is measured by them.
+    The time stamps serve to measure the offset between two clocks.
 
     Attributes:
         member: Name of the member.
@@ -72,7 +72,7 @@ class ChangeRequest(DirectMessage, frozen=True, kw_only=True):
 
     Attributes:
         link: Link whose settings change, as in "m1->s".
-        dominance: Site that changes the weights with which it follows its peers.
+        dominance: Site whose weights change, with which it follows its peers.
         to: The new settings of the link, or the new weights.
         ramp_s: Duration of the transition to the new weights, in s.
         stop_s: Time at which the run ends, in s since the epoch, the common start of the
@@ -80,8 +80,8 @@ class ChangeRequest(DirectMessage, frozen=True, kw_only=True):
         mark: Text that is stored in the log as a mark of the present moment.
         order: Order to the site, such as "stop", which it executes in its next tick.
         source: Who requests the change: a noun phrase such as "the experimenter", which the
-            event of the site repeats. A request without a source has the same bytes as that of
-            a program that does not know this field.
+            event of the site repeats. A request without a source has the same bytes as a
+            request from a program that does not know this field.
     """
 
     link: str = ""
@@ -100,10 +100,10 @@ class ChangeReply(DirectMessage, frozen=True, kw_only=True):
     Attributes:
         member: Name of the site.
         accepted: True if the site applies the change.
-        text: Sentence for the user: the tick from which the change holds, or the reason why it
-            was refused.
-        tick: First tick, at the tick rate of the site, for which the change holds. It is -1 if
-            the change was refused.
+        text: Sentence for the user: the tick from which the change takes effect, or the reason
+            why it was refused.
+        tick: First tick, at the tick rate of the site, in which the change is in effect. It is
+            -1 if the change was refused.
     """
 
     member: str
@@ -113,7 +113,7 @@ class ChangeReply(DirectMessage, frozen=True, kw_only=True):
 
 
 class BackfillRequest(DirectMessage, frozen=True, kw_only=True):
-    """Request of a recorder to a site, to send messages again that were lost on the way.
+    """Request of a recorder to a site to send again messages that were lost on the way.
 
     A record is the result of one tick of a control loop, and its number is that of the tick.
     Statistics and events are numbered from 0.
@@ -195,8 +195,8 @@ class ArmEnable(DirectMessage, frozen=True, kw_only=True):
         site: Name of the site.
         boot: Random number that identifies this start of the switch's program.
         n: Number of the message since that start, from 0.
-        held: True while somebody holds the switch. False stops the arm at once. Without a
-            message, the site stops it only after some time of silence.
+        held: True while somebody holds the switch. False stops the arm at once. If messages
+            stop arriving, the site stops the arm only after some time of silence.
         sent_ns: Time of sending on the program's monotonic clock, in ns.
     """
 
@@ -218,7 +218,8 @@ class HandMessage(DirectMessage, frozen=True, kw_only=True):
         boot: Random number above 0 that identifies the operator. Only one operator at a time
             moves an arm.
         source: Name of the person or program, for the users of the session.
-        n: Number of the target or force, from 0. If it is repeated, nothing has changed.
+        n: Number of the target or force, from 0. A repeated number means that nothing has
+            changed.
         grip: True while the operator moves the arm, and False to release it.
         target: Target position of the end effector in m, or of the joints in rad. Empty for an
             operator who pushes.
@@ -237,7 +238,7 @@ class HandMessage(DirectMessage, frozen=True, kw_only=True):
 
 
 class PeerSeen(DirectMessage, frozen=True, kw_only=True):
-    """State of one arm at another site, as the site that an operator's program moves sees it.
+    """State of a peer's arm, as received by the site whose arm an operator's program moves.
 
     The state is delayed by the network. The fields are those of `PeerView`.
     """

@@ -56,7 +56,7 @@ LATE_GATHER_NS = 1_500_000_000
 
 
 class SessionJoin:
-    """Lets one process join a session, and finds the epoch, the common time of tick 0.
+    """Makes one process join a session, and finds the epoch, the common time of tick 0.
 
     The process first declares its subscriptions, because the other members may send messages to
     it as soon as they know it. It then creates this object, which announces the process, and
@@ -74,7 +74,8 @@ class SessionJoin:
         late: Rules about sites that join while the session runs.
 
     Attributes:
-        refusal: Why a running site has refused this site. Empty if no site has refused it.
+        refusal: Reason why a running site has refused this site. Empty if no site has refused
+            it.
         membership: The other members of the session.
         pinger: Measures the offsets of the other members' clocks.
     """
@@ -100,7 +101,7 @@ class SessionJoin:
         # The newest request of this site to join a running session: its event and its epoch.
         self._coming: tuple[Event, Epoch] | None = None
         self._admitted_by: set[str] = set()  # running sites that have granted that request
-        self._admitted_boots: dict[str, int] = {}  # boots of others that joined meanwhile
+        self._admitted_boots: dict[str, int] = {}  # boots of other sites that joined since then
 
         # What this member receives from the others.
         self._events = bus.inbox(topics.key(session, "*", topics.EVENT), 256)
@@ -155,7 +156,7 @@ class SessionJoin:
 
     @property
     def _info(self) -> Info:
-        """Identity of this member, as other members get it: its boot, scenario and clock."""
+        """Identity of this member, as others receive it: its boot, scenario and clock."""
         return self._publisher.info
 
     def poll(self) -> Epoch | None:
@@ -199,14 +200,14 @@ class SessionJoin:
         elif membership.is_leader:
             epoch = self._lead()
         if not running:
-            # The time that `_join_late` waits for further sites begins anew.
+            # The time that `_join_late` waits for further sites starts again.
             self._found_running_ns = None
         return epoch
 
     def _join_late(self, running: Sequence[Info], now_ns: int) -> Epoch | None:
         """Takes the next step to join a session that is running already.
 
-        These steps must be complete, one after another:
+        These steps must be completed one after another:
 
         1. All sites of the session that are present are known, or `LATE_GATHER_NS` have passed.
         2. A site (not a recorder) knows the clocks of all running sites on other machines.
@@ -237,8 +238,8 @@ class SessionJoin:
             return None
 
         # The site whose epoch is used may run on another clock. Convert with the present
-        # offset: that at the epoch is not known, as the clocks have drifted since. The offset
-        # is the other clock minus the local clock: local time = other time - offset.
+        # offset. The offset at the epoch is not known, because the clocks have drifted since.
+        # The offset is the other clock minus the local clock: local time = other time - offset.
         offset_ns = 0
         if source.clock != local_clock:
             offset_ns = self.pinger.estimate(source.boot).extrapolate_ns(now_ns)
@@ -286,8 +287,7 @@ class SessionJoin:
         def rank(info: Info) -> tuple[bool, int]:
             """Returns a sort key: sites on this machine first, then the order of the scenario.
 
-            A site on this machine has the same clock, so that its start time needs no
-            conversion.
+            A site on this machine has the same clock, so its start time needs no conversion.
             """
             return info.clock != local_clock, indices.get(info.member, -1)
 
@@ -327,7 +327,8 @@ class SessionJoin:
 
         since_epoch_ns = now_ns - epoch.mono_ns
         first_tick_after_ns = since_epoch_ns + EPOCH_AHEAD_NS + 2 * slowest_ns
-        # The division of the negative number rounds up: no tick before that time is chosen.
+        # The division of the negative number rounds up, so that no tick before that time is
+        # chosen.
         first = -(-first_tick_after_ns * rate_hz // NS_PER_S)
         self._attempt += 1
         self._admitted_by = set()
@@ -443,8 +444,8 @@ class SessionJoin:
         states which site it is about, the boot of that site (the number that identifies the
         start of its process), and the number of the request, because a request may be repeated.
 
-        Other sites may be admitted while this site waits. Their boots are noted in any case,
-        because they become members of the session.
+        Other sites may be admitted while this site waits. Their boots are always noted, because
+        they become members of the session.
 
         Args:
             event: An event of a running site. Events of other kinds are ignored.
@@ -478,8 +479,7 @@ class SessionJoin:
         leader. It learns the scenario from the identities of the sites, and ignores proposals
         until one of the listed sites has sent it.
 
-        The member agrees (`_reply_ready`) at once if it has measured the clocks of the others,
-        or later when it has.
+        The member agrees (`_reply_ready`) as soon as it has measured the clocks of the others.
 
         Args:
             event: Event `epoch`, the proposal.
@@ -502,7 +502,7 @@ class SessionJoin:
         local = self._info
         is_included = event.boots.get(local.member) == local.boot
         is_other_process_included = not is_included and local.member in event.boots
-        # A proposal with another recorder is no error: of two recorders, one joins late.
+        # A proposal with another recorder is no error, because one of two recorders joins late.
         if is_other_process_included and not is_recorder:
             raise SessionError(
                 f"session {self._session!r} continues with another process of {local.member}"
@@ -565,11 +565,11 @@ class SessionJoin:
         """Takes the next step of the leader: proposes an epoch, or confirms or withdraws it.
 
         An epoch is proposed once all members are present and their clocks are known. It is
-        confirmed once all members have agreed. It is withdrawn if a member is too late, is gone
-        or has joined meanwhile. The next call then proposes another one.
+        confirmed once all members have agreed. It is withdrawn if a member is too late, has
+        disappeared, or has joined in the meantime. The next call then proposes another one.
 
-        The decision must be made early enough that the confirmation reaches all members before
-        the epoch: `DECIDE_NS` and the slowest round trip before.
+        The decision must be made early enough for the confirmation to reach all members before
+        the epoch: earlier than the epoch by `DECIDE_NS` plus the slowest round trip.
 
         Returns:
             The epoch once it is confirmed. None until then.

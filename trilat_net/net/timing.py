@@ -1,4 +1,4 @@
-"""Decides when a running arm computes, and measures the clocks of the other arms.
+"""Decides when the control loop of an arm runs, and measures the clocks of the other arms.
 
 The control loop of each arm computes once per period, a tick. Tick k is due k * 10^9 // rate_hz
 ns after the epoch, the common start time of the session. If several loops run on one machine,
@@ -26,7 +26,7 @@ Invariant:
       faster or slower, by at most SLEW_LIMIT, and never by a step, so that no tick is skipped
       or repeated. If the leader disconnects, the site continues with the last estimate.
     - Measured delays never decide whether a sample is used. If a sample seems to arrive before
-      it was sent, this is counted as a clock fault, but the sample is used all the same.
+      it was sent, this is counted as a clock fault, but the sample is still used.
 """
 
 from array import array
@@ -60,8 +60,8 @@ class TickSchedule:
     """Times at which the ticks of one site (arm controller) are due, on the clock of that site.
 
     Tick k is due at a time that grows linearly with k. The rate of growth can be adjusted from
-    any tick (control period) on, so that the site keeps the same schedule as the leader, the
-    first site of the scenario, although their clocks differ.
+    any tick (control period) onwards, so that the site keeps the same schedule as the leader,
+    the first site of the scenario, although their clocks differ.
 
     Args:
         epoch_ns: Time of tick 0 on the site's clock, in ns.
@@ -77,7 +77,7 @@ class TickSchedule:
         self.slew = 0.0
         self.error_ns = 0
         self._rate_hz = rate_hz
-        # Nominal time and scheduled time of the tick from which on the present rate applies.
+        # Nominal time and scheduled time of the first tick to which the present rate applies.
         self._base_nominal_ns = 0
         self._base_ns = epoch_ns
         self._slew_per_ns = 0.0
@@ -148,9 +148,10 @@ class SentStamps:
         self._entries[slot + 1] = sent_ns
 
     def find_ns(self, tick: int) -> int | None:
-        """Returns when the sample of a tick was sent, on the local clock, in ns.
+        """Returns the time at which the sample of a tick was sent, on the local clock, in ns.
 
-        None if that time is not stored any more, or if no sample was sent in that tick.
+        The result is None if that time is not stored any more, or if no sample was sent in that
+        tick.
 
         Args:
             tick: Number of the tick (period of the control loop).
@@ -167,7 +168,8 @@ class PeerClock(NamedTuple):
     Attributes:
         name: Name of the peer.
         epoch_ns: Time of tick 0 on the peer's clock, in ns.
-        index_at_peer: Index of this site among the peers of that peer. Echoes name sites by it.
+        index_at_peer: Index of this site among the peers of that peer. Echoes identify sites by
+            this index.
         estimate: Offset of the peer's clock.
         estimator: Estimator that already contains the limits from pings. None if the peer runs
             on this machine, and therefore on this clock.
@@ -205,7 +207,7 @@ class LinkTimingMonitor:
         faults: Number of clock faults: impossible time stamps, and windows that contradict
             earlier ones.
         newest: Newest sample of the peer whose arrival this site has not confirmed yet: its
-            tick, and its arrival on the local clock in ns. None if all are confirmed.
+            tick, and its arrival on the local clock in ns. None if all samples are confirmed.
         worst_ns: Longest time by which a sample seemed to arrive before it was sent, since the
             last event about a fault, in ns. 0 if there was none.
         contradicted: True if a window has contradicted earlier windows since that event.
@@ -289,7 +291,8 @@ class LinkTimingMonitor:
             self.newest = sample.tick, arrived_ns
         self._received_ns = arrived_ns
 
-        # The peer confirms samples of all its peers. `index` says whose sample it is.
+        # The peer confirms samples of all its peers. `index` identifies the peer that sent the
+        # sample.
         for index, tick, peer_arrival_ns in sample.echo:
             if index != self._index_at_peer:
                 continue
@@ -432,7 +435,7 @@ ClockNotice = dict[str, Any]
 
 
 def find_turn_ns(index: int, sites: int, rate_hz: int) -> int:
-    """Returns by how much a site wakes up after the start of a control period, in ns.
+    """Returns the delay of a site's wake-up after the start of a control period, in ns.
 
     If all sites (arm controllers) of a machine woke up at the same time, they would compete for
     its processors. The sites are spread over half of a period. A sample (sent state) of the
@@ -501,7 +504,7 @@ class SiteTiming:
         return self.schedule.due_ns(k) + self.turn_ns
 
     def list_initial_notices(self) -> list[ClockNotice]:
-        """Returns how far the clocks of other sites differ at the start, as events for the log.
+        """Returns the initial offsets of other sites' clocks, as events for the log.
 
         Peers (other sites) on this machine have no offset and are left out.
 
@@ -545,8 +548,8 @@ class SiteTiming:
             monitor.admit(clock)
             return []
 
-        # The offset is the time at which the peer's first tick is due on its clock, minus the
-        # time at which the same tick of this site is due on this clock.
+        # The offset is the time at which the peer's first tick is due on the peer's clock,
+        # minus the time at which the same tick of this site is due on the local clock.
         k = t_ns * self._rate_hz // NS_PER_S
         due_ns = self.schedule.due_ns(k)
         offset_ns = epoch_ns + k * NS_PER_S // self._rate_hz - due_ns
@@ -608,7 +611,7 @@ class SiteTiming:
         the leader's schedule.
 
         An estimate of an offset takes a considerable part of a period. Therefore each call
-        estimates that of at most one peer.
+        estimates the offset of at most one peer.
 
         Args:
             k: Number of the next tick (period of the control loop). The adjusted schedule
@@ -634,7 +637,7 @@ class SiteTiming:
         return notices
 
     def _update_next_estimate(self, k: int, now_ns: int, due_ns: int) -> list[ClockNotice]:
-        """Estimates the clock offset of at most one peer, of each peer after another.
+        """Estimates the clock offset of at most one peer. The peers are taken in turn.
 
         One estimate takes a considerable part of a period. Several of them in one call would
         make the next tick late.
@@ -659,8 +662,8 @@ class SiteTiming:
         """Returns the events about a peer's clock faults and about its acknowledgements.
 
         Clock faults are reported at most once per `FAULT_EVERY_NS`. If the peer no longer
-        confirms the samples of this site (arm controller), this is reported once, and again
-        when it has ended.
+        confirms the samples of this site (arm controller), this is reported once, and its end
+        is reported as well.
 
         Args:
             index: Index of the peer.
@@ -679,14 +682,14 @@ class SiteTiming:
         is_acknowledged = monitor.is_acknowledged(now_ns)
         if is_acknowledged is None:  # not known at present
             return notices
-        was_acknowledged = not monitor.is_unacknowledged  # as reported by the last event
+        was_acknowledged = not monitor.is_unacknowledged  # value that the last event reported
         if is_acknowledged != was_acknowledged:
             monitor.is_unacknowledged = not is_acknowledged
             notices.append(_describe_acknowledgement(monitor, k))
         return notices
 
     def pop_measurements(self, now_ns: int) -> dict[str, Any]:
-        """Returns timing statistics of the site, and begins new ones for measured delays.
+        """Returns timing statistics of the site, and begins new statistics of measured delays.
 
         Args:
             now_ns: Present time on the local clock, in ns.
@@ -714,7 +717,7 @@ def _describe_estimate(monitor: LinkTimingMonitor, k: int, local_ns: int) -> Clo
 
     Args:
         monitor: Timing of the link from the peer (other site).
-        k: Tick (control period) from which on the offset applies.
+        k: First tick (control period) to which the offset applies.
         local_ns: Time of that tick on the local clock, in ns.
     """
     offset = monitor.offset
@@ -749,10 +752,10 @@ def _describe_fault(monitor: LinkTimingMonitor) -> ClockNotice:
     early_ns = monitor.worst_ns
     bound_ns = monitor.offset.bound_ns
     if early_ns:
-        fault = f"a sample came {early_ns / 1e6:.3f} ms before it was sent"
+        fault = f"a sample arrived {early_ns / 1e6:.3f} ms before it was sent"
     else:
         bound_us = bound_ns / 1000
-        fault = f"its stamps contradict those before, beyond the bound of {bound_us:.0f} us"
+        fault = f"time stamps contradict earlier ones, beyond the bound of {bound_us:.0f} us"
 
     return {
         "kind": "clock fault",
@@ -777,10 +780,10 @@ def _describe_acknowledgement(monitor: LinkTimingMonitor, k: int) -> ClockNotice
     if monitor.is_unacknowledged:
         timeout_ms = _UNHEARD_NS // 1_000_000
         kind = "unheard"
-        text = f"{name} is heard and does not hear: for {timeout_ms} ms it acknowledged nothing"
+        text = f"samples of {name} arrive, but {name} has acknowledged none for {timeout_ms} ms"
     else:
         kind = "heard"
-        text = f"{name} hears again"
+        text = f"{name} acknowledges samples again"
     return {"kind": kind, "text": text, "about": name, "ticks": k}
 
 
@@ -857,14 +860,14 @@ class LoopStats:
     def pop_stats(
         self, output: TickRecord, measured: Mapping[str, Any] | None = None
     ) -> LinkStats:
-        """Returns the statistics after a tick, and resets their largest times.
+        """Returns the statistics after a tick, and resets the largest times in them.
 
         These are the largest lateness of a tick and the largest computing time since the last
         call.
 
         Args:
             output: Result of the tick.
-            measured: Timing fields of `LinkStats`. None leaves them at their defaults.
+            measured: Timing fields of `LinkStats`. If None, they keep their defaults.
         """
         peers = self._site.peers
         counts = dict(zip(peers, self._site.counts(), strict=True))

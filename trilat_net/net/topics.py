@@ -175,7 +175,8 @@ def count_messages(channel: str, ticks: int, rate_hz: int) -> int:
     """
     if channel != LINK:
         return ticks
-    # Rounded up, as statistics are published after tick 0: -(-a // b) rounds a / b up.
+    # The number is rounded up, because statistics are published after tick 0: -(-a // b) rounds
+    # a / b up.
     return -(-ticks // ticks_per_stats(rate_hz))
 
 
@@ -199,7 +200,7 @@ def skipped_numbers(
     skipped: int,
     rate_hz: int,
 ) -> tuple[int, int]:
-    """Returns which numbers the messages of skipped ticks would have had.
+    """Returns the numbers that the messages of skipped ticks would have had.
 
     A site (arm controller) that is late may skip ticks, periods of its control loop, and then
     publishes no messages for them. Their numbers remain unused, and must not count as lost

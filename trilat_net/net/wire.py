@@ -119,7 +119,7 @@ def encode_state(
         late_us: Time by which the tick began late, in us.
         busy_us: Computing time of the previous tick, in us.
         sent_ns: Time of sending, in ns since the epoch (the common start of the session) on the
-            site's clock. None uses the nominal time of the tick, as in simulations.
+            site's clock. If None, the nominal time of the tick is used, as in simulations.
         echo: Newest sample that has arrived from each peer, by which the peer can measure the
             delay to this site, see `State.echo`.
 
@@ -198,7 +198,7 @@ def encode_sample(
     sent_ns: int,
     echo: Sequence[Sequence[int]],
 ) -> bytes:
-    """Encodes the message with which a site tells other sites its state in one tick.
+    """Encodes the message with which a site publishes its state in one tick to other sites.
 
     A tick is one period of the control loop. This message (sample) is shorter than the record
     of the same tick, because it contains only what the peers (other sites) need.
@@ -336,7 +336,8 @@ def decode(
         versions: Accepted versions of the schema. Logs may contain older versions, see
             `READABLE`.
         layout: Numbers of joints, peers and arm parameters of the sender, from which the
-            lengths of the vectors in the message follow. None accepts vectors of any length.
+            lengths of the vectors in the message follow. If None, vectors of any length are
+            accepted.
 
     Returns:
         The message.
@@ -362,8 +363,8 @@ def make_decoder(
     Args:
         kind: Expected type of the messages.
         versions: Accepted versions of the schema, the definition of the messages' fields.
-        layout: Numbers of joints, peers and parameters of the sender. None accepts vectors of
-            any length.
+        layout: Numbers of joints, peers and parameters of the sender. If None, vectors of any
+            length are accepted.
 
     Returns:
         The function, which raises WireError as `decode` does.
@@ -390,7 +391,7 @@ def make_decoder(
         - `get_vectors`: returns the fields of a message that are vectors, such as the joint
           angles. None if the type has no vectors.
         - `lengths_by_name`: lengths of these vectors, by name.
-        - `required_lengths`: the same lengths as a list. None accepts any lengths.
+        - `required_lengths`: the same lengths as a list. If None, any lengths are accepted.
 
         Args:
             payload: The encoded message.

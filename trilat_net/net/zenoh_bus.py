@@ -44,7 +44,7 @@ _SHARED_POOL = (
     "(rx:(worker_threads:4),tx:(handover:rx),acc:(handover:rx),"
     "net:(handover:rx),app:(handover:rx))"
 )
-"""Zenoh's runtime setting that makes its five thread pools share the threads of one."""
+"""Zenoh's runtime setting that makes its five thread pools share the threads of one pool."""
 MAX_DEPTH = 100
 """Largest permitted nesting of a user's Zenoh file.
 
@@ -56,12 +56,13 @@ T = TypeVar("T")
 
 
 def share_threads() -> None:
-    """Makes Zenoh use one thread pool instead of five, for all sessions opened from now on.
+    """Makes Zenoh use one thread pool instead of five in sessions that are opened from now on.
 
-    With several pools, their threads wake each other for each message, which costs time. The
-    pool has four threads although one is enough for the work: closing a connection whose peer
-    never received its last bytes blocks a thread for up to 10 s (eclipse-zenoh/zenoh#1101). The
-    other threads then continue to serve the other members (processes of a session).
+    With several pools, threads of different pools wake each other for each message, which takes
+    time. The pool has four threads although one is enough for the work: closing a connection
+    whose peer never received its last bytes blocks a thread for up to 10 s
+    (eclipse-zenoh/zenoh#1101). The other threads then continue to serve the other members
+    (processes of a session).
 
     A router must not call this function. A router that waits for room in its output queue
     blocks the thread that reads, and needs another pool to empty the queue.
@@ -93,7 +94,7 @@ class _ZenohRing(Generic[T]):
         self._read = read
 
     def poll(self) -> T | None:
-        """Removes the oldest usable entry from the queue and returns it. None if there is none.
+        """Removes the oldest usable entry from the queue and returns it. None if it is empty.
 
         An entry is a message or a reply. Entries for which `read` returns None, such as error
         replies, are skipped. The queue of a query also counts as empty once all replies have
@@ -380,7 +381,8 @@ class ZenohBus:
                 key replies.
             payload: Payload of the query.
         """
-        # Not a ring channel: it loses its replies when the last one has arrived.
+        # A ring channel is not used, because it loses its replies when the last reply has
+        # arrived.
         replies = self._session.get(
             key,
             handlers.FifoChannel(256),
@@ -389,7 +391,7 @@ class ZenohBus:
             timeout=_QUERY_TIMEOUT_S,
             allowed_destination=Locality.REMOTE,
             payload=payload,
-            # Replies inherit these settings, so that no member waits for a hanging receiver.
+            # Replies inherit these settings, so that no member waits for a receiver that hangs.
             congestion_control=CongestionControl.DROP,
             priority=Priority.REAL_TIME,
         )
@@ -460,7 +462,7 @@ def read_zenoh_file(path: Path) -> ZenohFile:
         with reading(path, UsageError) as stream:
             text = stream.read().decode("utf-8-sig")
     except UnicodeDecodeError:
-        raise UsageError(f"{path}: is not UTF-8 text") from None
+        raise UsageError(f"{path} is not UTF-8 text") from None
     return check_zenoh_file(str(path), _parse_json5(str(path), text), _find_refusal)
 
 

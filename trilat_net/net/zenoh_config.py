@@ -168,8 +168,8 @@ def merge_settings(base: Mapping[str, Any], overrides: Mapping[str, Any]) -> dic
 
     Args:
         base: The settings.
-        overrides: Values that replace those of `base`, at any level. Settings of `base` that
-            `overrides` does not mention stay.
+        overrides: Values that replace those of `base`, at any level. Settings that appear only
+            in `base` are kept.
     """
     merged = dict(base)
     for key, value in overrides.items():
@@ -207,7 +207,7 @@ def _require_value(required: object, text: str) -> _Requirement:
 
 
 def _require_minimum(minimum: int, text: str) -> _Requirement:
-    """Returns the requirement that a setting is an integer of at least a certain size.
+    """Returns the requirement that a setting must be an integer not below a minimum.
 
     Args:
         minimum: The smallest permitted value.
@@ -304,7 +304,7 @@ _FILE_KEYS = r"transport/(link/tls/\w+_(certificate|private_key)|auth/usrpwd/dic
 """Pattern of the keys whose values are names of files.
 
 These files are opened during the check, to report unreadable files early. Zenoh opens them only
-when it connects, and then tries again for ever.
+when it connects, and then tries again forever.
 """
 
 
@@ -331,7 +331,7 @@ class ZenohFile:
         Args:
             side: "listen" for the endpoints at which the member (process of a session) listens,
                 or "connect" for those to which it connects.
-            mode: Mode of the member, as the file may name other endpoints for each mode.
+            mode: Mode of the member. The file may name different endpoints for each mode.
 
         Returns:
             The endpoints. None if the file names none.
@@ -361,7 +361,7 @@ def check_zenoh_file(
 
     Raises:
         UsageError: The file is not a Zenoh configuration, or contradicts the requirements of a
-            session. The message lists all keys that do so.
+            session. The message lists all keys with such contradictions.
     """
     if not isinstance(stated, dict):
         raise UsageError(f"{source}: a Zenoh configuration must be a single object in braces")
@@ -467,7 +467,7 @@ def _drop_key(settings: dict[str, Any], path: str) -> None:
 def _remove_nulls(settings: Mapping[str, Any]) -> dict[str, Any]:
     """Returns a copy of nested settings without the keys whose value is null.
 
-    A key with null states nothing, so it must not be checked as a choice of the user.
+    A key with the value null sets nothing, so it must not be checked as a choice of the user.
     """
     return {
         key: _remove_nulls(value) if isinstance(value, dict) else value
@@ -501,7 +501,7 @@ def _find_refused_keys(
     refusal: Callable[[Mapping[str, Any]], str],
     path: tuple[str, ...],
 ) -> Iterator[tuple[tuple[str, ...], str]]:
-    """Finds out which settings Zenoh refuses, by trying each setting alone.
+    """Finds the settings that Zenoh refuses, by trying each setting alone.
 
     Args:
         settings: Settings below `path`.
@@ -567,8 +567,7 @@ class _Role(NamedTuple):
         publishes: Channels that the member publishes under its own name.
         replies: Channels on which the member answers queries to its own name.
         receives_addressed: Channels that the member receives under its own name.
-        publishes_to: Channels that the member publishes under the name of the member that shall
-            receive them.
+        publishes_to: Channels that the member publishes under the name of the receiving member.
     """
 
     receives: tuple[str, ...]

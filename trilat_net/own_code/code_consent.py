@@ -101,8 +101,9 @@ def allow_own_code(
         scenario: Scenario that names the code.
         codes: Classes that the user named, for example "package.module:Law". If None, the user
             wrote the whole scenario, so all its code may run.
-        changed_from: Scenario from which the user made this one. Code that may run there may
-            run here as well, with its new arguments. None if there is no such scenario.
+        changed_from: Scenario that the user changed to get this scenario. Code that may run
+            there may run here as well, with its new arguments. None if there is no such
+            scenario.
 
     Returns:
         The same scenario.
@@ -165,8 +166,8 @@ def allow_logged_code(
 
     Args:
         scenario: Scenario of the log, which names the code.
-        law: Python files that the person permits to run. By default, there are none.
-        other_version: If True, a file may differ from the one that ran.
+        law: Python files that the person permits to run. By default, no file is permitted.
+        other_version: If True, a file may differ from the file that ran.
         remember: If True, the permission is stored for later logs.
 
     Raises:
@@ -246,7 +247,7 @@ def _read_store() -> dict[str, _RememberedFile]:
 
 
 def _write_store(remembered: Mapping[str, _RememberedFile]) -> None:
-    """Writes all permissions to run code to the user's file, in place of the earlier ones."""
+    """Replaces the permissions to run code in the user's file by the given permissions."""
     make_folder(_find_store().parent)
     # The file may be a link: people link their settings to a folder under version control.
     store = _find_store().resolve()
@@ -285,13 +286,13 @@ def _allow_file(
     if not keys:
         names = ", ".join(sorted({key.code for key in logged})) or "no external code"
         raise UsageError(
-            f"--law {file}: does not contain code that the log names; the log names {names}"
+            f"--law {file} does not contain code that the log names; the log names {names}"
         )
     for key in keys:
         if key.sha256 != sha256 and not other_version:
             versions = _compare_hashes(key, sha256)
             problem = f"is not the file that ran as {key.code}: {versions}"
-            raise UsageError(f"--law {file}: {problem}; --other-version accepts it")
+            raise UsageError(f"--law {file} {problem}; --other-version accepts it")
         check_class(source, key.code, "--law", logged[key].method)
         allowed_code[key] = CodeConsent(source.file, sha256)
     return sha256, keys
@@ -351,7 +352,7 @@ class _LoggedUserLaw(NamedTuple):
 def find_user_laws(scenario: ScenarioWithCode) -> list[_LoggedUserLaw]:
     """Returns the control laws in an experiment that are users' classes, without running them.
 
-    Each entry tells whether the law may run, and which file would be used.
+    Each entry states whether the law may run, and which file would be used.
 
     Args:
         scenario: Scenario of a log.

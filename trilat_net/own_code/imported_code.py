@@ -206,7 +206,7 @@ class CodeKey(NamedTuple):
     def import_class(self, path: str, method: str = "torque") -> Any:
         """Imports a user's class from its permitted file.
 
-        The file must be the one that a person permitted. It is checked before any of its code
+        The file must be the file that a person permitted. It is checked before any of its code
         runs.
 
         Args:
@@ -309,7 +309,7 @@ def _list_differences(
 ) -> list[str]:
     """Returns a string for each argument whose value differs, such as "gain = 5 (was 3)".
 
-    An argument that is missing on one side has its default there.
+    An argument that one of the two sets does not contain has its default value in this set.
     """
     old_texts = {key: describe_setting(value) for key, value in old_settings.items()}
     new_texts = {key: describe_setting(value) for key, value in new_settings.items()}
@@ -480,7 +480,7 @@ def _find_spec(module: str) -> ModuleSpec | None:
         if finder is PathFinder or finder.__module__.startswith("__editable__")
     ]
 
-    # The packages around the module are looked up first, from the outermost one on.
+    # The enclosing packages of the module are looked up first, starting with the outermost.
     spec = None
     search_folders = None
     parts = module.split(".")
@@ -519,7 +519,7 @@ PAGES = {
 
 
 def check_class(source: _CodeSource, code: str, path: str, method: str = "torque") -> None:
-    """Checks that a Python file defines a certain class with a certain method.
+    """Checks that a Python file defines a given class with a given method.
 
     The check parses the file and runs no code of it, because the code may not have been
     permitted to run yet.

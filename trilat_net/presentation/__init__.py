@@ -42,7 +42,6 @@ __all__ = [
     "EpisodePicture",
     "FigureSize",
     "figure",
-    "is_position",
     "style",
     "write_figure",
     "write_figures",
@@ -64,7 +63,7 @@ if TYPE_CHECKING:
     from .certificate_text import describe_judgement
     from .citation import compose_citation
     from .conclusion import Conclusion, conclude, conclude_files
-    from .episode_picture import EpisodePicture, is_position
+    from .episode_picture import EpisodePicture
     from .export import Exporter
     from .exports import list_export_formats
     from .figures.registry import FIGURES, figure, write_figures, write_overlay
@@ -87,7 +86,7 @@ else:
             "certificate_text": "describe_judgement",
             "citation": "compose_citation",
             "conclusion": "Conclusion conclude conclude_files",
-            "episode_picture": "EpisodePicture is_position",
+            "episode_picture": "EpisodePicture",
             "export": "Exporter",
             "exports": "list_export_formats",
             "figures.registry": "FIGURES figure write_figures write_overlay",

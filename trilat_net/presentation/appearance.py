@@ -2,7 +2,7 @@
 
 An arm has the same colour in every figure and on every page. The first three colours are the
 "high contrast" set of Paul Tol's notes on colour: people with colour blindness can distinguish
-them, and they differ in lightness, also in grey print.
+them, and they differ in lightness, so they remain distinct in grey print.
 
 Invariant:
     - Text in printed figures is 8 pt high throughout.
@@ -44,7 +44,7 @@ PAGE_IN = 7.0
 class FigureSize(NamedTuple):
     """Width, type sizes and resolution of figures.
 
-    They differ between a report on a screen and a printed paper.
+    These sizes differ between a report on a screen and a printed paper.
 
     Attributes:
         width_in: Width of the figure, in inches.
@@ -62,7 +62,7 @@ class FigureSize(NamedTuple):
     def narrow(self) -> bool:
         """True if the figure is narrower than 5 in: too narrow for two panels side by side.
 
-        Figures then put their panels, parts with axes of their own, below each other, or show
+        Such figures place their panels (parts with their own axes) below each other, or show
         fewer labels.
         """
         return self.width_in < 5.0
@@ -75,7 +75,7 @@ class FigureSize(NamedTuple):
             width_in: Width in inches: 3.5 for one column, or 7 for two columns.
 
         Raises:
-            UsageError: The width is neither of them.
+            UsageError: The width is neither of these values.
         """
         if width_in not in (COLUMN_IN, PAGE_IN):
             raise UsageError(

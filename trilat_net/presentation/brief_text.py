@@ -5,10 +5,11 @@ other. With the option --all, these commands print everything, see `certificate_
 `summary_text`.
 
 Invariant:
-    - A short text has at most `MOST_LINES` lines, and a further line that names --all. The
+    - A short text has at most `MOST_LINES` lines, and one more line that mentions --all. The
       meaning of a judgement and remarks about the run are not counted.
-    - The lines are among those that --all prints, or the largest of the numbers that it prints.
-    - The judgement comes first, and a line that speaks against stability is never left out.
+    - Each line is also printed with --all, or contains the largest of the values that --all
+      prints.
+    - The judgement comes first, and a line that contradicts stability is never left out.
 """
 
 from collections.abc import Iterator
@@ -50,7 +51,7 @@ _KEY_METRICS = (
 )
 """Keys of metrics, the most important first. The first ten that a run has are printed."""
 _PREMISES = "premises are what the theorem requires (docs/reference/certificate-premises.md)"
-"""Explanation of a word that `trilat certify` uses."""
+"""Explanation of the word "premise" in the output of `trilat certify`."""
 _MARK_RANKS = {"FAIL": 0, "open": 1, "ok": 2, "note": 3}
 """Importance of a line of a certificate, by its mark."""
 
@@ -83,7 +84,7 @@ def compose_key_reasons(certificate: Certificate) -> Iterator[Block]:
 def _choose_lines(lines: list[CertificateLine]) -> list[CertificateLine]:
     """Selects the most important lines of a stability certificate, in their original order.
 
-    Lines that speak against stability are more important than lines that confirm it.
+    Lines that contradict stability are more important than lines that confirm it.
 
     Args:
         lines: All lines of the certificate, of which the first is the judgement.
@@ -96,13 +97,13 @@ def _choose_lines(lines: list[CertificateLine]) -> list[CertificateLine]:
 
 
 def compose_key_metrics(metrics: LogMetrics) -> Iterator[Block]:
-    """Yields a table with the ten most important numbers of a run, each with its subject.
+    """Yields a table with the ten most important metrics of a run, each with its subject.
 
-    The subject is, for example, the site with the largest value, or "every site" if all have
-    the same.
+    The subject is, for example, the site with the largest value, or "every site" if all sites
+    have the same value.
 
     Args:
-        metrics: All numbers of the run.
+        metrics: All metrics of the run.
     """
     by_key = {quantity.key: quantity for quantity in quantities()}
     rows = []
@@ -116,15 +117,15 @@ def compose_key_metrics(metrics: LogMetrics) -> Iterator[Block]:
 
 
 def _make_row(metrics: LogMetrics, quantity: Quantity) -> list[str]:
-    """Returns the row of a quantity in the short table of a run's most important numbers.
+    """Returns the row of a quantity in the short table of a run's most important metrics.
 
-    The row has the name of the quantity, its number, its unit, and the subject (such as a site)
-    to which the number belongs. If the number is unknown, the row has the reason instead of the
-    subject.
+    The row contains the name of the quantity, its value, its unit, and the subject (such as a
+    site) to which the value belongs. If the value is unknown, the row contains the reason
+    instead of the subject.
 
     Returns:
-        The four texts of the row. Empty if the run cannot have the quantity, or if a missing
-        number needs no explanation.
+        The four texts of the row. Empty if the quantity cannot exist for this run, or if a
+        missing value needs no explanation.
     """
     applicable = {
         subject: metric
@@ -138,7 +139,7 @@ def _make_row(metrics: LogMetrics, quantity: Quantity) -> list[str]:
     run_metric = metrics.run_value(quantity)
     if run_metric.value is None:
         is_known_for_some = any(metric.value is not None for metric in applicable.values())
-        # A run that never settles is worth a line, although no site has a settling time.
+        # A run that never settles gets a line, although no site has a settling time.
         needs_reason = quantity.key == "settle_s" or is_known_for_some
         if not needs_reason:
             return []
@@ -150,11 +151,11 @@ def _make_row(metrics: LogMetrics, quantity: Quantity) -> list[str]:
 
 
 def _name_subject(quantity: Quantity, values: dict[str, Metric]) -> str:
-    """Returns the name of the subject to which a number in the table of key numbers belongs.
+    """Returns the name of the subject to which a value in the short table belongs.
 
-    A quantity has a number per site, for example, and the table shows only the largest. The
-    name is then that of the site, such as "m1". It is "all sites together" for a sum, and
-    "every site" if all numbers are equal.
+    For example, a quantity has a value per site, and the table shows only the largest value.
+    The name is then that of the site, such as "m1". The name is "all sites together" for a sum,
+    and "every site" if all values are equal.
     """
     numbers = {subject: metric.value for subject, metric in values.items()}
     known_values = {subject: value for subject, value in numbers.items() if value is not None}

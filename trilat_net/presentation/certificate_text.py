@@ -53,13 +53,15 @@ _OTHER_ENDS = {
     EndBehaviour.CONVERGED: "the record ends with slow arms",
     EndBehaviour.DECAYS: "the motion decays at the end of the record",
     EndBehaviour.HARDLY: "the motion hardly decays at the end of the record",
-    EndBehaviour.UNDECIDED: "the record alone decides nothing",
+    EndBehaviour.UNDECIDED: "the record alone does not decide",
     EndBehaviour.COASTS: "an arm coasts at the end of the record",
     EndBehaviour.BOUNDED: "the arms still swing at the end of the record",
     EndBehaviour.DRIFTS: "an arm still drifts at the end of the record",
     EndBehaviour.GROWS: "the motion still grows at the end of the record",
 }
-"""Clauses about the end of a record that alone would be judged otherwise than its run."""
+"""Clauses about the end of a record, for runs whose judgement differs from that of the end
+alone.
+"""
 
 _HOLDS = {True: "holds", False: "fails", None: "undecided"}
 
@@ -67,7 +69,7 @@ _HOLDS = {True: "holds", False: "fails", None: "undecided"}
 def compose_certificate(certificate: Certificate) -> Iterator[Block]:
     """Yields the text of a stability certificate: judgement, reasons, and tables.
 
-    The tables have the premises (conditions of the stability theorem) and the energies.
+    The tables contain the premises (conditions of the stability theorem) and the energies.
 
     Args:
         certificate: Judgement whether a run was stable, with its reasons.
@@ -124,11 +126,11 @@ def _tabulate_premises(premises: Sequence[premise_quantities.Premise]) -> TextTa
 
 
 def compose_twins(twins: PushedTwins) -> Iterator[Block]:
-    """Yields the text about repetitions of a run that received a small push.
+    """Yields the text about the repetitions of a run with small pushes.
 
     A repetition with a push is called a twin, and shows whether small disturbances grow. The
-    text states up to which size a push has a proportional effect, and has a line about each
-    push.
+    text states the size up to which the effect of a push is proportional to the push, and
+    contains a line about each push.
 
     Args:
         twins: The run and its twins.
@@ -145,7 +147,7 @@ class CertificateLine(NamedTuple):
     """One line of a stability certificate: a sentence with a mark such as "ok" or "FAIL".
 
     Attributes:
-        mark: "ok" if the sentence supports that the run was stable, "FAIL" if it speaks against
+        mark: "ok" if the sentence supports that the run was stable, "FAIL" if it contradicts
             it, "open" if it leaves the question open, and "note" for other sentences.
         text: The sentence.
     """
@@ -155,10 +157,10 @@ class CertificateLine(NamedTuple):
 
     @property
     def print_form(self) -> MarkedText:
-        """The sentence behind its coloured mark, as the terminal and the page show it.
+        """The sentence with its coloured mark, as the terminal and the page show it.
 
-        The mark says "ok", for example. If the sentence begins with the same word and a colon,
-        it is left out, so that it does not appear twice.
+        For example, the mark is "ok". If the sentence begins with the same word and a colon,
+        the word is left out of the sentence, so that it does not appear twice.
         """
         return MarkedText(MARKS[self.mark], self.text.removeprefix(f"{self.mark}: "))
 
@@ -220,7 +222,7 @@ def describe_in_words(certificate: Certificate) -> list[CertificateLine]:
 
 
 def _explain_judgement(certificate: Certificate) -> str:
-    """Returns what a judgement means for small disturbances, as a sentence in plain words.
+    """Returns a sentence in plain words on what a judgement means for small disturbances.
 
     For example: "a small disturbance halves every 0.83 s".
 
@@ -235,14 +237,14 @@ def _explain_judgement(certificate: Certificate) -> str:
     if stability is Stability.SETTLED:
         return (
             f"{describe_settling(certificate)}; "
-            "`trilat certify --accept settled` takes this for a success"
+            "`trilat certify --accept settled` counts this as success"
         )
 
     decay_rate = describe_pace(certificate)
     if stability is Stability.NOT_STABLE:
         return decay_rate or "the motion of this run does not come to rest"
 
-    # The run is stable. The theorem may be silent about it, which users would ask about.
+    # The run is stable. Users would ask why if the theorem does not apply to it.
     explanation = decay_rate or "small disturbances die away"
     if not certificate.has_functional:
         return f"{explanation}; the theorem of the paper is about another control law"
@@ -252,7 +254,7 @@ def _explain_judgement(certificate: Certificate) -> str:
 
 
 def describe_settling(certificate: Certificate) -> str:
-    """Returns a clause on what was observed of a run that settled, without a stability proof.
+    """Returns a clause on the observed motion of a run that settled without a stability proof.
 
     A settled run has become slow, or its motion decays. Its arms need not be at rest.
 
@@ -269,8 +271,9 @@ def describe_settling(certificate: Certificate) -> str:
 def describe_pace(certificate: Certificate) -> str:
     """Returns how fast a small disturbance of the final pose dies away or grows, as a sentence.
 
-    For example: "a small disturbance halves every 0.83 s". The rate is that of the slowest or
-    fastest growing characteristic root of the linearised control loop.
+    For example: "a small disturbance halves every 0.83 s". The rate is that of the
+    characteristic root of the linearised control loop that decays most slowly or, if a root
+    grows, of the root that grows fastest.
 
     Args:
         certificate: Judgement whether a run was stable, with its reasons.
@@ -317,16 +320,17 @@ def _describe_verdict(certificate: Certificate) -> list[CertificateLine]:
 
 
 def describe_theorem(certificate: Certificate) -> list[str]:
-    """Returns a line on what the paper's stability theorem says about a run.
+    """Returns a line that says whether the paper's stability theorem applies to a run.
 
     A theorem in the paper guarantees stability if the controller and the network fulfil its
-    conditions. The line states whether they were fulfilled.
+    conditions. The line states whether these conditions were fulfilled.
 
     Args:
         certificate: Judgement whether a run was stable, with its reasons.
 
     Returns:
-        The line. Empty if the theorem is about another control law, and has nothing to say.
+        The line. Empty if the theorem is about a different control law and therefore does not
+        apply.
     """
     if not certificate.has_functional:
         return []
@@ -337,15 +341,16 @@ def describe_theorem(certificate: Certificate) -> list[str]:
 def _compare_rates(
     roots: decision_facts.LoopRoots | None, twins: TwinGrowth
 ) -> list[CertificateLine]:
-    """Returns a remark why two measured rates of decay differ, if their printed numbers do.
+    """Returns a remark on why two rates of decay differ, if their printed values differ.
 
     A certificate states the rate of the characteristic roots, and the rate at which small
-    pushes of the arms died away in repetitions of the run (twins). Both belong to amplitudes.
-    The roots describe small motions near one pose, whereas a push follows the motion of the run
-    for a limited time.
+    pushes of the arms died away in repetitions of the run (twins). Both are rates of
+    amplitudes. The roots describe small motions near one pose, whereas a push develops along
+    the motion of the run for a limited time.
 
     Args:
-        roots: Characteristic roots of the loop at its final pose. None if there are none.
+        roots: Characteristic roots of the loop at its final pose. `None` if they were not
+            computed.
         twins: Growth of the pushes.
 
     Returns:
@@ -384,7 +389,7 @@ def _describe_evidence(certificate: Certificate) -> CertificateLine:
 
 
 def _describe_paper_weights(certificate: Certificate) -> str:
-    """Returns how much V would have risen with the weights that the paper gives to the sites.
+    """Returns a sentence on the rise that V would have had with the weights of the paper.
 
     V is the energy function of the stability proof, a weighted sum over the sites. The paper's
     weights, all equal to 1, are right only for some networks.
@@ -428,9 +433,10 @@ def compose_headline(certificate: Certificate) -> str:
 
 
 def _describe_end(certificate: Certificate) -> str:
-    """Returns how the motion of a run ends, as a phrase that claims no more than its judgement.
+    """Returns a phrase on the end of a run's motion that claims no more than the judgement.
 
-    Only a run that is judged as settled needs numbers: the error e and the joint speed |qd|.
+    Only the phrase for a run that is judged as settled contains values: the error e and the
+    joint speed |qd|.
     """
     end = certificate.end
     if certificate.stability is not Stability.SETTLED:
@@ -496,8 +502,8 @@ _ROOT_MARKS = {"stable": "ok", "unstable": "open"}
 def _mark_twins(twins: TwinGrowth) -> str:
     """Returns the mark of the sentence about twins: "ok" if all pushes die away.
 
-    It is "FAIL" if a push grows or its repetition leaves the run, "note" without pushes, and
-    "open" otherwise.
+    The mark is "FAIL" if a push grows or the repetition departs from the run, "note" without
+    pushes, and "open" otherwise.
     """
     if not twins.pushes:
         return "note"
@@ -511,10 +517,10 @@ def _describe_balance(balance: EnergyBalance) -> str:
     """Returns a sentence about how well the energy balance of a run closes.
 
     V is the energy function of the stability proof, in J. Its change should equal the work that
-    was done on the arms less the dissipated energy. The difference is the residual. One cause
+    was done on the arms minus the dissipated energy. The difference is the residual. One cause
     is that the controller acts only once per tick (period of the control loop), while the proof
     assumes continuous time. The work of this sampling is computed. The sentence therefore also
-    says how small the residual is without it.
+    says how small the residual is without this work.
 
     Args:
         balance: The energy balance of the run.
@@ -530,14 +536,14 @@ def _describe_balance(balance: EnergyBalance) -> str:
         return text
 
     unexplained_fraction = unexplained_j / scale_j
-    return f"{text}; to {unexplained_fraction:.1e} once the controller's sampling is booked"
+    return f"{text}; to {unexplained_fraction:.1e} once the controller's sampling is included"
 
 
 def list_energies(balance: EnergyBalance) -> list[tuple[str, float]]:
     """Lists the energies of the balance of V, the energy function of the stability proof.
 
-    They are V at the start, the energies that changed V, and V at the end, in J. Energies below
-    `MIN_ENERGY_SHARE` of the largest energy are left out. If there are more than
+    The entries are V at the start, the energies that changed V, and V at the end, in J.
+    Energies below `MIN_ENERGY_SHARE` of the largest energy are left out. If there are more than
     `MAX_LISTED_LINKS` links, their energies are summed.
 
     Args:
@@ -593,8 +599,8 @@ def _compute_rest(balance: EnergyBalance) -> Array:
 def _describe_v(balance: EnergyBalance, index: int) -> tuple[str, float]:
     """Returns the name and the value in J of the energy function V at one tick.
 
-    The name is for example "V at 2.5 s". A tick is a control period. A V that is smaller than
-    rounding errors counts as 0.
+    The name is for example "V at 2.5 s". A tick is a control period. If V is smaller than the
+    rounding errors, 0 is returned.
     """
     energy_j = float(balance.V[index])
     shown_j = energy_j if energy_j > ZERO_ENERGY_J else 0.0

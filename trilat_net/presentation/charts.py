@@ -1,7 +1,7 @@
 """Computes the data of the interactive charts in the report of a run, a web page.
 
-Scripts in the page draw the charts. For this they need signals of the run, such as joint angles
-and torques. A log typically has a value per millisecond, which is far too much for a page.
+Scripts in the page draw the charts. The charts need signals of the run, such as joint angles
+and torques. A log typically contains a value per millisecond, which is far too much for a page.
 `ChartBuilder` therefore divides the time into intervals, and keeps the least and the largest
 value of each interval (decimation). The result consists of tables of columns, and of charts
 whose lines refer to these columns by index. `page_data` defines the types of the data.
@@ -10,9 +10,9 @@ Invariant:
     - Every spike of the log is on the page, because decimation keeps the least and the largest
       value of an interval.
     - Every line of a chart has a value to draw. A chart without any line is left out, and
-      `_PageCharts.missing` names it, so that the page can say so.
-    - Numbers are base64 text of little-endian int32 and float32. This is a third of their
-      length as decimal text.
+      `_PageCharts.missing` names the chart, so that the page can mention it.
+    - Numbers are stored as base64 text of little-endian int32 and float32, which is a third of
+      the length of decimal text.
 """
 
 import base64
@@ -60,7 +60,8 @@ Values = NDArray[Any]
 """Numbers of any type."""
 
 BUCKET_BUDGET = 48_000
-"""Number of buckets of all columns together. It keeps a page near 1 MB for any number of sites.
+"""Number of buckets of all columns together. This limit keeps a page near 1 MB for any number
+of sites.
 """
 _MIN_BUCKETS = 100
 """Smallest number of buckets of a column, whatever the budget."""
@@ -73,7 +74,9 @@ _CHAIN_INSTANTS = 400
 _MAXIMA = 400
 """Number of intervals of a line of maxima."""
 _LEAST_DRAWN = 1e-6
-"""Smallest drawn maximum, at which smaller ones are drawn. A logarithmic axis has no zero."""
+"""Smallest drawn maximum. Smaller maxima are drawn at this value, because a logarithmic axis
+has no zero.
+"""
 PICTURE_SIDE = 4.0
 """Longer side of a scaled picture, in the unit of the line widths of the page."""
 
@@ -96,21 +99,21 @@ class _PageCharts(NamedTuple):
 class ChartBuilder:
     """Computes from a log the charts of the web page that reports the run.
 
-    The numbers become tables, from which the scripts of the page draw the charts in the
-    browser.
+    The values of the signals become tables, from which the scripts of the page draw the charts
+    in the browser.
 
     Args:
         log: Log of the run.
         twin: Log of the same run without operators, the people or programs that move the arms.
-            None if there is no such log. Then the chart of the motion due to operators is left
-            out.
+            If `None`, the chart of the motion due to operators is left out.
 
     Attributes:
         bounds_m: Left, right, bottom and top of a box around the motion of all arms, in m.
         units_per_m: Scale of the pictures of the arms, in units of the picture per m. Pictures
             with a chain, and of planar arms that move in less than half of `PICTURE_SIDE`, are
-            scaled to that size, because the widths of lines are fixed. Otherwise it is 1.
-        leads: Who leads each slave over time.
+            scaled to that size, because the widths of lines are fixed. Other pictures have the
+            scale 1.
+        leads: Weights with which each slave follows the other arms over time.
     """
 
     def __init__(self, log: Log, twin: Log | None) -> None:
@@ -151,8 +154,8 @@ class ChartBuilder:
     def build(self) -> _PageCharts:
         """Computes all charts of the page: overview, motion of the arms, and timing.
 
-        A chart without any curve, for example of a law that has no estimates, is left out. The
-        page mentions the titles of such charts by section.
+        A chart without any curve is left out, for example the estimates of a law that has none.
+        The page lists the titles of such charts by section.
 
         Returns:
             The data of the page, and the titles of the charts that are left out.
@@ -203,8 +206,8 @@ class ChartBuilder:
     def _build_overview_charts(self) -> Iterator[TimeChart]:
         """Yields the two charts of the first screen: the error and the delay of each site.
 
-        A site has a single line in each: the largest error of its joints, and the age of the
-        oldest sample that its controller used.
+        In each chart a site has a single line: the largest error of its joints, or the age of
+        the oldest sample that its controller used.
         """
         log = self._log
         unit = plot_signals.shared_unit(log)
@@ -244,7 +247,7 @@ class ChartBuilder:
             unit: Unit of the errors.
 
         Returns:
-            The sentence behind a space. Empty if no site has such small errors.
+            The sentence, preceded by a space. Empty if no site has such small errors.
         """
         for site in self._log.sites:
             largest = site_signals.largest_magnitude(site_signals.joint_errors(self._log[site]))
@@ -253,10 +256,10 @@ class ChartBuilder:
         return ""
 
     def _add_maxima(self, read_values: Callable[[str], Array]) -> list[TableSeries]:
-        """Adds a line per arm with the largest value of a signal in each short interval.
+        """Adds a line per arm with the largest value of a signal in each short time interval.
 
         Within an interval, the line is constant. A line of the values themselves would be a
-        broad band wherever they oscillate.
+        broad band wherever the values oscillate.
 
         Args:
             read_values: Function that returns the values of a site, given its name, with a row
@@ -265,11 +268,12 @@ class ChartBuilder:
         series = []
         for site in self._log.sites:
             values = read_values(site)
-            # NaN marks an unknown value, which must not hide the known ones of the same record.
+            # NaN marks an unknown value, which must not hide the known values of the same
+            # record.
             values_without_nan = np.where(np.isnan(values), -np.inf, values)
             largest = values_without_nan.max(axis=1, initial=-np.inf)
 
-            # A new interval begins wherever the number of the interval changes.
+            # A new interval begins wherever the index of the interval changes.
             records = self._log[site]
             interval_numbers = np.floor(records.t_s * (_MAXIMA / self._end_s)).astype(np.int64)
             first_records = np.flatnonzero(np.diff(interval_numbers, prepend=-1))
@@ -346,9 +350,9 @@ class ChartBuilder:
             yield from self._chart_histograms()
 
     def _add_table(self, site: str, tick: Ints, values: Values) -> int:
-        """Adds a table of numbers to the report, from which its scripts draw curves.
+        """Adds a table of values to the report, from which its scripts draw curves.
 
-        The numbers are encoded in binary form, which is shorter than text.
+        The values are encoded in binary form, which is shorter than decimal text.
 
         Args:
             site: Name of the site, whose tick rate converts ticks (control periods) to times.
@@ -384,9 +388,9 @@ class ChartBuilder:
         return self._add_table(site, trace.tick, trace.values)
 
     def _add_records(self, site: str, values: Values) -> int:
-        """Reduces one arm's recorded values to what a page can show, and adds them as a table.
+        """Adds as many recorded values of one arm as a page can show, as a table.
 
-        The records of a long run are more than the page can show. Their extremes are kept.
+        A long run has more records than the page can show. The extremes of the values are kept.
 
         Args:
             site: Name of the site.
@@ -421,7 +425,7 @@ class ChartBuilder:
     def _add_columns(
         self, site: str, tick: Ints, t_s: Array, values: Values
     ) -> list[TableSeries]:
-        """Reduces the values of one arm to what a screen can show, and adds them to the page.
+        """Adds as many values of one arm to the page as a screen can show.
 
         All columns share one table if there are few of them. Otherwise each column has its own
         table, which is smaller in total, see `__init__`.
@@ -621,8 +625,8 @@ class ChartBuilder:
     def _list_stated_delays(self, site: str) -> list[StatedLine]:
         """Returns lines at the mean delays that the scenario states for the links to a site.
 
-        They are drawn beside the measured delays, so that a reader sees whether the network
-        kept them.
+        They are drawn next to the measured delays, so that a reader sees whether the network
+        had the stated delays.
 
         Args:
             site: Name of the receiving site.
@@ -695,8 +699,8 @@ class ChartBuilder:
     def _chart_histograms(self) -> Iterator[HistogramChart]:
         """Yields histograms that show whether the control loops kept their timing.
 
-        One shows how late the loops woke up for their ticks (control periods), and one how long
-        the computation of a tick took.
+        One histogram shows how late the loops woke up for their ticks (control periods), the
+        other how long the computation of a tick took.
         """
         log = self._log
         edges_us = age_and_lateness.choose_bin_edges_us(log)
@@ -731,7 +735,7 @@ class ChartBuilder:
         arms, called chains, are handled by `_build_chain`.
 
         Args:
-            index: Index of the site, which is also that of its colour.
+            index: Index of the site, which is also the index of its colour.
             site: Name of the site, which must have at least one record.
 
         Returns:
@@ -764,7 +768,7 @@ class ChartBuilder:
         shadow on the floor, at up to `_CHAIN_INSTANTS` records.
 
         Args:
-            index: Index of the site, which is also that of its colour.
+            index: Index of the site, which is also the index of its colour.
             site: Name of the site, which must have at least one record.
 
         Returns:

@@ -1,11 +1,11 @@
 """Composes a paragraph for a paper about the stability of a run, with its references.
 
-The paragraph names the scenario, the program, what the verdict rests on, and the numbers behind
-it, so that a reader of the paper can repeat and judge the statement. References follow as
+The paragraph names the scenario, the program, the verdict with its basis, and the values behind
+it, so that a reader of the paper can reproduce and judge the statement. References follow as
 BibTeX entries.
 
 Invariant:
-    - The paragraph states nothing that the certificate does not state.
+    - The paragraph states only facts that the certificate states.
     - A source is listed only if the statement rests on it.
 """
 
@@ -87,8 +87,8 @@ def compose_citation(log: Log, certificate: Certificate) -> Iterator[str]:
 def _compose_sentences(log: Log, certificate: Certificate) -> Iterator[str]:
     """Yields the sentences of a paragraph, for a paper, about a run and its stability.
 
-    They state the scenario, the control laws and delays, the judgement and its basis, the
-    methods that were used (with their citations), and the state of the log.
+    The sentences state the scenario, the control laws and delays, the judgement and its basis,
+    the methods that were used (with their citations), and the state of the log.
     """
     scenario = log.scenario
     ticks = sum(len(log[site]) for site in log.sites)
@@ -172,7 +172,7 @@ def _state_settings(scenario: Scenario) -> Iterator[str]:
 
 
 def _group_equal(texts: Mapping[str, str]) -> str:
-    """Returns texts with the names that each is about, once if all are equal."""
+    """Joins the texts about several objects, each with the names of its objects."""
     names: dict[str, list[str]] = {}
     for name, text in texts.items():
         names.setdefault(text, []).append(name)

@@ -1,6 +1,6 @@
 """Draws columns of a log over time, as the method `Log.plot` does.
 
-A column is one number of an arm, such as the angle of its first joint. For example,
+A column is one recorded quantity of an arm, such as the angle of its first joint. For example,
 `log.plot("q1", "tau1")` draws the angle and the torque of the first joint of all arms. A name
 selects one of
 
@@ -12,7 +12,7 @@ Invariant:
     - Names are those of the tables of the log (`Log.table`), and "e", the error.
     - Each column has a panel. The panel contains a line for each selected arm that has the
       column.
-    - An unknown name is an error that states which names exist.
+    - An unknown name raises an error that lists the existing names.
 """
 
 import re
@@ -40,14 +40,15 @@ DEFAULT_QUANTITIES = ("q", "e", "tau")
 _JOINT_QUANTITIES = ("q", "qd", "q_des", "qd_des", "tau", "tau_x", "e")
 """Quantities that have a column per joint, named after the number of the joint."""
 _QUANTITIES_BY_SOURCE = {"ch.": "ch", "used.": "used", "t_ns, used.": "age"}
-"""Quantities with a column per peer or per vector, by the beginning of a column's source."""
+"""Quantities with a column per peer or per vector, by the first letters of a column's source.
+"""
 _MARGIN_IN = 0.7
 """Height of the time axis and the legend, in inches."""
 _ROW_IN = 1.25
 """Height of a row of panels, in inches."""
 
 Joints = int | str | Sequence[int | str] | None
-"""Joints by number, counted from 1, or by name. None for all joints."""
+"""Joints by number, counted from 1, or by name. `None` for all joints."""
 
 
 class _Line(NamedTuple):
@@ -89,10 +90,10 @@ def plot_log(
     Args:
         log: The log.
         names: Names of quantities or columns. Each name gets its own rows of panels.
-        sites: Names of the arms. None for all arms.
-        joints: Joints that are drawn of quantities with a column per joint.
-        from_s: First time that is drawn, in s. None for the start of the run.
-        until_s: Last time that is drawn, in s. None for the end of the run.
+        sites: Names of the arms. `None` for all arms.
+        joints: Joints to draw, for quantities with a column per joint.
+        from_s: First time that is drawn, in s. `None` for the start of the run.
+        until_s: Last time that is drawn, in s. `None` for the end of the run.
 
     Raises:
         UnknownName: There is no such column, arm or joint.
@@ -121,7 +122,7 @@ def _select_sites(log: Log, sites: str | Iterable[str] | None) -> list[str]:
 
     Args:
         log: The log.
-        sites: Name or names of the arms' sites. None selects all.
+        sites: Name or names of the arms' sites. `None` selects all.
 
     Raises:
         UnknownName: A site does not exist.
@@ -144,14 +145,15 @@ def _check_interval(
 
     Args:
         log: The log.
-        from_s: Start, in s. None for the start of the log.
-        until_s: End, in s. None for the end of the log.
+        from_s: Start, in s. `None` for the start of the log.
+        until_s: End, in s. `None` for the end of the log.
 
     Returns:
         The first and the last time to draw, in s.
 
     Raises:
-        UsageError: The first time is not before the last one, or the log ends before.
+        UsageError: The first time is not before the last time, or the log ends before the first
+            time.
     """
     end_s = recorded_end_s(log)
     first_s = 0.0 if from_s is None else float(from_s)
@@ -251,11 +253,11 @@ def _find_lines(log: Log, columns: Mapping[str, Sequence[Column]], name: str) ->
 def _explain_unknown_name(columns: Mapping[str, Sequence[Column]], name: str) -> str:
     """Returns the error message for an unknown column, which suggests a similar name.
 
-    The user has probably misspelled the name.
+    A similar name is suggested because the user has probably misspelled the name.
     """
     if name in FIGURES:
         return (
-            f"{name!r} is a figure and no column of the log; "
+            f"{name!r} is a figure and not a column of the log; "
             f"trilat_net.figure(log, {name!r}) draws it"
         )
 
@@ -275,15 +277,15 @@ def _explain_unknown_name(columns: Mapping[str, Sequence[Column]], name: str) ->
 
 
 def _number_joints(log: Log, site: str, joints: Joints) -> list[int]:
-    """Returns the numbers of the selected joints that the arm of a site has, counted from 1.
+    """Returns the numbers, from 1, of the selected joints that exist at the arm of a site.
 
-    A selection may have numbers and names of joints, or a single one of them. Numbers and names
-    that the arm does not have are ignored.
+    A selection consists of numbers and names of joints, or of a single number or name. Numbers
+    and names that the arm does not have are ignored.
 
     Args:
         log: The log.
         site: Name of the site.
-        joints: The selected joints. None for all joints.
+        joints: The selected joints. `None` for all joints.
     """
     names = log.scenario.arms[site].joint_names
     numbers = list(range(1, len(names) + 1))
@@ -359,7 +361,7 @@ def _filter_joints(log: Log, name: str, panels: _Panels, joints: Joints) -> _Pan
 
 
 def _get_joint_number(column: Column) -> int | None:
-    """Returns the number of the joint to which a column belongs. None if it belongs to none."""
+    """Returns the number of the joint to which a column belongs. `None` for other columns."""
     quantity = _get_quantity(column)
     if quantity not in _JOINT_QUANTITIES:
         return None
@@ -387,7 +389,7 @@ def _draw_groups(
         first_row = style.arrange_joints(largest_group, narrow=False)[0]
         column_count = len(first_row)
 
-    # Each cell of the grid has the name of a column, or an empty text behind the end of a
+    # Each cell of the grid contains the name of a column, or an empty text after the end of a
     # group.
     cells: list[str] = []
     for group in groups:
@@ -465,8 +467,8 @@ def _draw_panel(
 def _list_words(lines: Sequence[_Line]) -> list[str]:
     """Returns the distinct texts of a column of texts, which label the ticks of the value axis.
 
-    The list is empty for a column of numbers. The modes of the control loop are in the order of
-    the numbers by which messages for viewers represent them. Other texts follow in alphabetical
+    The list is empty for a column of numbers. The modes of the control loop are sorted by the
+    numbers that represent them in messages for viewers. Other texts follow in alphabetical
     order.
     """
     words: set[str] = set()
@@ -482,7 +484,7 @@ def _list_words(lines: Sequence[_Line]) -> list[str]:
 
 
 def _read_numbers(column: Column, words: Sequence[str]) -> NDArray[np.float64]:
-    """Returns the values of a column as numbers to draw, shape (K,). NaN stands for no value.
+    """Returns the values of a column as numbers to draw, shape (K,). NaN marks a missing value.
 
     Texts, such as the mode of an arm, are replaced by their positions in a list of all texts.
 

@@ -5,7 +5,7 @@ again from the received data in the log, and compares the results with the log, 
 result is a `Conclusion`, whose text the commands print after a run.
 
 Invariant:
-    - Every claim rests on a new execution of the log, made for this conclusion.
+    - Every claim rests on a new execution of the log that was made for this conclusion.
     - The execution runs in another process while the report is written, so that two processor
       cores are used.
 """
@@ -45,7 +45,7 @@ class Conclusion(CheckReport):
 
     Attributes:
         verdict: Judgement whether the run was stable.
-        meaning: Lines that say what the judgement means, with remarks about the run.
+        meaning: Lines that explain the judgement, with remarks about the run.
         table: Table with a row for each arm.
         notes: Lines about notable facts of the run, such as changed settings or messages of a
             user's control law, and about the proof of stability.
@@ -63,8 +63,8 @@ class Conclusion(CheckReport):
     def blocks(self) -> Iterator[Block]:
         """Yields the parts of the text that `trilat report` prints.
 
-        They are the judgement about stability and its meaning, the checks of the log, the table
-        of sites, the notes, and the paths of the files.
+        The parts are the judgement about stability and its meaning, the checks of the log, the
+        table of sites, the notes, and the paths of the files.
         """
         for line in (self.verdict, *self.meaning):
             yield line.print_form
@@ -90,7 +90,7 @@ class Conclusion(CheckReport):
         """Returns a line that says whether the log passed its checks, with the report's path.
 
         Some checks may be incomplete, because they need the code of a user's control law that
-        may not run. The line then says that not all was judged.
+        may not run. The line then says that not everything was judged.
         """
         results = {0: "passed", CodeWithheld.exit_code: "not all was judged"}
         result = results.get(self.exit_code, "FAILED")
@@ -107,8 +107,8 @@ class Conclusion(CheckReport):
     def to_dict(self) -> dict[str, Any]:
         """Converts the result to plain values, as `trilat report --json` prints them.
 
-        The entries have the outcome ("passed", "verdict"), its explanation for people
-        ("meaning", "notes"), the single checks, and the paths of the files.
+        The entries contain the outcome ("passed", "verdict"), its explanation for users
+        ("meaning", "notes"), the individual checks, and the paths of the files.
         """
         return {
             "passed": self.passed,
@@ -136,7 +136,7 @@ def conclude(
     Args:
         log: Log that was opened from files.
         folder: Existing folder.
-        progress: Function that is called with the number of drawn figures and of all figures.
+        progress: Function that is called with the number of drawn figures and the total number.
         min_coverage: Smallest fraction of the ticks (control periods) of each site that must be
             recorded and checked for a judgement.
         png: True to write the figures as PNG files too.
@@ -225,7 +225,8 @@ def _run_without_operators(log: Log) -> Log | None:
     The difference between the two runs shows how far the operators displaced the arms.
 
     Returns:
-        The log of the simulation. None if it would not differ from the run, or cannot run.
+        The log of the simulation. `None` if the simulation would not differ from the run, or is
+        not possible.
     """
     # A run that failed would fail again, or hang. External arms cannot be simulated.
     has_failed = any(event.kind == "failed" for event in log.events)
@@ -235,7 +236,7 @@ def _run_without_operators(log: Log) -> Log | None:
     try:
         return simulate_without_operators(log)
     except (ScenarioError, LawFailed):
-        # The control law of a user fails or may not run. The check of the log reports this.
+        # The control law of a user failed or may not run. The check of the log reports this.
         return None
 
 
@@ -246,8 +247,8 @@ _TIMING_HEADERS = ("late p50 us", "p99", "max", "busy p50 us", "p99")
 def _tabulate_sites(log: Log, *, is_timed: bool) -> TextTable:
     """Returns a table with a row per arm: number of records, timing, and largest final error.
 
-    The error is the largest one of any joint in the last second, or of the whole run if the run
-    was shorter. The table names the joint.
+    The error is the largest error of any joint in the last second, or of the whole run if the
+    run was shorter. The table names the joint.
 
     Args:
         log: Log of the run.
@@ -284,7 +285,7 @@ def _list_timing_cells(records: SiteLog) -> list[str]:
     """Returns the percentiles of the lateness and of the computing time of a site's ticks."""
     late_us = np.percentile(records.late_us, (50, 99, 100))
     busy_us = np.zeros(2)
-    # A record has the computing time of the previous tick, so that the first record has none.
+    # A record contains the computing time of the previous tick, so the first record has none.
     if len(records) > 1:
         busy_us = np.percentile(records.busy_us, (50, 99))
     return [f"{time_us:.0f}" for time_us in (*late_us, *busy_us)]

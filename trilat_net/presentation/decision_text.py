@@ -1,11 +1,11 @@
-"""Writes what a decision about the stability of a run rests on, and what prevents a better one.
+"""Writes the sentences on the basis of a stability decision, and on the obstacles to it.
 
 `analysis.stability_decision` decides and returns names, and the evidence with its numbers. For
 example, this module states the basis "roots" as "exact roots, slowest -0.832 /s".
 
 Invariant:
-    - Each name of a basis has one function here, in `BASES`, and each name of an obstacle one
-      in `OBSTACLES`.
+    - Each name of a basis has exactly one function in `BASES`, and each name of an obstacle
+      exactly one function in `OBSTACLES`.
 """
 
 from collections.abc import Callable, Iterable
@@ -17,12 +17,12 @@ from .verdict_text import THEOREM
 
 
 def _state_basis(decision: decision_facts.StabilityDecision) -> str:
-    """Returns what a decision rests on, as a phrase. Empty if it rests on nothing."""
+    """Returns a phrase that names the basis of a decision. Empty if there is none."""
     return BASES[decision.basis](decision.findings)
 
 
 def _list_reasons(decision: decision_facts.StabilityDecision) -> list[str]:
-    """Returns sentences on everything that prevents a better decision.
+    """Returns sentences on all reasons that prevent a better decision.
 
     Empty if the run is stable.
     """
@@ -35,7 +35,7 @@ def _list_reasons(decision: decision_facts.StabilityDecision) -> list[str]:
 
 
 def _describe_roots(roots: decision_facts.LoopRoots) -> str:
-    """Returns a sentence on the roots at the end of a run, or why there are none."""
+    """Returns a sentence on the roots at the end of a run, or on why there are none."""
     if not roots.verdict:
         return f"this rest: no roots: {roots.reason}"
     if roots.rate_per_s is None:
@@ -64,7 +64,7 @@ def _describe_root_basis(roots: decision_facts.LoopRoots) -> str:
 
 
 def _state_end(run: decision_facts.RunFindings) -> str:
-    # The frequency of an oscillation is known only if all records are.
+    # The frequency of an oscillation is known only if all records are known.
     return f"the end of the run: {run.end._replace(frequency_hz=None).text}"
 
 
@@ -83,7 +83,7 @@ def _state_proofs(run: decision_facts.RunFindings) -> str:
 
 
 def _state_pushes(run: decision_facts.RunFindings) -> str:
-    """Returns the basis of a settled run: the number of pushes, and why nothing proves more.
+    """Returns the basis of a settled run: the number of pushes, and why there is no proof.
 
     For example "8 pushes over 12 s, all of which died away; its roots are not exact".
     """
@@ -128,8 +128,8 @@ def _list_missing_records(run: decision_facts.RunFindings) -> list[str]:
 def _describe_period(run: decision_facts.RunFindings) -> list[str]:
     """Returns a sentence for repetitions that were shorter than the period of the delays.
 
-    Pushes that died away then prove little, because the delays of the rest of the period were
-    never tried.
+    Pushes that died away then prove little, because the delays in the rest of the period were
+    never tested.
     """
     twins = run.twins
     assert twins is not None
@@ -148,16 +148,16 @@ def _describe_growing_roots(run: decision_facts.RunFindings) -> list[str]:
 
 def _describe_short_record(advised_s: float | None) -> str:
     if advised_s is None:
-        return "the run is too short to tell; try one of twice its length"
-    return f"the run is too short to tell; a run of {advised_s:.3g} s would"
+        return "the run is too short to tell; try a run of twice its length"
+    return f"the run is too short to tell; a run of {advised_s:.3g} s would be long enough"
 
 
 def _describe_slow_decay(run: decision_facts.RunFindings) -> list[str]:
     assert run.roots is not None
     lasting = "drift" if run.end.behaviour is EndBehaviour.DRIFTS else "oscillation"
     sentence = (
-        f"too slow to be told from a lasting {lasting} in the judged part; its numerical "
-        f"roots decay at {run.roots.rate_per_s:.3g} /s"
+        f"too slow to be distinguished from a lasting {lasting} in the judged part; its "
+        f"numerical roots decay at {run.roots.rate_per_s:.3g} /s"
     )
     return [sentence]
 
@@ -189,7 +189,7 @@ OBSTACLES: dict[decision_facts.Obstacle, Callable[[decision_facts.RunFindings], 
     "unclear end": lambda run: [run.end.text],
 }
 """For each obstacle, the function that writes its sentences. `_list_reasons` itself writes the
-one on a short record.
+sentence on a short record.
 """
 
 DESCRIBERS: dict[type, Callable[[Any], str]] = {

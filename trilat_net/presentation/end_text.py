@@ -1,10 +1,11 @@
-"""Writes the sentences on how the motion at the end of a run behaves, for people.
+"""Writes the sentences for users on the motion at the end of a run.
 
-`analysis.run_end` judges the motion and returns names and numbers. This module states them, for
-example as "converged: largest |e| 0.001 rad and |qd| 0.0002 rad/s in the last second".
+`analysis.run_end` judges the motion and returns names and numbers. This module writes them as
+sentences, for example "converged: largest |e| 0.001 rad and |qd| 0.0002 rad/s in the last
+second".
 
 Invariant:
-    - Each name of a doubt has one template here, in `END_DOUBTS`.
+    - Each name of a doubt has exactly one template in `END_DOUBTS`.
 """
 
 from collections.abc import Callable, Iterable
@@ -12,8 +13,8 @@ from typing import Any
 
 from ..analysis import SETTLED_ERROR_RAD, EndBehaviour, EnvelopeTrend, RunEnd
 
-_LASTING_ERRORS = "at rest, with errors that stay"
-"""Phrase for arms that are slow although their errors exceed the limit of settled sites."""
+_LASTING_ERRORS = "at rest, with remaining errors"
+"""Phrase for arms that are slow, but whose errors exceed the limit of settled sites."""
 END_DOUBTS = {
     "sites apart": (
         "{sites[0]} and {sites[1]} stand {distance_rad:.3g} rad apart, and nothing holds them "
@@ -21,7 +22,8 @@ END_DOUBTS = {
     ),
     "arms fell": "{names} {hang}: the arms fell",
     "arm thrown": (
-        "{names} ends {distance_rad:.3g} rad away from every start pose, and nobody pushed"
+        "{names} ends {distance_rad:.3g} rad away from every start pose, although no operator "
+        "pushed"
     ),
     "loop changes": "the loop changes until {until_s:.4g} s, within the judged part",
     "operator acts": "an operator acts until {until_s:.4g} s, within the judged part",
@@ -39,7 +41,7 @@ _TRENDS = {
 def _describe_end(end: RunEnd) -> str:
     """Returns a sentence on how the motion of a run ends, with the numbers that show it.
 
-    The sentence also has the reasons why the run cannot be called stable.
+    The sentence also contains the reasons why the run cannot be called stable.
     """
     return "; ".join([_describe_behaviour(end), *_list_doubts(end)])
 
@@ -61,7 +63,7 @@ def name_behaviour(end: RunEnd) -> str:
     """Returns a phrase for the behaviour at the end, such as "converged" or "growing".
 
     If the arms rest, but with synchronisation errors above the limit of settled sites, the
-    phrase says that errors stay.
+    phrase says that errors remain.
 
     Args:
         end: How the motion ends.

@@ -1,15 +1,15 @@
-"""Draws the arms at one time of an episode, as an array of pixels for a film.
+"""Draws the arms at one time of an episode, as an array of pixels for a video.
 
 An episode is one attempt of a learned program at a task, see `trilat_studies`. A picture has
 one panel per arm. One of the panels also shows the goal of the task.
 
 Invariant:
     - A picture depends only on the poses of the arms, the goal of the task and the title.
-    - All pictures of an episode have the same size and the same axis limits, so that everything
-      that moves in the film is an arm or a body.
+    - All pictures of an episode have the same size and the same axis limits, so that only arms
+      and bodies move in the video.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -75,13 +75,13 @@ class EpisodePicture:
     ) -> NDArray[np.uint8]:
         """Draws the arms, the bodies and the goal of the task at one time of an episode.
 
-        An episode is one attempt at a task. Its pictures can be combined to a film.
+        An episode is one attempt at a task. Its pictures can be combined to a video.
 
         Args:
             q_rad: Joint angles by site, in rad, shape (n,) each.
             bodies: Poses of the bodies that the arms can touch, by site and name, shape (7,)
                 each.
-            goal_m: Position that the task asks for, in m. None if the goal is no position.
+            goal_m: Position that the task requires, in m. `None` if the goal is not a position.
             title: Text in the lower left corner of the first panel.
 
         Returns:
@@ -160,18 +160,3 @@ def _draw_arm(axes: Axes, points_m: Array, colour: str) -> None:
     joints_m = points_m[1:]
     axes.plot(*joints_m.T, linestyle="none", marker="o", markersize=4.0, color=colour)
     axes.plot(0.0, 0.0, **_BASE)
-
-
-def is_position(goal: Sequence[float] | Array, end_effector_m: Array) -> bool:
-    """Returns True if the goal of a task can be drawn as a point in space.
-
-    Goals may also be numbers of another kind, such as joint angles.
-
-    Args:
-        goal: Numbers that describe the goal.
-        end_effector_m: Position of the end effector, in m.
-
-    Returns:
-        True if the goal has as many numbers as the position.
-    """
-    return np.shape(goal) == np.shape(end_effector_m)

@@ -7,7 +7,7 @@ tables share `store_tables`.
 Invariant:
     - Numbers that are read back from an export equal those of the log, bit for bit.
     - An export describes itself: its session, and the unit, meaning and source of every column.
-    - An export that must be refused is refused before a log is read and before anything is
+    - An export that is not possible is rejected before a log is read and before any file is
       written.
 """
 
@@ -42,7 +42,7 @@ class ExportFormat(NamedTuple):
         write: Function that writes a log. Its arguments are the log (a list of logs if `many`
             is True), the file or folder to write, and a function of type `Written` that reports
             progress. Its keyword-only parameters are the settings of the format. It returns a
-            summary for the user, or None.
+            summary for the user, or `None`.
         ending: End of the default output path, which begins with the name of the log.
         folder: True if the format writes a folder.
         extra: If the format needs an optional package, the arguments of `import_extra`: the
@@ -65,7 +65,7 @@ class Exporter:
 
     Args:
         form: Name of the format.
-        path: The file or folder. None for a path next to the log, with the name of the log.
+        path: The file or folder. `None` for a path next to the log, with the name of the log.
         force: True to replace an earlier export.
         log: Path of the log, or of its first part.
         settings: Settings of the format by name, as a mapping or as pairs.
@@ -111,7 +111,8 @@ class Exporter:
 
         Args:
             *logs: The logs. Most formats accept only one.
-            progress: Function that is called with the numbers of written and of all records.
+            progress: Function that is called with the number of written records and the total
+                number.
 
         Returns:
             The summary of the format for the user. Empty if the format has none.
@@ -164,7 +165,7 @@ def _parse_settings(
         The converted settings by name.
 
     Raises:
-        UsageError: There is no such setting, or its value has another type.
+        UsageError: There is no such setting, or its value has the wrong type.
     """
     types = {}
     for parameter in inspect.signature(write).parameters.values():
@@ -239,10 +240,10 @@ def write_table_files(
     suffix: str,
     write_table: Callable[[Table, Path], None],
 ) -> None:
-    """Writes every table of a log as a file of its own, for formats such as CSV and Parquet.
+    """Writes every table of a log to a separate file, for formats such as CSV and Parquet.
 
-    The folder also gets a description of all tables and the scenario, the text that defines the
-    run.
+    A description of all tables, and the scenario (the text that defines the run), are also
+    written to the folder.
 
     Args:
         log: Log of the run that is exported.
@@ -275,7 +276,7 @@ def _describe_table(table: Table) -> JsonObject:
 def _describe_folder(log: Log, folder: Path, about: str) -> None:
     """Writes files that explain an exported folder to its later readers.
 
-    They are a description of the columns, and the scenario of the run.
+    The files are a description of the columns, and the scenario of the run.
 
     Args:
         log: Log of the run that is exported.

@@ -4,7 +4,7 @@ The classes of `analysis` contain names and numbers, and their properties `text`
 `remarks` call the two functions of this module through hooks.
 
 Invariant:
-    - Each class has its functions in one module, in the tables `DESCRIBERS` and
+    - The functions of each class are in one module, in the tables `DESCRIBERS` and
       `SENTENCE_LISTERS`.
 """
 
@@ -36,7 +36,7 @@ _SENTENCE_LISTERS: dict[type, Callable[[Any], Iterable[str]]] = {
 
 
 def describe_finding(finding: Any) -> str:
-    """Returns a finding of the analysis as a sentence or phrase for people.
+    """Returns a sentence or phrase for users on a finding of the analysis.
 
     Args:
         finding: The finding, with the numbers that show it.
@@ -47,7 +47,7 @@ def describe_finding(finding: Any) -> str:
 def list_finding_sentences(finding: Any) -> list[str]:
     """Returns the sentences on a finding that consists of several, one for each of its parts.
 
-    They say for example why the end of a run leaves its stability open.
+    For example, the sentences say why the end of a run leaves its stability open.
 
     Args:
         finding: The finding, with the numbers that show it.

@@ -1,17 +1,17 @@
-"""Makes the layout in which Foxglove and Lichtblick, viewers for robot data, show a log.
+"""Builds the layout in which Foxglove and Lichtblick, viewers for robot data, show a log.
 
-A layout is a JSON file that a user imports into the viewer. It states which panels are shown,
-and which numbers of which topics they draw. The layout has the plots of the layout for Rerun
-(`rerun_viewer.build_plot_layout`), the modes of the arms' controllers, the events, and the arms
-in space.
+A layout is a JSON file that a user imports into the viewer. The file states which panels are
+shown, and which values of which topics they draw. The layout contains the plots of the layout
+for Rerun (`rerun_viewer.build_plot_layout`), the modes of the arms' controllers, the events,
+and the arms in space.
 
-The live bridge to ROS 2 and exported bags have other topics than logs. The layout of a log
-therefore has two tabs: one for the log itself, and one for a running session of the same
-scenario, which reaches the viewer over ROS 2.
+The topics of the live bridge to ROS 2 and of exported bags differ from those of logs. The
+layout of a log therefore has two tabs: one for the log itself, and one for a running session of
+the same scenario, which reaches the viewer over ROS 2.
 
 Invariant:
-    - Each message path of the layout names a number that exists in the file or in the topics of
-      the live bridge.
+    - Each message path of the layout refers to a value that exists in the file or in the topics
+      of the live bridge.
     - Panels without data take no space.
     - Equal channels give layouts with equal bytes.
 
@@ -37,11 +37,11 @@ from .rerun_viewer import CurvePlot, PlotLayout, build_plot_layout
 _MODE = "mode"
 """Name of the topic with the mode of a site."""
 _MODE_NUMBERS = (_MODE, "mode_number")
-"""Names of the topics with the number of a mode, which have a panel of their own kind."""
+"""Names of the topics with the number of a mode, which are shown in a special kind of panel."""
 _PLOTS_PERCENT = 75.0
-"""Share of the height that plots have, above modes and events."""
+"""Height of the plots, above modes and events, as a percentage of the total height."""
 _MODES_PERCENT = 60.0
-"""Share of the width that modes have, beside events."""
+"""Width of the modes, beside events, as a percentage of the total width."""
 _TITLE_KEYS = ("foxglovePanelTitle", "lichtblickPanelTitle")
 """Settings that contain the title of a panel, one for each viewer."""
 
@@ -53,7 +53,7 @@ Tree = str | JsonObject
 def build_foxglove_layout(sources: Mapping[str, Ros2Channels]) -> JsonObject:
     """Returns a layout of plots for Foxglove, a program that shows data of robots.
 
-    It shows the channels of a log or of a running session. Foxglove opens the layout from a
+    The layout shows the channels of a log or of a running session. Foxglove opens it from a
     file.
 
     Args:
@@ -158,13 +158,13 @@ def _is_mode(plot: CurvePlot) -> bool:
 def _divide(direction: str, trees: Sequence[Tree], first_percent: float | None = None) -> Tree:
     """Divides an area of the viewer among several panels, or groups of panels (trees).
 
-    The viewer divides an area into two parts only. Therefore the first tree gets its part, and
-    the rest is divided again.
+    The viewer divides an area into two parts only. Therefore the first tree gets its share, and
+    the rest of the area is divided again.
 
     Args:
         direction: "row" to place the trees beside one another, "column" to stack them.
         trees: The trees, at least one.
-        first_percent: Part of the first tree, in %. None if all trees have the same size.
+        first_percent: Share of the first tree, in %. `None` if all trees have the same size.
     """
     first, *others = trees
     if not others:
@@ -220,8 +220,8 @@ def _get_list_path(channels: Ros2Channels, entity: str) -> str:
 
     Args:
         channels: Standard channels by topic.
-        entity: Topic of an array, or the topic of joint states and the name of one of their
-            lists, as `rerun_viewer._PlotCurves` has it.
+        entity: Topic of an array, or the topic of joint states followed by the name of one of
+            their lists, as in `rerun_viewer._PlotCurves`.
     """
     if entity in channels:
         return f"{entity}.data"
@@ -266,7 +266,7 @@ def _add_modes(panels: _Panels, channels: Ros2Channels) -> str:
 
 
 def _name_mode_numbers() -> JsonObject:
-    """Returns the setting with which a viewer shows the number of a mode as its name."""
+    """Returns the setting that makes a viewer show the name of a mode instead of its number."""
     states = []
     for word, number in NUMBERS_BY_MODE_WORD.items():
         states.append({"value": number, "operator": "=", "label": word})
@@ -274,7 +274,7 @@ def _name_mode_numbers() -> JsonObject:
 
 
 def _add_events(panels: _Panels, layout: PlotLayout) -> str:
-    """Adds a panel with the events as lines of a log. Returns "" if there are no events."""
+    """Adds a panel with the events as lines of text. Returns "" if there are no events."""
     if not layout.lines:
         return ""
     # Viewers call the type of this panel "RosOut" in files.

@@ -2,13 +2,13 @@
 
 `report.html` is the page that reports a run. The other templates contain macros, each for a
 piece of HTML, such as a table. A module `page_...` computes the values of its section of the
-report, and a template has all of the HTML.
+report, and the templates contain all of the HTML.
 
 Invariant:
     - Templates escape every value that is a plain string. Only values of the class `Markup` are
       inserted as HTML. These are the results of other templates, and files of this package.
-    - A value that a template names and does not get is an error.
-    - Jinja is imported with this module, and this module only when HTML is rendered.
+    - If a template refers to a value that is not passed to it, an error is raised.
+    - This module imports Jinja, and is itself imported only when HTML is rendered.
 """
 
 import json

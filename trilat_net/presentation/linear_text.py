@@ -1,6 +1,6 @@
 """Composes the text that `trilat linear` prints: whether small motions of coupled arms decay.
 
-The text has the pose of rest at which the arms are linearised, the delays, a table of the
+The text contains the pose of rest at which the arms are linearised, the delays, a table of the
 rightmost characteristic roots, the verdict, the largest stable delay, what operators feel, and
 the values of settings, such as gains, at which stability changes.
 
@@ -81,8 +81,8 @@ def _describe_scan(scan: EdgeScan, name: str) -> str:
 def describe_equilibrium(analysis: LinearAnalysis) -> Iterator[str]:
     """Yields lines about the pose of rest (equilibrium) about which the arms were linearised.
 
-    They state how the equilibrium was computed, its residual, and the pose of each arm. If all
-    arms have the same joint angles, a single line has them.
+    The lines state how the equilibrium was computed, its residual, and the pose of each arm. If
+    all arms have the same joint angles, a single line states these angles.
 
     Args:
         analysis: The analysis.
@@ -143,9 +143,9 @@ def tabulate_roots(analysis: LinearAnalysis) -> TextTable:
     A motion with the root s changes as exp(s t), and grows if the real part of s is positive.
     The table describes the motion of each root.
 
-    The roots are those of the continuous loop, whose controllers compute all the time. If a
+    The roots are those of the continuous loop, whose controllers act in continuous time. If a
     root of the sampled loop, whose controllers compute once per tick, differs, two further
-    columns have the roots of the sampled loop. If the delays differ from tick to tick, the
+    columns contain the roots of the sampled loop. If the delays differ from tick to tick, the
     table has only the roots of the sampled loop over a span of ticks, because the continuous
     loop has only mean delays.
 
@@ -154,11 +154,11 @@ def tabulate_roots(analysis: LinearAnalysis) -> TextTable:
 
     Returns:
         The table with a row per root: real part in 1/s, imaginary part in rad/s, frequency in
-        Hz, damping ratio, number of equal roots ("modes"), and what moves.
+        Hz, damping ratio, number of equal roots ("modes"), and the states that move most.
     """
     ticks_differ = analysis.decisive.span_s is not None
     roots = analysis.decisive.roots if ticks_differ else analysis.continuous.roots
-    # For each root, the one of the sampled loop if it is to be shown beside it.
+    # For each root, the root of the sampled loop if it is to be shown beside it.
     sampled_roots = [
         None if ticks_differ else analysis.find_sampled_root(root) for root in roots
     ]
@@ -191,8 +191,8 @@ def tabulate_roots(analysis: LinearAnalysis) -> TextTable:
 def describe_zero_roots(analysis: LinearAnalysis) -> str:
     """Returns a sentence about the roots that are zero by the structure of the system.
 
-    For example, if all arms were moved to another common pose, nothing would bring them back.
-    Such roots do not count for the stability of the loop.
+    For example, if all arms were moved to another common pose, no torque would bring them back.
+    Such roots are irrelevant for the stability of the loop.
 
     Args:
         analysis: The analysis.
@@ -215,10 +215,10 @@ def describe_linear_verdict(analysis: LinearAnalysis) -> str:
     """Returns a sentence that says whether small motions of the coupled arms decay.
 
     The sentence states the growth rate and the frequency of the slowest decaying, or fastest
-    growing, motion. They belong to the characteristic root with the largest real part. Motions
-    that neither decay nor grow, but keep a constant speed ("drifting"), are only counted. An
-    example is "stable: the slowest motion goes as exp(-1.2 t / s) at 3.4 rad/s, as computed
-    tick by tick".
+    growing, motion. Rate and frequency follow from the characteristic root with the largest
+    real part. Motions that neither decay nor grow, but keep a constant speed ("drifting"), are
+    only counted. An example is "stable: the slowest motion goes as exp(-1.2 t / s) at 3.4
+    rad/s, as computed tick by tick".
 
     Args:
         analysis: Result of the linear stability analysis. The roots that determine stability
@@ -246,7 +246,7 @@ def describe_linear_verdict(analysis: LinearAnalysis) -> str:
 
     motion = "the slowest motion"
     if drifting_count:
-        motion = f"{drift}, and the slowest of the others"
+        motion = f"{drift}, and the slowest of the other motions"
     return f"{analysis.verdict}: {motion} goes as {growth}"
 
 
@@ -255,7 +255,7 @@ _MAX_BANDS = 3
 _MAX_SEPARATE_JOINTS = 2
 """Largest number of joints for which every failing two-port has a separate line."""
 WEIGHTS_ALIKE = 1e-9
-"""Largest difference of weights that count as equal."""
+"""Largest difference between weights that count as equal."""
 
 
 def describe_ports(ports: PortAnalysis) -> list[str]:
@@ -277,7 +277,7 @@ def describe_ports(ports: PortAnalysis) -> list[str]:
     lines = _describe_conditions(ports)
     if ports.verdict == "unstable":
         lines.append(
-            "  the loop without operators is unstable: not passive, and without an impedance"
+            "  the loop without operators is unstable: it is not passive, and has no impedance"
         )
         return lines
 
@@ -290,8 +290,8 @@ def describe_ports(ports: PortAnalysis) -> list[str]:
         bands = ports.measured.below
         result = "stable"
         if bands:
-            result = f"not shown {_list_bands(bands)}, where they damp too little"
-        lines.append(f"  the measured operators at the masters, any at each: {result}")
+            result = f"not shown {_list_bands(bands)}, where the operators damp too little"
+        lines.append(f"  any of the measured operators at each master: {result}")
 
     if ports.clamped_verdict == "unstable":
         clamped = ports.transparency[0].other_site
@@ -333,7 +333,7 @@ def _describe_port_passivity(ports: PortAnalysis) -> list[str]:
     lines = []
     pole = ports.pole
     if pole.order:
-        meaning = "as of free masses" if pole.passive else "which no passive network has"
+        meaning = "as free masses have" if pole.passive else "which no passive network has"
         lines.append(f"  at zero frequency Y has a pole of order {pole.order}, {meaning}")
 
     all_ports_text = _describe_passivity(ports.velocity, ports.impedance_unit(), ports.kind)
@@ -356,7 +356,7 @@ def _describe_proof(ports: PortAnalysis, proof: Passivity) -> str:
     """Returns a sentence about the condition on operators that the stability proof assumes.
 
     The proof assumes that operators are passive with respect to r, the velocity plus Lambda
-    times the error e. Passive means that they give back no more energy than they took.
+    times the error e. Passive operators give back no more energy than they took.
 
     Args:
         ports: Results for the joints or axes at which operators act.
@@ -378,13 +378,13 @@ def _describe_passivity(passivity: Passivity, unit: str = "", kind: str = "") ->
     """Returns a sentence that says whether the arms are passive, and which damping is missing.
 
     Passive arms never supply energy to an operator. An example of a negative result is "not
-    passive at 2-5 Hz; least eigenvalue -0.1 at 3 Hz; 0.05 N m s/rad more at each joint would
-    make it so".
+    passive at 2-5 Hz; least eigenvalue -0.1 at 3 Hz; adding 0.05 N m s/rad at each joint would
+    make it passive".
 
     Args:
         passivity: Result for one joint or for all joints at which operators act.
         unit: Unit of the missing damping. Empty to leave out the damping.
-        kind: "joint" or "axis": where operators act.
+        kind: "joint" or "axis", at which operators act.
     """
     if passivity.passive:
         return "passive"
@@ -397,10 +397,10 @@ def _describe_passivity(passivity: Passivity, unit: str = "", kind: str = "") ->
         return text
     if math.isinf(passivity.lacking_nm_s_rad):
         plural = "axes" if kind == "axis" else "joints"
-        return f"{text}; no damping at the {plural} would make it so"
+        return f"{text}; no damping at the {plural} would make it passive"
 
     damping = f"{passivity.lacking_nm_s_rad:.3g} {unit}"
-    return f"{text}; {damping} more at each {kind} would make it so"
+    return f"{text}; adding {damping} at each {kind} would make it passive"
 
 
 def _list_bands(bands: tuple[FrequencyBand, ...]) -> str:
@@ -425,11 +425,11 @@ def _describe_absolute_stability(ports: PortAnalysis) -> str:
 def _describe_two_ports(ports: PortAnalysis) -> list[str]:
     """Returns the lines about Llewellyn's criterion, which decides on stability for two sites.
 
-    A two-port is one joint of two sites, at which one operator each acts. A third site is free,
-    or its arm is clamped. The criterion fails if Llewellyn's parameter is below 1 in
-    some band of frequencies. Then some passive operators make the two-port unstable. A line
-    describes a failing two-port, or a group of them, and a last line counts those for which the
-    criterion holds.
+    A two-port is one joint of two sites, with one operator at each site. A third site is free,
+    or its arm is clamped. The criterion fails if Llewellyn's parameter is below 1 in some band
+    of frequencies. Then some passive operators make the two-port unstable. A line describes a
+    failing two-port, or a group of them, and a last line states the number of two-ports for
+    which the criterion holds.
 
     Args:
         ports: Results for the joints at which the operators act.
@@ -460,14 +460,14 @@ def _describe_two_ports(ports: PortAnalysis) -> list[str]:
 def _describe_failing(ports: PortAnalysis, group: list[TwoPort]) -> str:
     """Returns a line that says at which frequencies Llewellyn's criterion fails.
 
-    A two-port is one joint of two sites. It fails at a frequency if Llewellyn's parameter is
-    below 1 there. The line ends with the smallest value of the parameter and its frequency. An
-    example is "m1 and s, joint 1: fails at 2-5 Hz; least 0.8 at 3 Hz".
+    A two-port is one joint of two sites. The criterion fails at a frequency if Llewellyn's
+    parameter is below 1 there. The line ends with the smallest value of the parameter and its
+    frequency. An example is "m1 and s, joint 1: fails at 2-5 Hz; least 0.8 at 3 Hz".
 
     Args:
         ports: Results for all joints, from which the names of joints and axes are taken.
-        group: Failing two-ports of the same two sites. They have the same third site clamped,
-            or none.
+        group: Failing two-ports of the same two sites. All have the same third site clamped, or
+            no clamped site.
     """
     worst = min(group, key=lambda two_port: two_port.minima.least)
     minima = worst.minima

@@ -1,4 +1,4 @@
-"""Writes the sentences on the energies that control laws declare, for people.
+"""Writes the sentences for users on the energies that control laws declare.
 
 `analysis.certificate.observed_energy` compares these energies with the records, and returns
 names and numbers.
@@ -13,10 +13,10 @@ from ..errors import count_nouns
 NEGATIVE_ENERGY_MEANING = (
     "an observed energy below zero, such as -0.85 mJ, means that at this tick one end of a "
     "connection had taken out that much more energy than it knew to have been put in, its "
-    "reserve included, so that passivity proves nothing about the run, which may be stable all "
-    "the same"
+    "reserve included. Passivity then proves nothing about the run, which may be stable "
+    "nevertheless"
 )
-"""What a negative energy means, in the same words wherever it is explained to the user."""
+"""Explanation of a negative energy, in the same words wherever users read it."""
 _FINDINGS = {
     ObservedFinding.PASSIVE: "observed energy never below zero",
     ObservedFinding.NEGATIVE: "observed energy below zero",
@@ -31,9 +31,9 @@ def _describe_observed(observed: ObservedEnergy) -> str:
 
 
 def _describe_cause(observed: ObservedEnergy) -> str:
-    """Returns the numbers behind the finding, or the reason why there are none."""
+    """Returns the values behind the finding, or the reason why there are none."""
     if observed.undeclared_sites:
-        return f"the law of {', '.join(observed.undeclared_sites)} declares none"
+        return f"the law of {', '.join(observed.undeclared_sites)} declares no energies"
     if observed.incomplete_sites:
         return f"records of {', '.join(observed.incomplete_sites)} are missing"
     if observed.finding is ObservedFinding.BROKEN:
@@ -52,7 +52,7 @@ def _describe_cause(observed: ObservedEnergy) -> str:
 
 
 def _explain_finding(finding: ObservedFinding) -> str:
-    """Returns what a finding means for a run. Empty if it needs no explanation."""
+    """Returns the meaning of a finding for a run. Empty if it needs no explanation."""
     return NEGATIVE_ENERGY_MEANING if finding is ObservedFinding.NEGATIVE else ""
 
 

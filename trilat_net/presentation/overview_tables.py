@@ -1,4 +1,4 @@
-"""Composes the text of `trilat log info`, which describes what log files contain.
+"""Composes the text of `trilat log info`, which describes the contents of log files.
 
 The text has these parts:
 
@@ -8,8 +8,8 @@ The text has these parts:
 - A line for each file.
 
 Invariant:
-    - Texts from a file pass `sanitize`, or are cells of a table, which `result_text` sanitizes.
-      A file therefore cannot control the terminal.
+    - Texts from a file are passed through `sanitize`, or are cells of a table, which
+      `result_text` sanitizes. A file therefore cannot control the terminal.
 """
 
 import re
@@ -34,8 +34,8 @@ _SIZE_UNITS = {"GB": 10**9, "MB": 10**6, "kB": 10**3}
 def compose_overview(overview: FileOverview) -> Iterator[Block]:
     """Yields the text that describes the contents of log files.
 
-    It has the session, the tables, the number of messages, the origin and the files. If the
-    files are no log of trilat-net, only the channels and the files are described.
+    The text contains the session, the tables, the number of messages, the origin and the files.
+    If the files are not a log of trilat-net, only the channels and the files are described.
 
     Args:
         overview: Contents of the files.
@@ -93,7 +93,7 @@ def _compose_session(facts: JsonObject, session: JsonObject) -> Iterator[Block]:
 
 
 def _describe_records(facts: JsonObject, session: JsonObject) -> str:
-    """Returns the numbers of recorded and missing records, and whether the files are intact.
+    """Returns the counts of recorded and missing records, and whether the files are intact.
 
     For example: "30000, none missing; finished".
     """
@@ -151,8 +151,9 @@ def _compose_sites(sites: Mapping[str, JsonObject]) -> Iterator[Block]:
 def _compose_links(links: Mapping[str, JsonObject]) -> Iterator[Block]:
     """Yields a table of the network connections (links) between the arms.
 
-    The table has the ages of the used messages. One-way delays and clock differences follow if
-    they were measured, and then the numbers of late, lost and duplicate messages.
+    The table contains the ages of the used messages. Further columns contain one-way delays and
+    clock differences if they were measured, and the numbers of late, lost and duplicate
+    messages.
     """
     has_delays = any(link["one_way_ms"] for link in links.values())
     has_clocks = any(link["clock_bound_us"] for link in links.values())
@@ -184,8 +185,8 @@ def _compose_channels(
 
     Args:
         channels: Channels by topic.
-        session: The session, whose name is left out of the topics. None if the files contain no
-            session.
+        session: The session, whose name is left out of the topics. `None` if the files contain
+            no session.
     """
     if not channels:
         return
@@ -218,7 +219,7 @@ def _compose_channels(
 
 
 def _list_gaps(gaps: Sequence[tuple[int, int]]) -> str:
-    """Writes the numbers of missing messages as ranges, for example "12-15, 20".
+    """Formats the numbers of missing messages as ranges, for example "12-15, 20".
 
     At most `_MAX_GAPS` ranges are listed.
 
@@ -248,16 +249,16 @@ def _compose_views(views: Mapping[str, JsonObject]) -> Iterator[Block]:
 
 
 def _compose_accounts(session: JsonObject) -> Iterator[Block]:
-    """Yields the counts that the recorder kept of the messages of each channel.
+    """Yields the recorder's counts of the messages of each channel.
 
     The counts show whether the log is complete. Only channels with a fault, such as missing
-    messages, are listed. The others are counted.
+    messages, are listed. For the others, only their number is stated.
     """
     accounts: dict[str, str] = session["accounts"]
     prefix = f"/trilat/{session['session']}/"
     yield ""
     if not accounts:
-        yield "no accounts: the recording was not finished"
+        yield "no counts: the recording was not finished"
         return
 
     faulty_accounts = {
@@ -321,7 +322,7 @@ def _compose_file(file: JsonObject) -> Iterator[Block]:
 
 
 def _compose_line(heading: str, text: str) -> Iterator[Block]:
-    """Yields a text behind a bold heading. Yields nothing for an empty text."""
+    """Yields a text after a bold heading. Yields nothing for an empty text."""
     if text:
         yield MarkedText(f"[bold]{heading:<9}[/bold]", sanitize(text))
 
@@ -333,8 +334,9 @@ def _tabulate(
 
     Args:
         headers: Header of each column.
-        rows: Values of each row. None is printed as a dash.
-        text_columns: Number of columns at the left that have texts. The others have numbers.
+        rows: Values of each row. `None` is printed as a dash.
+        text_columns: Number of columns at the left that contain texts. The others contain
+            numbers.
     """
     text_rows = []
     for row in rows:
@@ -352,7 +354,7 @@ def _format_counts(channel: JsonObject) -> list[object]:
 
 
 def _format_percentiles(percentiles: JsonObject | None) -> list[str | None]:
-    """Returns median, 99th percentile and maximum as three cells, or None without values."""
+    """Returns median, 99th percentile and maximum as three cells, `None` if unknown."""
     if percentiles is None:
         return [None, None, None]
     return [_format_number(percentiles[key]) for key in ("p50", "p99", "max")]

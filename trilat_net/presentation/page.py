@@ -1,19 +1,19 @@
-"""Writes the report of a recorded run: a web page and a file with the numbers of the run.
+"""Writes the report of a recorded run: a web page, and a file with the key numbers of the run.
 
-`write_report` computes the numbers of the run from its log, draws the figures that explain
+`write_report` computes the key numbers of the run from its log, draws the figures that explain
 whether the run was stable, and writes two files:
 
-- `report.html`, a page for people. `render_report` fills the template `templates/report.html`.
+- `report.html`, a page for readers. `render_report` fills the template `templates/report.html`.
   Each section of the page comes from one of the modules `page_...`. Interactive charts are
   drawn in the browser by scripts, from data that `charts.ChartBuilder` computes.
 - `summary.json`, the same numbers for programs.
 
 Invariant:
     - The page is a single file that contains its images, styles and scripts. It loads nothing
-      from a network, so that it can be sent by mail and read offline.
+      from a network, and can therefore be sent by mail and read offline.
     - Every text that comes from a scenario or from a log is escaped by the template in which it
       stands. Such a text therefore cannot add HTML to the page.
-    - The page has the colours and the type of the live page, which both read `theme.css`.
+    - The page has the same colours and type as the live page, because both read `theme.css`.
     - Empty tables are left out.
 """
 
@@ -54,16 +54,16 @@ def write_report(
 ) -> list[Path]:
     """Writes the report of a run, report.html and summary.json, into a folder.
 
-    The page shows the results of a run to people, and the JSON file has the same numbers for
-    programs.
+    The page shows the results of a run to readers, and the JSON file contains the same numbers
+    for programs.
 
     Args:
         log: Log of the run.
         folder: Folder of both files. It is created if it does not exist.
         certificate: Judgement whether the run was stable, with its reasons.
         twin: Log of the same run, simulated without the people or programs that move the arms.
-            The page shows the difference, which is the motion due to these operators. None
-            leaves this section out.
+            The page shows the difference, which is the motion due to these operators. If
+            `None`, this section is left out.
         verdicts: Results of the checks of the log. They are read only after the figures of the
             certificate are drawn, because another process may still check the log until then.
 
@@ -106,9 +106,9 @@ def render_report(
 
     Args:
         log: Log of the run.
-        twin: Log of the same run without operators, or None, see `write_report`.
+        twin: Log of the same run without operators, or `None`, see `write_report`.
         verdicts: Results of the checks of the log.
-        facts: Numbers of the run, from `summarise_run`.
+        facts: Key numbers of the run, from `summarise_run`.
         verdict: HTML of the judgement about stability, with which the page begins. Empty for
             none.
         reasons: HTML of the section that explains the judgement. Empty for no such section.
@@ -156,12 +156,12 @@ def _read_asset(name: str) -> Markup:
 
 
 def _render_motion(charts: Markup) -> Markup:
-    """Returns the section with positions, torques and estimates. Empty without charts."""
+    """Returns the section with positions, torques and estimates. Empty if it has no charts."""
     if not charts:
         return Markup()
     intro = (
         "Drag over a chart to zoom all, double-click to see the whole run, click a name to "
-        "hide its line. Fig. 3 to 6 show what the paper's figures of these numbers show."
+        "hide its line. Fig. 3 to 6 correspond to the paper's figures of the same numbers."
     )
     heading = "Positions, torques and estimates over time"
     return render_section(heading, intro, charts, "figures")

@@ -1,7 +1,7 @@
 """Renders the section of a report that explains whether the run was stable.
 
-The section has the sentences of `trilat certify`, and figures of V, the energy function of the
-stability proof.
+The section contains the sentences of `trilat certify`, and figures of V, the energy function of
+the stability proof.
 
 Invariant:
     - The sentences are those that `trilat certify` prints, with longer names of the checks.
@@ -43,9 +43,15 @@ _LONG_NAMES = {
 """Names of the checks on the page, by their names on a terminal."""
 _SYMBOLS = (
     ("q, qd", "angle of a joint, in rad, and its speed, in rad/s"),
-    ("q_des", "angle to which the other arms lead a joint: their mean by the shares, in rad"),
+    (
+        "q_des",
+        "reference angle of a joint: mean of the other arms, weighted by the shares, in rad",
+    ),
     ("e", "error of a joint, q − q_des"),
-    ("α, share", "dominance factor: the part of one arm in the mean that another follows"),
+    (
+        "α, share",
+        "dominance factor: the weight of one arm in the mean that another arm follows",
+    ),
     ("τ", "torque of the controller on a joint, in N m"),
     ("τ_x", "torque of hands and walls on a joint, with the sign of Eq. (8) of the paper"),
     ("θ, θ̂", "masses of an arm, and the controller's estimates of them"),
@@ -55,16 +61,16 @@ _SYMBOLS = (
 """Symbols of the page with their meanings."""
 _BALANCE_NOTE = (
     "V is the energy function of the stability theorem: a weighted sum of the energies of the "
-    "arms, of their errors and of the estimates. What is left of "
+    "arms, of their errors and of the estimates. The sum "
     "V − V(0) + dissipation − work must vanish, whatever the operators do."
 )
 
 
 def render_certificate(log: Log, certificate: Certificate) -> Markup:
-    """Renders the section of the report that explains why a run was judged as stable or not.
+    """Renders the section of the report that explains why a run was judged stable or not.
 
-    It has the reasons as sentences, and tables and figures that a reader can unfold. The
-    judgement itself stands at the beginning of the page.
+    The section contains the reasons as sentences, and tables and figures that a reader can
+    unfold. The judgement itself is at the beginning of the page.
 
     Args:
         log: Log of the run.
@@ -105,7 +111,7 @@ def render_certificate(log: Log, certificate: Certificate) -> Markup:
     body += render_folds(folds)
 
     intro = (
-        "✓ speaks for stability, ✗ against it, ? decides nothing, · is a remark or does not "
+        "✓ speaks for stability, ✗ against it, ? does not decide, · is a remark or does not "
         "apply (`trilat certify --all`)."
     )
     if certificate.has_functional:
@@ -116,9 +122,9 @@ def render_certificate(log: Log, certificate: Certificate) -> Markup:
 def _lengthen_name(sentence: str) -> str:
     """Replaces the short name at the beginning of a sentence by a name for readers of the page.
 
-    `describe_certificate` begins each sentence with the name of the check that it is about and
-    a colon. The short names fit a terminal. A name that is not in `_LONG_NAMES` remains, as
-    does a sentence without a colon.
+    Each sentence of `describe_certificate` begins with the name of a check and a colon. The
+    short names fit a terminal. A name that is not in `_LONG_NAMES` remains, as does a sentence
+    without a colon.
     """
     name, colon, rest = sentence.partition(": ")
     return f"{_LONG_NAMES.get(name, name)}{colon}{rest}"
@@ -131,11 +137,11 @@ def _render_premises(certificate: Certificate) -> Markup:
 
 
 def _draw_certificate(log: Log, certificate: Certificate) -> list[tuple[str, Figure]]:
-    """Draws the figures that show why a run was judged as stable or not.
+    """Draws the figures that show why a run was judged stable or not.
 
-    Which figures exist depends on the evidence: the energy function of the stability proof,
+    There is a figure for each kind of evidence: the energy function of the stability proof,
     energies that the control laws record themselves, and repetitions of the run with a small
-    push (twins), which grows or decays.
+    push (twins), whose effect grows or decays.
 
     Returns:
         Title and figure of each.

@@ -1,10 +1,11 @@
-"""Renders the places on the page of a report into which its scripts draw charts and arms.
+"""Renders the empty containers on a report's page into which its scripts draw charts and arms.
 
 A report is a web page about a recorded run of several robot arms. The scripts `report.js` and
 `arms.js` draw the charts and the moving arms in the browser, into empty containers.
 
 Invariant:
-    - Each group of charts unfolds. At first at most `_MOST_OPEN_CHARTS` charts are unfolded.
+    - Each group of charts can be unfolded. At first at most `_MOST_OPEN_CHARTS` charts are
+      unfolded.
     - The page names the charts for which the log has no value.
 """
 
@@ -28,13 +29,14 @@ from .page_leaders import describe_leads, render_lead_bars
 _TEXTS: dict[str, dict[str, Any]] = tomllib.loads(
     (resources.files("trilat_net.presentation") / "assets" / "report.toml").read_text("utf-8")
 )
-"""Heading and note of each section of charts, by place and section, and other notes."""
+"""Heading and note of each section of charts, by part of the page and section, and other notes.
+"""
 _OPEN_SECTIONS = ("torques", "errors", "positions")
 """Sections of charts that may be unfolded at first."""
 _MOST_OPEN_CHARTS = 10
-"""Largest number of charts of a place that are unfolded at first."""
+"""Largest number of charts in a part of the page that are unfolded at first."""
 _MOST_HALF_CHARTS = 2
-"""Largest number of charts of a group that takes half of the width of the page."""
+"""Largest number of charts in a group that takes half of the width of the page."""
 _NO_VALUE = "the log has no value to draw"
 """Reason why a chart is left out."""
 
@@ -45,13 +47,13 @@ _ARM_NOTE = (
 
 
 def render_overview(log: Log, builder: ChartBuilder, charts: Sequence[Chart]) -> Markup:
-    """Renders the top of a report: the moving arms, who leads, errors and delays.
+    """Renders the top of a report: the moving arms, the leading users, errors and delays.
 
-    Somebody who opens the page should understand the run without reading further.
+    A reader who opens the page should understand the run without reading further.
 
     Args:
         log: Log of the run.
-        builder: Builder of the charts, which knows the box around the motion and the scale.
+        builder: Builder of the charts, which provides the box around the motion and the scale.
         charts: Charts of the page.
     """
     html = Markup()
@@ -84,7 +86,8 @@ def render_chart_groups(
 
     Args:
         log: Log of the run.
-        place: Place on the page, a table of `report.toml`, such as "motion" or "links".
+        place: Part of the page, which is the name of a table in `report.toml`, such as "motion"
+            or "links".
         charts: Charts of the page.
         missing: Titles of the charts for which the log has no value, by section.
     """
@@ -119,7 +122,7 @@ def render_chart_groups(
     groups = Markup()
     if rendered_groups:
         groups = render_macro("charts.html", "groups", groups=rendered_groups)
-    if place == "loops":  # the section of the loops says itself what is missing
+    if place == "loops":  # the section of the loops itself says which charts are missing
         return groups
 
     for reason, titles in missing_by_reason.items():
@@ -133,7 +136,7 @@ def _render_group(
 ) -> Markup:
     """Renders a group of charts that readers can unfold.
 
-    It is an empty container, into which a script of the page draws the charts.
+    The group is an empty container, into which a script of the page draws the charts.
 
     Args:
         section: Key of the section, as in `report.toml`.

@@ -5,9 +5,10 @@ The scripts `report.js` and `arms.js` draw charts and moving arms in the browser
 base64.
 
 Invariant:
-    - These types are the contract between the program and the scripts. A script reads no field
-      that is not declared here. The tests of pages in browsers (`tests/page/whole_pages.py`)
-      report every field that a script reads and that was not sent.
+    - These types are the contract between the program and the scripts. A script reads only
+      fields that are declared here. The tests of pages in browsers
+      (`tests/page/whole_pages.py`) report every field that a script reads although it was not
+      sent.
     - Every field is sent, whether or not it has its default value. A script never has to guess
       the meaning of an absent field.
     - The field `kind` names the kind of a chart or an arm. A script never infers the kind from
@@ -26,7 +27,7 @@ The lines of references, true values and limits have the colour "limit".
 
 
 class ColumnTable(msgspec.Struct, frozen=True):
-    """Numbers of one arm over time, as the report's web page contains them.
+    """Values of one arm over time, as the report's web page contains them.
 
     A table has one row per shown tick (control period). The lines of charts refer to its
     columns.
@@ -46,7 +47,7 @@ class ColumnTable(msgspec.Struct, frozen=True):
 class TableSeries(msgspec.Struct, frozen=True, kw_only=True):
     """A line of a chart over time, which draws one column of a `ColumnTable`.
 
-    Several charts may draw from the same table, so that the page contains its numbers once.
+    Several charts may draw from the same table, so that the page contains its values only once.
 
     Attributes:
         label: Name of the line in the legend.
@@ -130,7 +131,7 @@ class TimeChart(msgspec.Struct, frozen=True, kw_only=True, tag="time", tag_field
         log: True for a logarithmic value axis.
         zero: True if the value axis begins at 0.
         margin: Least space above the values, as a fraction of the largest value.
-        note: Sentences below the chart. Empty for none.
+        note: Sentences below the chart. Empty for no sentence.
     """
 
     section: str
@@ -149,7 +150,7 @@ class TimeChart(msgspec.Struct, frozen=True, kw_only=True, tag="time", tag_field
 class HistogramChart(
     msgspec.Struct, frozen=True, kw_only=True, tag="histogram", tag_field="kind"
 ):
-    """A chart of the page that counts the ticks of each site by a time, such as the lateness.
+    """A histogram of a duration that is measured in every tick, such as the lateness.
 
     The bins have equal width on a logarithmic axis.
 
@@ -239,7 +240,7 @@ class ChainArm(msgspec.Struct, frozen=True, kw_only=True, tag="chain", tag_field
 
 
 class LeadBar(msgspec.Struct, frozen=True, kw_only=True):
-    """Data of a bar that shows over time which arms lead a slave arm.
+    """Data of a bar that shows which arms lead a slave arm over time.
 
     A slave follows its peers, the other arms, with weights, the dominance factors. Between two
     points in time the factors change linearly.
@@ -258,7 +259,7 @@ class LeadBar(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class MarkedChange(msgspec.Struct, frozen=True):
-    """A change during the run that charts mark, such as another delay of a link.
+    """A change during the run that charts mark, such as a new delay of a link.
 
     The number n connects the mark with the row of the table that explains the change.
 
@@ -276,7 +277,7 @@ class MarkedChange(msgspec.Struct, frozen=True):
 
 
 class ModeSpan(msgspec.Struct, frozen=True, array_like=True):
-    """An interval in which an arm did not follow the others, which charts shade.
+    """An interval, shaded in charts, in which an arm did not follow the others.
 
     The page receives it as a JSON list.
 
@@ -308,7 +309,7 @@ class Palettes(msgspec.Struct, frozen=True):
 
 
 class PageData(msgspec.Struct, frozen=True, kw_only=True):
-    """All numbers and texts that the scripts of a report's web page draw.
+    """All data that the scripts of a report's web page draw.
 
     Attributes:
         end_s: End of the time axis, in s.
@@ -318,7 +319,7 @@ class PageData(msgspec.Struct, frozen=True, kw_only=True):
         changes: Changes during the run.
         spans: For each site, the intervals in which it does not follow its peers.
         arms: Arms of the sites that have records.
-        leads: Who leads each slave whose dominance factors change, in the order of the bars.
+        leads: Dominance factors of each slave whose factors change, in the order of the bars.
         bounds_m: Left, right, bottom and top of the pictures of the arms, in the units of these
             pictures.
     """

@@ -3,8 +3,8 @@
 The modules `page_...` compose the sections of the report from these pieces.
 
 Invariant:
-    - Every function that renders HTML returns `Markup`. A plain string that becomes a part of
-      it is escaped.
+    - Every function that renders HTML returns `Markup`. Plain strings that become part of this
+      HTML are escaped.
     - A reader who uses the keyboard can scroll every region that scrolls sideways.
 """
 
@@ -28,7 +28,7 @@ def render_section(heading: str, intro: str, body: Markup, name: str = "") -> Ma
         intro: Sentence that says what the reader sees, as plain text. Text in backticks is
             shown as code.
         body: HTML of the content.
-        name: Identifier of the section, for links and style. Empty for none.
+        name: Identifier of the section, for links and style. Empty for no identifier.
     """
     return _render("section", heading=heading, intro=intro, body=body, name=name)
 
@@ -47,7 +47,7 @@ def render_details(summary: str, body: Markup, *, is_open: bool = False) -> Mark
 def render_folds(folds: Iterable[Markup]) -> Markup:
     """Renders several parts that unfold side by side, for details that few readers need.
 
-    While the parts are folded, they take one line.
+    While the parts are folded, they take up one line.
 
     Args:
         folds: HTML of each part, from `render_details`. Empty for a part that does not exist.
@@ -93,7 +93,7 @@ def render_table(
 def render_legend(columns: Mapping[str, str]) -> Markup:
     """Renders the meanings of a table's columns as a line of text, for touch screens.
 
-    With a pointer, a reader sees the meaning of a column at its header.
+    On other screens, the meaning of a column is shown while the pointer is on its header.
 
     Args:
         columns: Meanings of the columns by header. Columns with an empty meaning are left out.
@@ -131,7 +131,7 @@ def render_code(text: str) -> Markup:
 def label_site(log: Log, name: str) -> Markup:
     """Renders the label of a site in a table, for example "m1 (master)".
 
-    A square before it has the colour that the site has in all charts.
+    A square before the label has the colour of the site in all charts.
     """
     role = log.scenario.sites[name].role
     return _render("labelled", index=log.sites.index(name), text=f"{name} ({role})")
@@ -140,22 +140,22 @@ def label_site(log: Log, name: str) -> Markup:
 def label_link(log: Log, link: str) -> Markup:
     """Renders the label of a link in a table, for example "m1 → s" for the link "m1->s".
 
-    A square before it has the colour of the sending site.
+    A square before the label has the colour of the sending site.
     """
     peer, site = link.split("->")
     return _render("labelled", index=log.sites.index(peer), text=f"{peer} → {site}")
 
 
 def _render(macro: str, **values: Any) -> Markup:
-    """Renders a macro of the template with the pieces of a page."""
+    """Renders a macro of the template that contains the pieces of a page."""
     return render_macro("parts.html", macro, **values)
 
 
 def format_cell(value: float | None) -> str:
     """Returns the text of a number in a table, such as "15000" or "0.1235" for 0.12346.
 
-    Integers have all digits, other numbers four significant digits. A missing number (None) is
-    a dash.
+    Integers are printed with all digits, other numbers with four significant digits. A missing
+    number (`None`) is a dash.
     """
     if value is None:
         return NO_NUMBER
@@ -165,7 +165,7 @@ def format_cell(value: float | None) -> str:
 def format_numbers(values: Iterable[float] | None) -> str:
     """Returns numbers as one cell of a table, for example "0.1000, -0.2500".
 
-    None, for values that do not exist, gives a dash.
+    `None`, for values that do not exist, gives a dash.
     """
     if values is None:
         return NO_NUMBER
@@ -173,5 +173,5 @@ def format_numbers(values: Iterable[float] | None) -> str:
 
 
 def to_percent(share: float | None) -> float | None:
-    """Converts a share from 0 to 1 to percent: 0.05 gives 5. None (unknown) stays None."""
+    """Converts a fraction to percent: 0.05 gives 5. `None` (unknown) gives `None`."""
     return None if share is None else 100.0 * share

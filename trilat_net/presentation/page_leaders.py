@@ -2,11 +2,11 @@
 
 A slave arm may follow several master arms, each with a weight, the dominance factor. The master
 with the larger factor leads. The factors may change during a run, for example when a trainer
-takes over from a trainee. The bars stand below the moving arms of the report.
+takes over from a trainee. The bars are below the moving arms of the report.
 
 Invariant:
     - The factors are those with which the slave computed, from the scenario and the records.
-    - Where the factors never change, a sentence replaces the bar.
+    - For a slave whose factors never change, a sentence replaces the bar.
     - The bar has the time axis of the slider that moves the arms.
 """
 
@@ -37,7 +37,7 @@ _SAME_SHARE = 1e-9
 
 
 class _Lead(NamedTuple):
-    """How strongly each user's arm leads the slave arm over time.
+    """The weights with which each user's arm leads the slave arm over time.
 
     The slave follows the arms of several users, each with a dominance factor from 0 to 1.
 
@@ -57,7 +57,8 @@ class _Lead(NamedTuple):
     def is_constant(self) -> bool:
         """True if no weight with which the slave arm follows the others changes during the run.
 
-        A sentence then says all, and a bar over time would show nothing.
+        A sentence then describes the weights completely, and a bar over time would show
+        nothing.
         """
         return len(self.t_s) < 2 or bool(np.ptp(self.shares, axis=0).max() <= _SAME_SHARE)
 
@@ -80,7 +81,7 @@ def caption_site(scenario: Scenario, site: str) -> str:
 
 
 def trace_leads(log: Log) -> list[_Lead]:
-    """Returns who leads each slave arm over the run: the weights with which it follows others.
+    """Returns the weights with which each slave arm follows the other arms over the run.
 
     The bars, the sentences and the slider of the page use these data.
 
@@ -88,7 +89,8 @@ def trace_leads(log: Log) -> list[_Lead]:
         log: Log of the run.
 
     Returns:
-        An entry for each slave with records that follows somebody, for at most `_MAX_BARS`.
+        An entry for each slave that has records and follows another arm, at most `_MAX_BARS`
+        entries.
     """
     leads = []
     for site, site_settings in log.scenario.sites.items():
@@ -102,14 +104,14 @@ def trace_leads(log: Log) -> list[_Lead]:
 def _trace_lead(log: Log, slave: str) -> _Lead:
     """Returns the weights (dominance factors) with which a slave follows its peers over time.
 
-    The points are those at which the slopes of the weights change, so that straight lines
-    between them show the whole course.
+    The points are those at which the slopes of the weights change. Straight lines between the
+    points therefore show the weights at all times.
     """
     end_s = recorded_end_s(log)
     _, ramps = list_ramps(log, slave)
 
-    # Candidates: equal steps, and the begin and the end of each ramp. A point just before the
-    # begin shows a jump as a vertical line.
+    # Candidates: equal steps, and the start and the end of each ramp. A point just before the
+    # start shows a jump as a vertical line.
     times_s = [np.linspace(0.0, end_s, _INSTANTS)]
     for ramp in ramps:
         start_s = ramp.start_ns * 1e-9
@@ -127,7 +129,8 @@ def _trace_lead(log: Log, slave: str) -> _Lead:
 def _find_corners(t_s: Array, shares: Array) -> list[int]:
     """Returns the indices of the points that are needed to draw weights over time as a line.
 
-    Points on a straight line between others are left out. The first and the last are kept.
+    Points on a straight line between other points are left out. The first and the last point
+    are kept.
     """
     slopes = np.diff(shares, axis=0) / np.diff(t_s)[:, np.newaxis]
     turns = np.abs(np.diff(slopes, axis=0)).max(axis=1, initial=0.0)
@@ -136,12 +139,12 @@ def _find_corners(t_s: Array, shares: Array) -> list[int]:
 
 
 def list_lead_bars(leads: Sequence[_Lead]) -> list[LeadBar]:
-    """Returns the data from which a script of the page states who leads at a chosen time.
+    """Returns the data from which a script of the page shows who leads at a chosen time.
 
     Slaves whose weights never change are left out, because a sentence describes them.
 
     Args:
-        leads: Who leads each slave, from `trace_leads`.
+        leads: Weights of each slave, from `trace_leads`.
     """
     bars = []
     for lead in leads:
@@ -157,25 +160,25 @@ def list_lead_bars(leads: Sequence[_Lead]) -> list[LeadBar]:
 
 
 def render_lead_bars(log: Log, leads: Sequence[_Lead]) -> Markup:
-    """Renders a bar for each slave arm, whose areas show over time who leads it.
+    """Renders a bar for each slave arm, whose areas show who leads the arm over time.
 
     Slaves whose dominance factors never change have no bar.
 
     Args:
         log: Log of the run.
-        leads: Who leads each slave, from `trace_leads`.
+        leads: Weights of each slave, from `trace_leads`.
     """
     return Markup().join(_render_bar(log, lead) for lead in leads if not lead.is_constant)
 
 
 def describe_leads(log: Log, leads: Sequence[_Lead]) -> list[str]:
-    """Returns a sentence on who leads, for each slave arm whose leaders never change.
+    """Returns a sentence on who leads, for each slave arm whose weights never change.
 
     The other slaves have bars, see `render_lead_bars`.
 
     Args:
         log: Log of the run.
-        leads: Who leads each slave, from `trace_leads`.
+        leads: Weights of each slave, from `trace_leads`.
     """
     return [_describe_constant_lead(log.scenario, lead) for lead in leads if lead.is_constant]
 
@@ -187,7 +190,7 @@ def _describe_constant_lead(scenario: Scenario, lead: _Lead) -> str:
 
     Args:
         scenario: Scenario of the run.
-        lead: Who leads the slave.
+        lead: Weights with which the slave follows its peers.
     """
     slave = _name_slave(scenario, lead.slave)
     first, *others = lead.peers
@@ -200,13 +203,15 @@ def _describe_constant_lead(scenario: Scenario, lead: _Lead) -> str:
 
 
 def describe_phases(lead: _Lead) -> str:
-    """Returns who leads when, as in "0 to 10 s: m1 90 %, m2 10 %; from 12 s: m1 10 %, m2 90 %".
+    """Returns a text on who leads at which times.
 
-    Ramps between two spans are left out, because the spans around them say how they begin and
-    end. If there are more than `_MAX_PHASES` spans, the last ones are counted.
+    An example is "0 to 10 s: m1 90 %, m2 10 %; from 12 s: m1 10 %, m2 90 %".
+    Ramps between two spans are left out, because these spans show the weights before and after
+    the ramp. If there are more than `_MAX_PHASES` spans, only the number of the remaining ones
+    is stated.
 
     Args:
-        lead: Who leads the slave.
+        lead: Weights with which the slave follows its peers.
     """
     phase_texts = []
     first_point = 0
@@ -271,7 +276,7 @@ def _list_points(t_s: Array, heights: Array) -> list[str]:
 
 
 def _list_shares(lead: _Lead, index: int) -> str:
-    """Returns the percentages of all peers at a point, as in "m1 90 %, m2 10 %"."""
+    """Returns the percentages of all peers at a point, such as "m1 90 %, m2 10 %"."""
     shares = zip(lead.peers, lead.shares[index], strict=True)
     return ", ".join(f"{peer} {_format_percent(share)}" for peer, share in shares)
 

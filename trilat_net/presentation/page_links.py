@@ -1,11 +1,11 @@
 """Renders the section of a report about communication: delays, losses and clocks.
 
-A link is the directed connection from one arm to another. Over it, an arm sends its state in
-each period of its control loop, which is called a sample. The age of a sample is the time since
-it was sent, and thus the delay that the controller of the receiver experiences.
+A link is the directed connection from one arm to another. Over a link, an arm sends its state
+in each period of its control loop. Such a state is called a sample. The age of a sample is the
+time since it was sent, and thus the delay that the controller of the receiver experiences.
 
 Invariant:
-    - A sentence with the main numbers precedes the tables, and each table has a legend.
+    - A sentence with the main results precedes the tables, and each table has a legend.
     - Empty tables are left out.
 """
 
@@ -75,7 +75,7 @@ _CLOCK_COLUMNS = {
     "rtt_min_us": ("round trip, min (µs)", "shortest time to the peer and back"),
     "faults": ("faults", "samples that arrived before they were sent"),
 }
-"""Header and meaning of each number of a sender's clock, by its key in the summary."""
+"""Header and meaning of each value of a sender's clock, by its key in the summary."""
 
 
 def render_links(log: Log, facts: JsonObject, charts: Markup = Markup()) -> Markup:  # noqa: B008
@@ -86,7 +86,7 @@ def render_links(log: Log, facts: JsonObject, charts: Markup = Markup()) -> Mark
     Args:
         log: Log of the run.
         facts: Numbers of the run, from `summarise_run`.
-        charts: HTML of the charts about the links. Empty for none.
+        charts: HTML of the charts about the links. Empty for no charts.
     """
     rows = _list_age_rows(log, facts)
     ages = render_table(_AGE_COLUMNS, rows, text_columns=[1]) + render_legend(_AGE_COLUMNS)
@@ -143,8 +143,8 @@ def _summarise_links(facts: JsonObject) -> str:
 def _list_age_rows(log: Log, facts: JsonObject) -> list[list[str]]:
     """Returns table rows with each network link's stated delay and the ages of its messages.
 
-    The scenario may change the delay of a link during the run. Then the cell lists all stated
-    delays, each with the time from which it applied.
+    The scenario may change the delay of a link during the run. In this case the cell lists all
+    stated delays, each with the time from which it applied.
     """
     rows = []
     for name, link in facts["links"].items():
@@ -190,7 +190,7 @@ def _render_samples(log: Log, facts: JsonObject) -> Markup:
 def _render_clocks(log: Log, facts: JsonObject) -> Markup:
     """Renders a table of the clock differences between the machines of a session.
 
-    Measured one-way delays are only as accurate as these differences are known.
+    Measured one-way delays are only as accurate as the estimates of these differences.
 
     Args:
         log: Log of the run.

@@ -1,10 +1,10 @@
-"""Renders the section of a report that says how the run was made and how to repeat it.
+"""Renders the section of a report that says how the run was executed and how to repeat it.
 
 It contains the description of the scenario (the experiment), the facts about the recording, the
 commands that check and repeat the run, the assumptions, and the versions of the software.
 
 Invariant:
-    - Everything in this section is folded, except the commands.
+    - All parts of this section are folded, except the commands.
 """
 
 import shlex
@@ -29,7 +29,7 @@ from .page_html import (
 from .page_timeline import describe_dominance
 
 _STATED_KEYS = ("seed", "duration_s")
-"""Settings that stand beside the title anyway."""
+"""Settings that are already shown next to the title."""
 _MAX_CHANGES = 3
 """Largest number of changed settings in the head of the page."""
 
@@ -37,7 +37,7 @@ _MAX_CHANGES = 3
 def render_origin(log: Log, facts: JsonObject, licence: str) -> Markup:
     """Renders the section of a report with which a reader can repeat the run.
 
-    It has the commands, the scenario, the assumptions and the versions.
+    The section contains the commands, the scenario, the assumptions and the versions.
 
     Args:
         log: Log of the run.
@@ -84,10 +84,11 @@ def summarise_origin(log: Log) -> str:
 
 
 def describe_changes(scenario: Scenario) -> str:
-    """Returns how a scenario differs from the shipped scenario whose name and title it has.
+    """Returns how a scenario differs from the shipped scenario of the same name and title.
 
     The title and the description of a scenario state its original settings. A run with other
-    settings, for example of `trilat rerun`, keeps both, so that a reader must be told.
+    settings, for example of `trilat rerun`, keeps title and description. The reader must
+    therefore be informed of the differences.
 
     Args:
         scenario: Scenario of the run.
@@ -151,7 +152,7 @@ def _list_recording_facts(log: Log, facts: JsonObject) -> list[tuple[str, str]]:
 def _describe_driver(log: Log) -> str:
     """Returns a text on how a run was executed: simulated, repeated from a log, or live.
 
-    A live session has the time of its start ("epoch").
+    The text on a live session contains the time of its start ("epoch").
     """
     session = log.session
     if log.driver == "virtual":
@@ -216,7 +217,7 @@ def _list_law_files(scenario: Scenario) -> list[str]:
 def _list_versions(log: Log) -> list[tuple[str, str]]:
     """Returns the software and the machine that recorded a log, as pairs of name and text.
 
-    The fingerprint of the arithmetic tells whether another machine computes the same last
+    The fingerprint of the arithmetic shows whether another machine computes the same last
     digits.
     """
     session = log.session

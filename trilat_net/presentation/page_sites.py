@@ -34,7 +34,7 @@ _MOTION_KEYS = (
     "saturated_ticks",
 )
 _MOST_OPEN_ROWS = 4
-"""Largest number of sites whose table is not folded."""
+"""Largest number of sites for which the table is not folded."""
 _ANGLE_COLUMNS = {
     "site": "",
     "q at the end (rad)": "angle of each joint at the last record",
@@ -46,8 +46,7 @@ _ANGLE_COLUMNS = {
 def render_sites(log: Log, facts: JsonObject) -> Markup:
     """Renders the section of a report with tables of the motion and records of each arm.
 
-    A reader sees there how well each arm followed the others, and how hard its controller
-    worked.
+    The tables show how well each arm followed the others, and how hard its controller worked.
 
     Args:
         log: Log of the run.
@@ -102,22 +101,23 @@ _LOOP_COLUMNS = {
     "busy p50 (µs)": "median computing time of a tick",
     "busy p99 (µs)": "value that 99 % of the ticks do not exceed",
     "busy max (µs)": "largest value",
-    "overruns": "ticks that began late by a period or more, and were made all the same: a "
+    "overruns": "ticks that began late by a period or more, and were executed nevertheless: a "
     "simulated arm catches up",
-    "skipped": "ticks that were not made: a site with an external arm skips the ticks that it "
-    "missed",
+    "skipped": "ticks that were not executed: a site with an external arm skips the ticks that "
+    "it missed",
 }
 
 
 def render_loops(log: Log, facts: JsonObject, charts: Markup = Markup()) -> Markup:  # noqa: B008
     """Renders the section of the report about the timing of each site's control loop.
 
-    It shows how punctual the ticks (control periods) were, and how long they took to compute.
+    The section shows how punctual the ticks (control periods) were, and how long they took to
+    compute.
 
     Args:
         log: Log of the run.
         facts: Numbers of the run, from `summarise_run`.
-        charts: HTML of the charts about the loops. Empty for none.
+        charts: HTML of the charts about the loops. Empty for no charts.
     """
     reason = explain_missing_loop_times(log)
     if reason:
@@ -145,7 +145,7 @@ def render_loops(log: Log, facts: JsonObject, charts: Markup = Markup()) -> Mark
     intro = (
         f"The latest tick began {largest_lateness_us / 1e3:.3g} ms after it was due; "
         f"{count_nouns(overrun_count, 'tick')} began a period or more late and "
-        f"{verb} made all the same; "
+        f"{verb} executed nevertheless; "
         f"{count_nouns(skipped_count, 'tick was', 'ticks were')} skipped."
     )
     table = render_table(_LOOP_COLUMNS, rows) + render_legend(_LOOP_COLUMNS)

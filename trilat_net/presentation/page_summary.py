@@ -1,13 +1,13 @@
 """Renders the first lines of a report: the stability judgement, its checks and key numbers.
 
-They let a reader decide within seconds whether the run needs a closer look. One of the numbers
-is the tracking error e, the difference between the motion of an arm and the motion that it
-should follow.
+These lines let a reader decide within seconds whether the run needs a closer look. One of the
+key numbers is the tracking error e, the difference between the motion of an arm and the motion
+that it should follow.
 
 Invariant:
-    - The judgement never stands alone beside a number that seems to contradict it. A sentence
-      says which number it is, and why both are true.
-    - A check that failed is named in the first lines, and unfolded.
+    - If a number seems to contradict the judgement, a sentence names this number and explains
+      why both are true.
+    - A failed check is named in the first lines, and its details are unfolded.
     - Every text that comes from a log is escaped, by the template `summary.html`.
 """
 
@@ -41,19 +41,22 @@ from .style import typeset
 _MAX_ALARMS = 8
 """Largest number of alarms at the top of the page."""
 _SEVERE_ALARMS = ("FAULT", "STOPPED")
-"""Words of the alarms of sites that can no longer move."""
+"""Names of the alarms of sites that can no longer move."""
 
 _MEANINGS = {
     Stability.STABLE: "A proof holds for this loop, and the run agrees with it",
     Stability.NOT_STABLE: "The motion of this run does not come to rest",
     Stability.OPEN: "Nothing decides whether this loop is stable",
 }
-"""What each judgement means. The meaning of a settled run has numbers, see `_explain_word`."""
+"""Meaning of each judgement. The meaning of a settled run contains values, see `_explain_word`.
+"""
 _ROOTS_AND_THEOREM = (
     "This proof is about small motions near the final pose. The paper's theorem, which "
     "is examined below, is another proof, and this one does not need it."
 )
-"""What readers must know if the loop has stable roots, but not all premises of the theorem."""
+"""Explanation for readers if the loop has stable roots, but not all premises of the theorem
+hold.
+"""
 _MARKS = {
     Stability.STABLE: "good",
     Stability.SETTLED: "good",
@@ -64,16 +67,16 @@ _MARKS = {
 _ENDS = {
     EndBehaviour.DECAYS: "the motion was dying away",
     EndBehaviour.HARDLY: "the motion was hardly dying away",
-    EndBehaviour.UNDECIDED: "the motion showed no trend, so that a longer record is needed",
-    EndBehaviour.COASTS: "an arm coasted, because nobody holds it",
+    EndBehaviour.UNDECIDED: "the motion showed no trend, so a longer record is needed",
+    EndBehaviour.COASTS: "an arm coasted, because no operator holds it",
     EndBehaviour.BOUNDED: "the arms oscillated between limits",
     EndBehaviour.DRIFTS: "an arm drifted",
     EndBehaviour.GROWS: "the motion grew",
-    EndBehaviour.DIVERGED: "a joint had exceeded its limit of speed",
+    EndBehaviour.DIVERGED: "a joint had exceeded its speed limit",
 }
-"""How the arms moved at the end of a run, as a clause in the past tense.
+"""Clauses, in the past tense, on the motion of the arms at the end of a run.
 
-The clause about a run that converged has numbers, see `_explain_end`.
+The clause about a run that converged contains values, see `_explain_end`.
 """
 
 
@@ -111,7 +114,7 @@ def render_verdict(log: Log, certificate: Certificate, findings: Sequence[Findin
     has_failed_check = any(finding.judged and not finding.passed for finding in findings)
     if has_failed_check:
         css_class = "bad" if css_class == "bad" else "warn"
-        sentences.append("The log failed a check, so that the judgement may be wrong.")
+        sentences.append("The log failed a check, so the judgement may be wrong.")
 
     remarks = [f"{_start_sentence(remark)}." for remark in certificate.remarks]
     return render_macro(
@@ -139,7 +142,7 @@ def _start_sentence(text: str) -> str:
 
 
 def describe_basis(certificate: Certificate) -> str:
-    """Returns a sentence that says what a judgement about stability means and rests on.
+    """Returns a sentence on the meaning and the basis of a judgement about stability.
 
     A simulation and a live session, or a proof and an observation, support a judgement to
     different degrees.
@@ -168,18 +171,18 @@ def describe_basis(certificate: Certificate) -> str:
 
 
 def _explain_word(certificate: Certificate) -> str:
-    """Returns what the judgement of a run means, as a clause."""
+    """Returns the meaning of the judgement of a run as a clause."""
     if certificate.stability is Stability.SETTLED:
         return _start_sentence(describe_settling(certificate))
     return _MEANINGS[certificate.stability]
 
 
 def _explain_end(log: Log, certificate: Certificate) -> str:
-    """Returns how the motion ends, and why that does not contradict the judgement of the run.
+    """Returns sentences on the end of the motion, and why it does not contradict the judgement.
 
     The judgement is about the loop: whether disturbances of its motion die away. A stable run
-    may end with errors that stay, for example because an operator still pushes. Without an
-    explanation, a reader might take the judgement for wrong.
+    may end with remaining errors, for example because an operator still pushes. Without an
+    explanation, a reader might think that the judgement is wrong.
     """
     end = certificate.end
     if end.missing_sites:
@@ -220,7 +223,7 @@ def _explain_end(log: Log, certificate: Certificate) -> str:
 
 
 def _explain_remaining_error(log: Log) -> str:
-    """Returns which sites hands or walls still push at the end, as a clause. Empty if none."""
+    """Returns a clause on the sites that hands or walls still push at the end. May be empty."""
     pushed = _list_pushed_sites(log)
     if not pushed:
         return ""
@@ -243,7 +246,7 @@ class _KeyNumber(NamedTuple):
     Attributes:
         name: Name of the quantity.
         value: The number with its unit.
-        detail: Where and when the number was measured, or what it includes.
+        detail: Place and time of the measurement, or the contents of the number.
     """
 
     name: str
@@ -254,7 +257,7 @@ class _KeyNumber(NamedTuple):
 def render_key_numbers(log: Log, facts: JsonObject) -> Markup:
     """Renders the most important numbers of a run: its errors and the delay in use.
 
-    They stand below the judgement, for readers who read nothing else.
+    The key numbers are shown below the judgement, for readers who read nothing else.
 
     Args:
         log: Log of the run.
@@ -275,10 +278,10 @@ def find_error_peak(log: Log, sites: Sequence[str] = ()) -> JointError | None:
 
     Args:
         log: Log of the run.
-        sites: Names of the sites that count. Empty for all sites.
+        sites: Names of the sites to consider. Empty for all sites.
 
     Returns:
-        The first record with this error. None if no record has a finite error.
+        The first record with this error. `None` if no record has a finite error.
     """
     peaks = [JointError.find_largest(log[site]) for site in sites or log.sites]
     known_peaks = [peak for peak in peaks if peak is not None]
@@ -290,7 +293,7 @@ def _list_error_cards(log: Log) -> list[_KeyNumber]:
 
     A slave is a remote arm, and a master is an arm that a person moves. The error of a slave
     says how well it follows the people. The error of a master is large while its operator leads
-    the others, and says nothing about how well they follow.
+    the others, and says nothing about how well the other arms follow.
     """
     slaves = [site for site in log.sites if log.scenario.sites[site].role == "slave"]
     masters = [site for site in log.sites if site not in slaves]
@@ -312,7 +315,8 @@ def _describe_errors(log: Log, sites: Sequence[str], place: str) -> _KeyNumber:
     Args:
         log: Log of the run.
         sites: Names of the sites.
-        place: What the error is measured from, as the end of the name of the number.
+        place: Phrase for the pose from which the error is measured, which ends the name of the
+            number.
     """
     peak = find_error_peak(log, sites)
     if peak is None:
@@ -336,8 +340,8 @@ def _describe_errors(log: Log, sites: Sequence[str], place: str) -> _KeyNumber:
 def _describe_undelayed_error(log: Log, slaves: Sequence[str]) -> list[_KeyNumber]:
     """Returns a text on how far the slave arms were from the others at the same time.
 
-    The tracking error compares a slave with what the other arms sent some time ago. A reader
-    who sees the arms apart on the screen looks for the distance at the same time.
+    The tracking error compares a slave with states that the other arms sent some time ago. A
+    reader who sees the arms apart on the screen looks for the distance at the same time.
 
     Args:
         log: Log of the run.
@@ -397,9 +401,9 @@ def _describe_delay(facts: JsonObject) -> _KeyNumber:
 def render_alarms(log: Log) -> Markup:
     """Renders the alarms of a run, such as an emergency stop, as a list in large type.
 
-    Faults and stops are the severe alarms. If there are any, only these are listed, because
-    other alarms usually follow from them. At most `_MAX_ALARMS` alarms are listed, and the rest
-    is counted.
+    Faults and stops are the severe alarms. If there are severe alarms, only these are listed,
+    because other alarms usually follow from them. At most `_MAX_ALARMS` alarms are listed, and
+    the number of the others is stated.
 
     Args:
         log: Log of the run.

@@ -1,4 +1,4 @@
-"""Renders the section of a report that lists what happened in the run, in order of time.
+"""Renders the section of a report that lists the events of the run, in order of time.
 
 For example, a command changed the network delay at 5 s, or an operator pushed an arm at 7 s.
 The section also lists alarms, and changes of an arm's mode: it follows the other arms, holds
@@ -7,7 +7,7 @@ its position, brakes or returns.
 Invariant:
     - Every sentence comes from the scenario or from a record.
     - Changes have the same numbers as their marks in the charts.
-    - Moments beyond `MAX_SHOWN` are folded, and none is left out before `_MAX_MOMENTS`.
+    - Moments beyond `MAX_SHOWN` are folded, and moments beyond `_MAX_MOMENTS` are left out.
 """
 
 from collections.abc import Iterator
@@ -33,11 +33,13 @@ MAX_SHOWN = 5
 _MAX_MOMENTS = 400
 """Largest number of moments on the page. summary.json has all modes and changes."""
 _MAX_PUSHES = 3
-"""Largest number of pushes of a site with a sentence each. More pushes share a sentence."""
+"""Largest number of pushes of a site that have separate sentences. More pushes share a
+sentence.
+"""
 _PAUSE_S = 0.2
 """Shortest pause between two pushes, in s. Shorter pauses do not divide a push."""
 _LEAST_PUSH_NM = 1e-3
-"""Torque below which nobody pushes, in N m."""
+"""Torque, in N m, below which an arm does not count as pushed."""
 _DID = {
     "hold": "held still",
     "brake": "braked",
@@ -46,17 +48,19 @@ _DID = {
     "fault": "stood still with a fault",
     "stopped": "stood by order",
 }
-"""What a site did in each mode, in the past tense. Other modes have the words of records."""
+"""Clause on the behaviour of a site in each mode. Other modes are described by their names in
+the records.
+"""
 
 
 class _RunMoment(NamedTuple):
-    """Something that happened in a run at a certain time, such as a changed delay or an alarm.
+    """An event in a run at a certain time, such as a changed delay or an alarm.
 
     Attributes:
-        t_s: Time at which it happened or began, in s.
-        sentence: Sentence about it.
-        site: Name of the site that did it. Empty if it concerns all sites.
-        number: Number of the change, which charts show. None for other moments.
+        t_s: Time at which the event happened or began, in s.
+        sentence: Sentence about the event.
+        site: Name of the site concerned. Empty if the event concerns all sites.
+        number: Number of the change, which charts show. `None` for other events.
         is_bad: True for alarms and divergence.
     """
 
@@ -68,7 +72,7 @@ class _RunMoment(NamedTuple):
 
 
 def render_timeline(log: Log, facts: JsonObject) -> Markup:
-    """Renders the section with what happened during the run, in the order of time.
+    """Renders the section with the events of the run, in the order of time.
 
     Examples are a changed delay, a push by an operator, and an arm that stopped because the
     network was interrupted.
@@ -102,9 +106,9 @@ def _render_moments(log: Log, moments: list[_RunMoment]) -> Markup:
 
 
 def list_moments(log: Log, facts: JsonObject) -> list[_RunMoment]:
-    """Lists what happened in a run, in the order of time: changes, pushes, modes and errors.
+    """Lists the events of a run in the order of time: changes, pushes, modes and errors.
 
-    The page of the run lists them, so that a reader can relate the curves to what happened.
+    The page of the run lists the events, so that a reader can relate the curves to them.
 
     Args:
         log: Log of the run.
@@ -123,7 +127,7 @@ def list_moments(log: Log, facts: JsonObject) -> list[_RunMoment]:
 
 
 def describe_dominance(scenario: Scenario) -> str:
-    """Returns which peers each site follows at the start, as in "m1 follows s 0.7, m2 0.3".
+    """Returns the peers that each site follows at the start, as in "m1 follows s 0.7, m2 0.3".
 
     A peer is another site whose states the site receives. The number is the dominance factor,
     the weight with which the site follows the peer. Peers with the factor 0 are left out.
@@ -134,12 +138,12 @@ def describe_dominance(scenario: Scenario) -> str:
     clauses = []
     for site, factors in scenario.dominance.items():
         followed_peers = [f"{peer} {factor:g}" for peer, factor in factors.items() if factor]
-        clauses.append(f"{site} follows {', '.join(followed_peers) or 'nobody'}")
+        clauses.append(f"{site} follows {', '.join(followed_peers) or 'no other site'}")
     return "; ".join(clauses)
 
 
 def _list_hands(log: Log) -> Iterator[_RunMoment]:
-    """Yields when people and programs took hold of arms or let go, and which ones failed."""
+    """Yields the moments at which people and programs took or released arms, or failed."""
     failures = log.failed_hands
     for event in log.events:
         if event.kind == "hand":
@@ -154,7 +158,7 @@ def _list_hands(log: Log) -> Iterator[_RunMoment]:
 def _list_changes(log: Log, facts: JsonObject) -> Iterator[_RunMoment]:
     """Yields the changes of settings during a run, such as another delay, for the timeline.
 
-    Charts mark the changes with the numbers that they have here.
+    Charts mark the changes with the same numbers.
 
     Args:
         log: Log of the run.
@@ -177,7 +181,7 @@ def _list_changes(log: Log, facts: JsonObject) -> Iterator[_RunMoment]:
 
 
 def _list_pushes(log: Log) -> Iterator[_RunMoment]:
-    """Yields when operators, walls or bodies pushed each arm, and with which torque.
+    """Yields the moments at which operators, walls or bodies pushed an arm, with the torque.
 
     Short pauses do not divide a push. If an arm was pushed very often, a single moment states
     the number of pushes.
@@ -210,8 +214,8 @@ def _list_pushes(log: Log) -> Iterator[_RunMoment]:
 def _find_spans(t_s: Array, acts: Bools) -> list[tuple[float, float]]:
     """Returns the intervals of time in which a condition holds, as start and end in s.
 
-    For example, an operator pushes. Interruptions that are shorter than `_PAUSE_S` do not
-    divide an interval.
+    An example of a condition is that an operator pushes. Interruptions that are shorter than
+    `_PAUSE_S` do not divide an interval.
 
     Args:
         t_s: Times of K records, shape (K,).
@@ -221,7 +225,7 @@ def _find_spans(t_s: Array, acts: Bools) -> list[tuple[float, float]]:
     if not len(times_s):
         return []
 
-    # An interval ends at the last time before a pause, and the next one begins behind it.
+    # An interval ends at the last time before a pause, and the next one begins after the pause.
     last_before_pause = np.flatnonzero(np.diff(times_s) > _PAUSE_S)
     starts_s = times_s[np.append(0, last_before_pause + 1)]
     ends_s = times_s[np.append(last_before_pause, len(times_s) - 1)]
@@ -229,7 +233,7 @@ def _find_spans(t_s: Array, acts: Bools) -> list[tuple[float, float]]:
 
 
 def _name_pusher(log: Log, site: str) -> str:
-    """Returns who may push the arm of a site: an operator, its environment, or both."""
+    """Returns a phrase for the possible sources of pushes, such as "An operator"."""
     spec = log.scenario.sites[site]
     if spec.hands and spec.environment:
         return "An operator or a wall"
@@ -239,10 +243,10 @@ def _name_pusher(log: Log, site: str) -> str:
 
 
 def _list_modes(log: Log) -> Iterator[_RunMoment]:
-    """Yields when an arm did not follow the others, but held its position, braked or returned.
+    """Yields the moments at which an arm stopped following, to hold, brake or return.
 
-    The sentence has the reason if there was an alarm. Arms that did the same at the same time
-    share a sentence.
+    The sentence contains the reason if there was an alarm. Arms that did the same at the same
+    time share a sentence.
     """
     alarms_by_start = {(alarm.site, alarm.from_s): alarm for alarm in list_alarms(log)}
     end_s = recorded_end_s(log)

@@ -2,9 +2,10 @@
 
 A signal is an array with one row for each period of the control loop. A run of a minute at 1
 kHz has 60 000 rows, too many for a plot. Therefore the rows are reduced: each bucket of records
-keeps the minimum and the maximum of each column, so that a spike of a single period stays
+keeps the minimum and the maximum of each column, so that a spike of a single period remains
 visible. A gap in the records that is wider than a bucket becomes a row of NaN, so that no line
-is drawn across it. `analysis.site_signals` has the signals that metrics and summaries use too.
+is drawn across it. `analysis.site_signals` contains the signals that metrics and summaries also
+use.
 
 Invariant:
     - Empty logs give empty arrays.
@@ -95,7 +96,7 @@ def sample_ages_ms(log: Log, site: str) -> Array:
 def sites_with_operator(log: Log) -> list[str]:
     """Returns the arms on which a person or program may act.
 
-    They have an operator in the scenario, or recorded external torques.
+    These arms have an operator in the scenario, or recorded external torques.
 
     Args:
         log: The log of the run.
@@ -127,7 +128,7 @@ class _DecimatedTrace(NamedTuple):
 
 
 def extreme_rows(values: Array, buckets: int) -> Ints:
-    """Chooses the rows of some signals that a plot needs, so that no peak gets lost.
+    """Chooses the rows of some signals that a plot needs, so that no peak is lost.
 
     The rows are divided into buckets, intervals with equal numbers of rows. In each bucket the
     rows with the largest and the smallest value of each column are kept. The first and the last
@@ -174,10 +175,10 @@ def decimate(
     values: Array,
     buckets: int,
 ) -> _DecimatedTrace:
-    """Reduces signals to the points that a plot needs, so that no peak gets lost.
+    """Reduces signals to the points that a plot needs, so that no peak is lost.
 
-    The time is divided into buckets, of which each keeps at most 2 C + 3 points for C columns,
-    among them the extremes of each column. One bucket per pixel of a plot is enough.
+    The time is divided into buckets. Each bucket keeps at most 2 C + 3 points for C columns,
+    including the extremes of each column. One bucket per pixel of a plot is enough.
 
     Args:
         tick: Ascending ticks, shape (K,).
@@ -188,7 +189,7 @@ def decimate(
     if not len(tick):
         return _DecimatedTrace(tick, t_s, values)
 
-    # narrower gaps are narrower than a pixel, and there may be thousands of them
+    # shorter gaps are narrower than a pixel, and there may be thousands of them
     total_ticks = tick[-1] - tick[0]
     bucket_ticks = max(1.0, total_ticks / buckets)
     before_gap = np.flatnonzero(np.diff(tick) > bucket_ticks)

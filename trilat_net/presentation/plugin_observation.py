@@ -1,8 +1,8 @@
-"""Computes from a log the observation that the LeRobot plugin makes in a live session.
+"""Computes from a log the observation that the LeRobot plugin provides in a live session.
 
-The plugin `lerobot_robot_trilat` holds the arm of one user. It observes the slave, that arm,
-and the operator who moves the arm. A program that was trained with the observations of this
-module can therefore act through the plugin.
+The plugin `lerobot_robot_trilat` moves the arm of one user. It observes the slave, the arm of
+the user, and the operator model that moves this arm. A program that was trained with the
+observations of this module can therefore act through the plugin.
 
 Invariant:
     - The names and their order are those of `observation_features` of the plugin. A test
@@ -21,11 +21,11 @@ from ..log import Ints, Log
 from ..scenario import TASK_AXES, LiveHand
 
 _HAND_ACTIONS = {"tip": "tip", "joint": "joints"}
-"""Kind of exported actions that an operator of each mode accepts as commands."""
+"""Kind of exported actions that an operator accepts as commands, by mode of the operator."""
 
 
 def _find_plugin_hand(log: Log, site: str) -> LiveHand:
-    """Finds the operator of an arm that stands for the program of a plugin.
+    """Finds the operator of an arm through which the program of a plugin moves the arm.
 
     Args:
         log: Log of the run.
@@ -45,7 +45,7 @@ def _find_plugin_hand(log: Log, site: str) -> LiveHand:
 
 
 def find_plugin_actions(log: Log, site: str) -> str:
-    """Returns the kind of actions that a log must be exported with for the LeRobot plugin.
+    """Returns the kind of actions with which a log must be exported for the LeRobot plugin.
 
     The plugin commands the operator model of an arm by positions of its end effector ("tip") or
     by joint angles. A dataset for training must contain the same kind.
@@ -69,7 +69,7 @@ def find_plugin_actions(log: Log, site: str) -> str:
 def observe_as_plugin(
     log: Log, slave: str, site: str, rows: Mapping[str, Ints]
 ) -> tuple[Array, list[str]]:
-    """Returns the observation that the LeRobot plugin would have made in every frame of a log.
+    """Returns the observation of the LeRobot plugin in every frame of a log.
 
     A policy can then be trained from logs, and later run by the plugin.
 
@@ -80,7 +80,7 @@ def observe_as_plugin(
         rows: For each site, the index of each frame's record, shape (F,).
 
     Returns:
-        The observation, shape (F, n), and the names of its n numbers.
+        The observation, shape (F, n), and the names of its n components.
 
     Raises:
         UsageError: The scenario has no operator for the plugin at this site.

@@ -1,11 +1,13 @@
 """Writes the sentences that say whether each condition of the stability theorem holds.
 
 A condition, such as constant delays, is called a premise. The package `analysis` computes the
-numbers that decide it, and the functions in `DESCRIBERS` state them for people.
+quantities that decide whether a premise holds, and the functions in `DESCRIBERS` describe them
+in sentences.
 
 Invariant:
-    - A sentence lists at most `MAX_LISTED_NAMES` arms, links or joints, and counts the others.
-    - Each class of `premise_quantities` has one function here, in `DESCRIBERS`.
+    - A sentence lists at most `MAX_LISTED_NAMES` arms, links or joints, and states the number
+      of the others.
+    - Each class of `premise_quantities` has exactly one function in `DESCRIBERS`.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -44,7 +46,7 @@ def describe_quantities(quantities: premise_quantities.PremiseQuantities) -> str
     An example of a condition is that all network delays are constant.
 
     Args:
-        quantities: What was found about the premise.
+        quantities: The data on the premise.
     """
     return DESCRIBERS[type(quantities)](quantities)
 
@@ -69,7 +71,7 @@ def describe_missing_functionals(
 ) -> str:
     """Returns a text on the arms for which the stability proof has no energy function.
 
-    The text says why. A run with such an arm is judged without the energy function.
+    The text states the reasons. A run with such an arm is judged without the energy function.
 
     Args:
         missing: Sites of these arms, grouped by the reason.
@@ -86,7 +88,7 @@ def describe_missing_functionals(
 
 
 def describe_closed_groups(groups: Sequence[Sequence[str]]) -> str:
-    """Returns a sentence that the total energy of all arms is not defined, and why.
+    """Returns a sentence on why the total energy of all arms is not uniquely defined.
 
     The total energy weights each site, the process that runs one arm. If no group of sites
     follows another group, the weights of the groups relative to each other are arbitrary.
@@ -97,7 +99,8 @@ def describe_closed_groups(groups: Sequence[Sequence[str]]) -> str:
     """
     group_texts = " and ".join("{" + ", ".join(group) + "}" for group in groups)
     return (
-        f"{group_texts} follow nobody outside: beta is not unique, certify each group by itself"
+        f"{group_texts} follow no site outside their group: beta is not unique, certify each "
+        "group by itself"
     )
 
 
@@ -122,7 +125,7 @@ def _describe_gains(quantities: premise_quantities.GainQuantities) -> str:
             numbers = ", ".join(f"{gain:g}" for gain in gains)
             gain_texts.append(f"{site} ({numbers})")
         gains_text = ", ".join(gain_texts)
-        return f"Kd differs in shape between sites, so that no beta exists: {gains_text}"
+        return f"Kd differs in shape between sites, so no beta exists: {gains_text}"
 
     if not quantities.is_positive:
         return "some Kd is zero, but the theorem requires positive Kd"
@@ -203,7 +206,7 @@ def _describe_following(quantities: premise_quantities.FollowingQuantities) -> s
     for site, count in quantities.limited_ticks.items():
         ticks_text = count_nouns(count, "tick")
         interruption_texts.append(
-            f"{site} with a reference as fast as it may be at {ticks_text}"
+            f"{site} with a reference at its speed limit for {ticks_text}"
         )
 
     if not interruption_texts:
@@ -268,7 +271,7 @@ def _describe_operators(quantities: premise_quantities.OperatorQuantities) -> st
 
     supply = quantities.supply
     if supply is None:
-        return "nobody pushes"
+        return "no operator or wall pushes"
 
     sources = " and ".join(supply.sources)
     if supply.is_passive:
@@ -277,7 +280,7 @@ def _describe_operators(quantities: premise_quantities.OperatorQuantities) -> st
     r = "qd - v" if supply.in_task_space else "qd + Lambda e"
     text = f"the {sources} supplied up to {supply.energy_j:.3g} J with respect to r = {r}"
     if supply.free_s >= supply.least_free_s:
-        return f"{text}; nobody pushes after {supply.released_s:.3f} s"
+        return f"{text}; no pushes after {supply.released_s:.3f} s"
     if supply.free_s > 1e-9:
         return (
             f"{text}, and push until {supply.released_s:.3f} s: {supply.free_s:.3g} s of free "
@@ -298,8 +301,8 @@ def _describe_presence(quantities: premise_quantities.PresenceQuantities) -> str
     spans = [f"{site} {from_s:.4g} to {to_s:.4g} s" for site, from_s, to_s in quantities.absent]
     stretches = "; ".join(map(_describe_stretch, quantities.stretches))
     return (
-        f"away: {_join_limited(spans)}, about which the theorem says nothing; "
-        f"by themselves: {stretches}"
+        f"absent: {_join_limited(spans)}, times to which the theorem does not apply; "
+        f"the times between: {stretches}"
     )
 
 
@@ -316,21 +319,24 @@ def _describe_stretch(stretch: premise_quantities.PresentStretch) -> str:
 
 def _describe_books(quantities: premise_quantities.BooksQuantities) -> str:
     sizes = f"{quantities.residual_j:.1e} J of {quantities.scale_j:.4g} J"
-    return f"the books of {quantities.site}'s law close to {sizes}, and the others closer"
+    text = f"the energies of {quantities.site}'s law add up to within {sizes}"
+    return f"{text}, those of the other laws better"
 
 
 def _describe_booked_torques(quantities: premise_quantities.BookedTorqueQuantities) -> str:
     if quantities.unbooked:
         sites = ", ".join(quantities.unbooked)
-        return f"cut off at {sites}: the law books another torque than the arm got"
+        return f"cut off at {sites}: the law uses a different torque than the arm received"
     if quantities.cut:
-        return f"cut off at {', '.join(quantities.cut)}, and booked so"
+        return (
+            f"cut off at {', '.join(quantities.cut)}, and the law uses the torque after the cut"
+        )
     return "never cut off"
 
 
 def _describe_sampling(quantities: premise_quantities.SamplingQuantities) -> str:
-    energy = f"up to {quantities.leak_j:.3g} J more than its law books"
-    return f"the arm of {quantities.site} got {energy}, between ticks"
+    energy = f"up to {quantities.leak_j:.3g} J more than its law accounts for"
+    return f"the arm of {quantities.site} received {energy}, between ticks"
 
 
 DESCRIBERS: dict[type, Callable[[Any], str]] = {
@@ -356,12 +362,12 @@ DESCRIBERS: dict[type, Callable[[Any], str]] = {
 
 
 def _join_limited(items: Sequence[str]) -> str:
-    """Joins texts with commas. Counts the texts beyond `MAX_LISTED_NAMES` instead."""
+    """Joins texts with commas. Only the number of texts beyond `MAX_LISTED_NAMES` is stated."""
     text = ", ".join(items[:MAX_LISTED_NAMES])
     hidden = len(items) - MAX_LISTED_NAMES
     return f"{text} and {hidden} more" if hidden > 0 else text
 
 
 def _format_by_site(values: Mapping[str, float]) -> str:
-    """Returns a string such as "m1 0.5, s 2" of a value per site."""
+    """Formats a value per site, for example as "m1 0.5, s 2"."""
     return ", ".join(f"{site} {value:.4g}" for site, value in values.items())

@@ -1,4 +1,4 @@
-"""Writes the remarks on a run that a reader of its stability judgement should know.
+"""Writes the remarks on a run that matter to readers of its stability judgement.
 
 `analysis.run_remarks` finds the circumstances. For example, this module writes "m1 and m2 were
 at their torque limit for 0.56 s and 0.43 s".

@@ -8,10 +8,10 @@ per quantity. The extra `view` of the package installs Rerun.
 Invariant:
     - A finished log that has standard channels is opened as it is. Any other log is first
       exported as a ROS 2 bag into a temporary folder.
-    - A plot has a single unit, and every curve has a name.
+    - All curves of a plot have the same unit, and every curve has a name.
     - Quantities that a log lacks take no space.
-    - All views, names and colors are set by this module and none by the viewer, so that any two
-      logs look alike.
+    - This module sets all views, names and colors instead of the viewer, so that all logs look
+      alike.
 """
 
 import os
@@ -58,7 +58,7 @@ class ViewerOptions(NamedTuple):
     Attributes:
         full: True to show every record instead of the decimated standard channels.
         web: True to serve the viewer to a browser.
-        save: Path of an .rrd file to write instead of opening the viewer. None to open the
+        save: Path of an .rrd file to write instead of opening the viewer. `None` to open the
             viewer.
     """
 
@@ -84,7 +84,7 @@ def open_rerun(
     Args:
         paths: File of the log, or its parts.
         read_log: Function that reads the log. It is called only if the log must be exported.
-        options: How the log is shown.
+        options: Options for showing the log.
         print_line: Function that prints a line for the user.
         run_command: Function that runs Rerun.
 
@@ -140,7 +140,7 @@ def _require_display(options: ViewerOptions) -> None:
 def make_application_id(path: Path) -> str:
     """Returns the name under which the viewer Rerun stores the layout of a log.
 
-    It is the name of the log, with only the letters that Rerun allows.
+    The name is that of the log, with only the characters that Rerun allows.
 
     Args:
         path: Path of the log.
@@ -158,7 +158,7 @@ def _list_commands(
     address of the page is printed.
 
     Args:
-        options: How the log is shown.
+        options: Options for showing the log.
         log: File of the log.
         layout: File of the layout.
         print_line: Function that prints a line for the user.
@@ -198,18 +198,18 @@ def _find_free_port() -> int:
 
 
 _SESSION_CHANNELS = (EVENTS, LINES, FRAMES, DIAGNOSTICS)
-"""Names, the last parts of topics, of the channels of a session instead of a site."""
+"""Names (last parts of the topics) of the channels of a session, which belong to no site."""
 
 
 class _PlotCurves(NamedTuple):
-    """Curves of a plot in the viewer Rerun, which show the numbers of one channel.
+    """Curves of a plot in the viewer Rerun, which show the values of one channel.
 
     A channel is a series of messages with a topic.
 
     Attributes:
-        entity: Path under which Rerun stores the numbers of the channel.
-        names: Names of all numbers in a message, in order.
-        visible: For each number, True if the plot shows its curve.
+        entity: Path under which Rerun stores the values of the channel.
+        names: Names of all values in a message, in order.
+        visible: For each value, True if the plot shows its curve.
     """
 
     entity: str
@@ -254,11 +254,11 @@ class _PlotRow(NamedTuple):
 
     Attributes:
         quantity: Name of the quantity.
-        unit: Unit of the quantity. Empty for a plain number.
-        sources: Channels of the quantity. Each is the name of a channel, which is the last part
-            of its topic, and a field. The field of joint states is one of their lists. The
-            field of estimates is a kind of inertial parameter, such as "m", or empty for planar
-            arms. The field of other channels is empty.
+        unit: Unit of the quantity. Empty for a dimensionless number.
+        sources: Channels of the quantity. A source consists of the name of a channel, which is
+            the last part of its topic, and a field. For joint states, the field is the name of
+            one of their lists. For estimates, it is a kind of inertial parameter, such as "m",
+            or empty for planar arms. For other channels it is empty.
     """
 
     quantity: str
@@ -350,7 +350,7 @@ def _list_sent_rows(channels: Ros2Channels) -> tuple[_PlotRow, ...]:
     """Returns a row of plots for each quantity that control laws send to other arms.
 
     The rows are in the order in which the laws declare the quantities. The metadata of a
-    channel has the name and the unit of its quantity.
+    channel contains the name and the unit of its quantity.
     """
     rows = {}
     for topic, channel in channels.items():
@@ -391,7 +391,7 @@ def _select_curves(channels: Ros2Channels, topic: str, field: str) -> _PlotCurve
     """Returns the curves of a channel that belong to a quantity.
 
     A channel is a series of messages with a list of numbers, such as the angles of all joints.
-    A plot may need only some of them.
+    A plot may need only some of these numbers.
 
     Args:
         channels: Standard channels by topic.
@@ -399,7 +399,7 @@ def _select_curves(channels: Ros2Channels, topic: str, field: str) -> _PlotCurve
         field: Field of the channel, see `_PlotRow`.
 
     Returns:
-        The curves. None if there is no such channel, or it has no such curves.
+        The curves. `None` if there is no such channel, or if it has no such curves.
     """
     channel = channels.get(topic)
     if channel is None or channel.kind == STRING:
@@ -431,7 +431,7 @@ def _select_estimates(topic: str, kind: str, names: Sequence[str]) -> _PlotCurve
         names: Names of all estimates, such as "upper.m" for the mass of the link "upper".
 
     Returns:
-        The curves. None if the channel has no estimate of this kind.
+        The curves. `None` if the channel has no estimate of this kind.
     """
     visible = []
     for name in names:
@@ -449,17 +449,17 @@ def _select_joint_states(topic: str, field: str, names: Sequence[str]) -> _PlotC
 
     The messages of a channel contain the states of the joints, those of the reference that the
     joints follow, or both. The reference has names with the suffix "_ref", or the topic
-    ".../reference". In the viewer, the curves of a reference always have the suffix, by which
-    they get a paler colour. If a channel contains both, the reference is shown only among the
+    ".../reference". In the viewer, the curves of a reference always have the suffix, which
+    gives them a paler colour. If a channel contains both, the reference is shown only among the
     positions.
 
     Args:
         topic: Topic of the channel.
         field: Name of the list: "position", "velocity" or "effort".
-        names: Names of all joints. Without any name, the channel counts as a reference.
+        names: Names of all joints. If there are no names, the channel counts as a reference.
 
     Returns:
-        The curves. None for the torques of a reference, which do not exist.
+        The curves. `None` for the torques of a reference, which do not exist.
     """
     suffix = "_ref"
     has_only_reference_names = all(name.endswith(suffix) for name in names)
@@ -492,10 +492,10 @@ _TIMELINE = "message_publish_time"
 def _save_blueprint(layout: PlotLayout, application: str, path: Path) -> None:
     """Writes the layout of a log for the viewer Rerun to a file, called a blueprint.
 
-    It tells the viewer which plots and views it arranges on the screen.
+    The file tells the viewer which plots and views to arrange on the screen.
 
     Args:
-        layout: The plots on each page, and what else is shown.
+        layout: The plots on each page, and the other views.
         application: Rerun's name of the recordings to which the layout applies.
         path: The file to write.
 

@@ -5,7 +5,7 @@ as a green "ok" (`MarkedText`), or a table (`TextTable`).
 
 A class of results may have a method `blocks` that returns its blocks. For other classes, a
 function in this folder composes the blocks, and `_COMPOSERS` lists these functions by the name
-of the class. These classes thus do not depend on this folder.
+of the class. Those classes therefore do not depend on this folder.
 
 Invariant:
     - Terminal, plain text and HTML have the same blocks in the same order.
@@ -71,8 +71,8 @@ class TextTable(NamedTuple):
     def to_the_right(self) -> list[bool]:
         """For each table column, True if its cells are aligned to the right, as numbers are.
 
-        If `align` has fewer letters than there are columns, its last letter holds for the
-        others.
+        If `align` has fewer letters than there are columns, its last letter applies to the
+        remaining columns.
         """
         letters = self.align.ljust(len(self.headers), self.align[-1])
         return [letter == "r" for letter in letters]
@@ -94,8 +94,8 @@ class TextTable(NamedTuple):
                 justify="right" if is_right else "left",
                 overflow="fold",
                 min_width=hash_width,
-                # Rich ignores the least width of a column that may wrap. Therefore a column of
-                # hashes may not wrap.
+                # Rich ignores the minimum width of a column that may wrap. Therefore a column
+                # of hashes must not wrap.
                 no_wrap=hash_width is not None and self._fits(index, hash_width),
             )
 
@@ -114,14 +114,14 @@ class TextTable(NamedTuple):
         return [row[index] for row in self.rows if index < len(row)]
 
     def _find_hash_width(self, index: int) -> int | None:
-        """Returns the length of the longest hash in a column. None if it has no hash."""
+        """Returns the length of the longest hash in a column. `None` if it contains no hash."""
         widths = []
         for cell in self._list_cells(index):
             widths += [len(digits) for digits in HASH.findall(cell)]
         return max(widths, default=None)
 
     def _fits(self, index: int, width: int) -> bool:
-        """Returns True if no cell of a column is longer than a width."""
+        """Returns True if no cell of a column exceeds the given width."""
         return all(len(cell) <= width for cell in self._list_cells(index))
 
     def markdown(self) -> str:
@@ -156,8 +156,8 @@ class TextTable(NamedTuple):
     def lines(self) -> list[str]:
         """Renders the table as plain lines, with columns aligned by spaces.
 
-        The first line has the headers, unless all headers are empty. Each column is as wide as
-        its longest cell.
+        The first line contains the headers, unless all headers are empty. Each column is as
+        wide as its longest cell.
         """
         table = list(self.rows)
         if any(self.titles):
@@ -179,14 +179,14 @@ class TextTable(NamedTuple):
 
 
 def format_number(value: float | None, digits: int = 3) -> str:
-    """Formats a number for the cell of a table: 0.123 for 0.12345, and a dash for None.
+    """Formats a number for the cell of a table: 0.123 for 0.12345, and a dash for `None`.
 
     Args:
-        value: The number, or None.
+        value: The number, or `None`.
         digits: Number of significant digits.
 
     Returns:
-        The text. A dash for None.
+        The text. A dash for `None`.
     """
     return "-" if value is None else f"{value:.{digits}g}"
 
@@ -251,12 +251,12 @@ _BRIEF_COMPOSERS = {
 
 
 def compose(result: Result, *, brief: bool = False) -> list[MarkedText | TextTable]:
-    """Collects the lines and tables of which the text of a result consists.
+    """Collects the lines and tables that make up the text of a result.
 
-    The terminal, plain text and HTML all show them, so that the contents are equal everywhere.
+    The terminal, plain text and HTML all show these blocks. Their contents are therefore equal.
 
     Args:
-        result: What a command has computed, such as the measured numbers of a run.
+        result: Result of a command, such as the metrics of a run.
         brief: True for the ten most important lines of a certificate, of metrics or of a
             comparison of logs.
 
@@ -281,8 +281,8 @@ def _import_composer(
 ) -> Callable[[Result], Iterable[Block]]:
     """Imports the function that composes the text of a result, only when it is needed.
 
-    Importing all such modules at the start would make every command slow. A subclass of a
-    listed class has the function of the listed class.
+    If all such modules were imported at the start, every command would be slow. For a subclass
+    of a listed class, the function of the listed class is used.
 
     Args:
         result: The result.

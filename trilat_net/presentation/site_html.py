@@ -4,7 +4,7 @@ If `log["m1"]` is the last line of a notebook's cell, the notebook shows this HT
 and a table that summarises each quantity over the run.
 
 Invariant:
-    - The table has only quantities that the records of this arm contain.
+    - The table contains only quantities that the records of this arm contain.
     - Rendering does not change the records.
 """
 
@@ -24,8 +24,9 @@ FIELDS = ("q", "qd", "q_des", "e", "tau", "tau_x", "theta_hat", "x", "xd", "wren
 def render_site_html(site: SiteLog) -> Markup:
     """Renders the records of one site as HTML, for display in a notebook.
 
-    A heading is followed by a table with a row per number of a record. A row has the first,
-    last, least and greatest value over the run. Without records there is only the heading.
+    The heading is followed by a table with a row per element of a record's vectors. A row
+    contains the first, last, smallest and largest value over the run. Without records there is
+    only the heading.
 
     Args:
         site: Records of the site.
@@ -47,13 +48,13 @@ def _list_rows(site: SiteLog) -> Iterator[list[str]]:
     for field in FIELDS:
         vectors = getattr(site, field)
         for index, values in enumerate(vectors.T):
-            # Only the first row of a vector has its meaning.
+            # Only the first row of a vector states its meaning.
             meaning = _describe_field(field) if index == 0 else ""
             yield [f"{field}[{index}]", *_summarize(values), meaning]
 
 
 def _summarize(values: Array) -> list[str]:
-    """Returns the first, last, least and greatest of the values, shape (K,), as texts."""
+    """Returns the first, last, smallest and largest of the values, shape (K,), as texts."""
     numbers = (values[0], values[-1], values.min(), values.max())
     return [format_number(float(number)) for number in numbers]
 

@@ -1,4 +1,4 @@
-"""Gives all figures a common style, and draws the parts that they share.
+"""Provides the common style of all figures, and draws the parts that they share.
 
 A figure looks the same wherever it appears: each arm has its own colour, and arms beyond the
 number of colours are distinguished by dashes. This module provides the lines, axes, panels and
@@ -9,7 +9,7 @@ per arm, a time axis and a legend. Markers show when an arm did not follow the o
 braked or returned), and when a change was applied, such as another network delay.
 
 Invariant:
-    - Matplotlib's global state stays unchanged, so that users' own figures keep their style.
+    - Matplotlib's global state remains unchanged, so that users' own figures keep their style.
     - Equal figures give equal bytes: files contain no date, and fonts are embedded as TrueType.
     - Figures of a run without events have no markers.
 """
@@ -73,11 +73,11 @@ LIMIT_LINE: LineOptions = {
 REPORT_DPI = REPORT_SIZE.dpi
 _NOTEBOOK_DPI = 200
 _LEAST_RANGE = 1e-9
-"""Values whose range is smaller than this differ by rounding errors only."""
+"""If the range of values is smaller than this, they differ by rounding errors only."""
 BUCKETS_PER_PANEL = 700
 """Number of intervals of time to which the signals of a panel are decimated.
 
-Half a page is 700 pixels wide, so that more points would not be visible.
+Half a page is 700 pixels wide, and more points would not be visible.
 """
 
 _STYLE_SHEET = resources.files("trilat_net.presentation") / "assets" / "figures.mplstyle"
@@ -135,7 +135,7 @@ class _NotebookFigure(Figure):
 
 
 def add_panels(figure: Figure, rows: int, columns: int, **options: Any) -> AxesGrid:
-    """Adds a grid of panels, parts with axes of their own, to a figure.
+    """Adds a grid of panels (parts with their own axes) to a figure.
 
     Args:
         figure: The Matplotlib figure.
@@ -164,7 +164,7 @@ def site_colour(log: Log, site: str) -> str:
 _WIDEST_PT = 2.0
 """Width of the line of the first site in a panel of all sites."""
 _THINNER_PT = 1.2
-"""Difference of the widths of the first and the last site's lines in such a panel."""
+"""Difference between the line widths of the first and the last site in such a panel."""
 
 
 def site_line(log: Log, site: str, width: float | None = None) -> LineOptions:
@@ -175,9 +175,9 @@ def site_line(log: Log, site: str, width: float | None = None) -> LineOptions:
     Args:
         log: Log with the site.
         site: Name of the site.
-        width: Width of the line, in pt. None if the lines of all sites are in one panel. Each
-            further site then has a thinner line, so that lines on top of one another stay
-            visible.
+        width: Width of the line, in pt. `None` if the lines of all sites are in one panel. In
+            that case each further site has a thinner line, so that lines on top of one another
+            remain visible.
     """
     site_index = log.sites.index(site)
     last_index = len(log.sites) - 1
@@ -223,7 +223,7 @@ def plot_decimated(axes: Axes, tick: Ints, t_s: Array, values: Array, **options:
 def positive(values: Array) -> Array:
     """Replaces zero and negative values by NaN, as a logarithmic axis cannot show them.
 
-    A line has a gap at NaN, while zero would draw it to the edge of the panel.
+    A line has a gap at NaN, while at zero it would extend to the edge of the panel.
 
     Args:
         values: The values.
@@ -247,8 +247,8 @@ def plot_spread(axes: Axes, t_s: Array, values: Array, **options: Any) -> None:
         axes: Panel of the figure, as Matplotlib axes.
         t_s: Times of the values, in s, shape (K,).
         values: The values, shape (K,). NaN values are ignored.
-        **options: Options of the line of the median. They must include a "color", which the
-            band has too.
+        **options: Options of the line of the median. They must include a "color", which also
+            applies to the band.
     """
     buckets = np.array_split(np.arange(len(values)), SPREAD_BUCKETS)
     points = []
@@ -291,10 +291,10 @@ def set_plain_log_axis(axis: Axis, steps: Sequence[float] = (1.0, 2.0, 5.0)) -> 
 
 
 def name_joints(log: Log) -> list[str]:
-    """Returns the titles of the panels that show a joint each, such as "joint 1".
+    """Returns the titles of panels that show one joint each, such as "joint 1".
 
     Names of joints are added if the arms are chains whose joints all have the same names. The
-    arm with the most joints decides the number of titles.
+    number of titles is that of the arm with the most joints.
 
     Args:
         log: Log with the arms.
@@ -309,7 +309,8 @@ def name_joints(log: Log) -> list[str]:
     units = longest_arm.joint_units("rad")
     titles = []
     for number, name, unit in zip(numbers, longest_arm.joint_names, units, strict=True):
-        # The axes of the figure have the units of revolute joints. Prismatic joints differ.
+        # The axes of the figure have the units of revolute joints. Prismatic joints have other
+        # units.
         quantity = " (m, N)" if unit == "m" else ""
         titles.append(f"{number}: {name}{quantity}")
     return titles
@@ -378,7 +379,7 @@ class _JointPanels(NamedTuple):
         joints: A panel per joint.
         columns: Number of panels in a row.
         lowest: Lowest panel of each column, which has the time axis.
-        below: Panel below the others, over the whole width. None if there is no such panel.
+        below: Panel below the others, over the whole width. `None` if there is no such panel.
     """
 
     joints: list[Axes]
@@ -413,7 +414,8 @@ def arrange_joints(joints: int, narrow: bool) -> list[list[str]]:
         return rows, rows * columns - joints
 
     choices = (2,) if narrow or joints == 2 else (3, 4)
-    # The fewest rows win. Of arrangements with as many rows, the fewest empty cells win.
+    # The fewest rows win. Among arrangements with equally many rows, the fewest empty cells
+    # win.
     columns = min(choices, key=count_cells)
     _, empty_cells = count_cells(columns)
 
@@ -460,7 +462,7 @@ def add_joint_panels(
 
 
 def typeset(text: str) -> str:
-    """Replaces "+-" and "->", as the terminal shows them, by the signs ± and →.
+    """Replaces "+-" and "->", which the terminal shows, by the signs ± and →.
 
     For example "m1->s: 3 +- 1" becomes "m1 → s: 3 ± 1".
 
@@ -569,7 +571,7 @@ def empty_figure(text: str, form: FigureSize = REPORT_SIZE) -> Figure:
 
 
 def annotate_empty_panel(axes: Axes, text: str) -> None:
-    """Writes into an empty panel of a figure why there is nothing to show.
+    """Writes the reason why there is nothing to show into an empty panel of a figure.
 
     Args:
         axes: Panel of the figure, as Matplotlib axes.
@@ -701,7 +703,7 @@ def time_figure(
         log: Log of the run.
         form: Width of the figure and sizes of its texts.
         height_in: Height of the figure, in inches.
-        interval_s: First and last time that the figure shows, in s. None for the whole run.
+        interval_s: First and last time that the figure shows, in s. `None` for the whole run.
     """
     with styled_figure(form, height_in) as figure:
         yield TimeFigure(log, form, figure, interval_s)
@@ -717,7 +719,7 @@ class TimeFigure:
         log: Log of the run.
         form: Width of the figure and sizes of its texts.
         figure: Empty Matplotlib figure.
-        interval_s: First and last time that the figure shows, in s. None for the whole run.
+        interval_s: First and last time that the figure shows, in s. `None` for the whole run.
 
     Attributes:
         log: Log of the run.
@@ -789,7 +791,7 @@ class TimeFigure:
     def mark(
         self, axes: Axes, sites: Sequence[str], link: str = "", *, numbered: bool = True
     ) -> None:
-        """Marks what happened during the run in a panel: interruptions and changes of settings.
+        """Marks interruptions and changes of settings during the run in a panel.
 
         The panel is shaded in the colour of a site (arm) while the site does not follow its
         peers. It has a vertical line at each change that the sites applied.
@@ -797,7 +799,8 @@ class TimeFigure:
         Args:
             axes: Panel of the figure, as Matplotlib axes.
             sites: Names of the sites whose events are marked.
-            link: Link whose changes alone are marked, such as "m1->s". Empty for all changes.
+            link: Name of a link, such as "m1->s", to mark only the changes of this link. Empty
+                to mark all changes.
             numbered: True to write the number of each change, which the text below the panels
                 explains.
         """
@@ -829,7 +832,7 @@ class TimeFigure:
     def _mark_change(self, axes: Axes, at_s: float, number: str) -> None:
         """Draws a vertical line at the time of a change.
 
-        The changes of a run, such as another link delay, are numbered and explained below the
+        The changes of a run, such as a new link delay, are numbered and explained below the
         figure.
 
         Args:
@@ -864,7 +867,7 @@ class TimeFigure:
             lowest: Lowest panel of each column, which gets a time axis.
             entries: Entries of the legend.
             links: False to explain all changes of settings below the panels. True to explain
-                only changes of network links, because the panels mark no others.
+                only changes of network links, because the panels mark no other changes.
             title: Title of the legend. Empty for no title.
         """
         for axes in lowest:
@@ -877,9 +880,9 @@ class TimeFigure:
         self._add_footnote(self._explain_changes(links=links), self._explain_shading())
 
     def _add_footnote(self, *sentences: str) -> None:
-        """Writes sentences below the panels, each on new lines. Empty ones are left out.
+        """Writes sentences below the panels, each on a new line. Empty sentences are left out.
 
-        They explain, for example, the marked changes and the shaded times.
+        For example, the sentences explain the marked changes and the shaded times.
         """
         letters_per_line = int(_LETTERS_PER_IN * self.figure.get_figwidth() / self._small_pt)
         lines: list[str] = []
@@ -897,7 +900,7 @@ class TimeFigure:
     def _explain_changes(self, *, links: bool) -> str:
         """Returns a sentence that explains the numbered marks of changes in a figure.
 
-        A change is for example another network delay from a certain time on.
+        An example of a change is a new network delay from a certain time on.
 
         Args:
             links: True to explain changes of links only.

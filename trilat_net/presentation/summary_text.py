@@ -3,8 +3,7 @@
 Each function `compose_...` turns the result of one command into lines and tables, which
 `terminal_output` prints. The results are about:
 
-- a run: its summary, measured numbers, checks of its log, recovery of its log, and repeated
-  execution,
+- a run: its summary, metrics, checks of its log, recovery of its log, and repeated execution,
 - a live session: `compose_ping`, `compose_topic_delays`,
 - this machine: `compose_doctor`, `compose_benchmark`.
 
@@ -13,8 +12,8 @@ messages of users' control laws.
 
 Invariant:
     - Links with a constant delay and no loss are not listed among the notable facts.
-    - A dash stands for a missing number. If the number makes sense for the run, the reason why
-      it is missing is written below the tables.
+    - A dash stands for a missing number. If the quantity is meaningful for the run, the reason
+      why the number is missing is written below the tables.
 """
 
 import math
@@ -45,19 +44,19 @@ from .result_text import MARKS, Block, MarkedText, TextTable
 from .untrusted_text import sanitize
 
 MOST_LINES = 12
-"""Largest number of lines of each kind. The file summary.json has all of them."""
+"""Largest number of lines of each kind. The file summary.json contains all of them."""
 MOST_LINE_CHARACTERS = 400
 """Largest length of a message of a user law or an external arm."""
 OUTSIDE_EVENT_KINDS = ("failed", "law", "arm")
 """Kinds of the events about user laws and external arms."""
 _MAX_LOCATIONS = 10
-"""Largest number of listed locations of a failed check; the JSON has all."""
+"""Largest number of listed locations of a failed check. The JSON output contains all."""
 _MAX_LOSSES = 10
-"""Largest number of listed losses of a recovery; the JSON has all."""
+"""Largest number of listed losses of a recovery. The JSON output contains all."""
 _NO_NUMBER = "–"
 """Cell of a missing number."""
 _MAX_FREQUENCIES = 16
-"""Largest number of listed frequencies of a response; the JSON has all."""
+"""Largest number of listed frequencies of a response. The JSON output contains all."""
 
 
 def compose_log(log: Log) -> Iterator[Block]:
@@ -83,8 +82,8 @@ def compose_log(log: Log) -> Iterator[Block]:
 def format_run_lines(log: Log) -> list[str]:
     """Returns lines about notable facts of a run, such as alarms and changed delays.
 
-    They concern alarms, user code, links, changes, modes and clocks. Long lists are cut, see
-    `_limit_lines`.
+    The lines concern alarms, user code, links, changes, modes and clocks. Long lists are cut,
+    see `_limit_lines`.
 
     Args:
         log: Log of the run.
@@ -127,8 +126,8 @@ def format_link_lines(log: Log) -> list[str]:
     """Returns a line for each network link whose delay varies or which loses messages.
 
     A link transmits the state of one arm to another, as a message (sample) per control period.
-    A line has the delay that the scenario states for the link, the measured one-way delay, the
-    age of the messages in use, and the losses.
+    A line contains the delay that the scenario states for the link, the measured one-way delay,
+    the age of the messages in use, and the losses.
 
     Args:
         log: Log of the run.
@@ -159,8 +158,8 @@ def format_link_lines(log: Log) -> list[str]:
 def _format_change_lines(log: Log) -> list[str]:
     """Returns a line of text for each change of a setting during the run.
 
-    A change is a command to an arm, another delay of a network link, or other weights with
-    which an arm follows the others (dominance factors).
+    A change is a command to an arm, a new delay of a network link, or new weights with which an
+    arm follows the others (dominance factors).
 
     Args:
         log: Log of the run.
@@ -200,7 +199,7 @@ def _format_mode_lines(log: Log) -> list[str]:
 def format_clock_lines(log: Log) -> list[str]:
     """Returns a line for each link whose two sites have different clocks.
 
-    The line states how far the clocks differ, because measured delays depend on this.
+    The line states the difference between the clocks, because measured delays depend on it.
 
     Args:
         log: Log of the run.
@@ -233,9 +232,9 @@ def _format_stated_models(states: Sequence[StatedModel]) -> str:
 
 
 def _format_clock(use: link_summary.ClockSummary) -> str:
-    """Returns a text on how far the clocks of two machines differ.
+    """Returns a text on the difference between the clocks of two machines.
 
-    Measured one-way delays are only as accurate as this difference is known.
+    Measured one-way delays are only as accurate as the estimate of this difference.
 
     Args:
         use: Summary of the difference over the run.
@@ -285,7 +284,7 @@ def _describe_losses(use: link_summary.LinkSummary, counts: link_summary.SampleC
 
     Args:
         use: Summary of the link.
-        counts: Numbers of its samples.
+        counts: Counts of its samples.
     """
     losses = {
         "missing on the way": counts.missing,
@@ -373,7 +372,7 @@ def compose_recovery(recovery: Recovery) -> Iterator[Block]:
     rows.append(("messages", f"{recovery.messages} in {recovery.duration_s:.3f} s"))
 
     loss_lists = [("lost", recovery.lost)]
-    # Without a number of expected records nothing can be called missing.
+    # Without a number of expected records, no record can be called missing.
     if recovery.coverage.expected:
         loss_lists.append(("missing", recovery.missing))
     for name, lines in loss_lists:
@@ -448,9 +447,9 @@ def _compare_undelayed_errors(rerun: Rerun) -> dict[str, tuple[float, float]]:
     """Returns how far arms were from the others at the same time, in a log and in its rerun.
 
     The tracking error compares an arm with delayed states of the others. The undelayed error
-    compares it with their states at the same time, and shows the effect of another delay. Both
-    runs are compared over the times of which both have a record. Sites that follow nobody have
-    no such error, and are left out.
+    compares it with their states at the same time, and shows the effect of another delay. The
+    runs are compared at the times at which both have a record. Sites that follow no other site
+    have no such error, and are left out.
 
     Returns:
         Largest undelayed error in the log and in the rerun, by site.
@@ -481,7 +480,7 @@ def _name_sample(tick: object) -> str:
 def _describe_site_effect(rerun: Rerun, site: str) -> list[str]:
     """Returns lines about the differences between the log of an arm and its repeated execution.
 
-    They state the largest deviation of the joint angles, and the first value that differs.
+    The lines state the largest deviation of the joint angles, and the first value that differs.
 
     Args:
         rerun: Result of the new execution.
@@ -524,9 +523,10 @@ def _describe_link_effect(rerun: Rerun, name: str) -> str:
 
 
 def _format_difference(before: object, after: object) -> tuple[str, str]:
-    """Formats two different values so that their texts differ.
+    """Formats two different values such that their texts differ.
 
-    Numbers have six digits. If the texts are then equal, they get all digits.
+    Numbers have six digits. If the texts are then equal, the numbers are printed with all
+    digits.
 
     Args:
         before: The value in the first log.
@@ -554,9 +554,9 @@ def compose_doctor(report: Result) -> Iterator[Block]:
 def compose_ping(report: Result) -> Iterator[Block]:
     """Yields tables of the round trip times in a session.
 
-    One table has the times to the members, the processes that take part in the session: sites
-    and recorders. The other has the times between sites. It exists only if the sites have
-    measured them.
+    One table contains the times to the members, the processes that take part in the session:
+    sites and recorders. The other contains the times between sites. The second table exists
+    only if the sites have measured these times.
 
     Args:
         report: Result of the measurement.
@@ -668,11 +668,11 @@ def _describe_clock(member: dict[str, Any]) -> str:
 
 
 def compose_benchmark(benchmark: Result) -> Iterator[Block]:
-    """Yields the delays of this machine's transports, and a judgement of each transport.
+    """Yields the delays of this machine's transports, and a judgement on each transport.
 
     A transport is a way to send messages between two processes. The table has a row per
-    transport, size of message and rate. The judgement compares the delay with the needs of a
-    scenario.
+    transport, size of message and rate. The judgement compares the delay with the requirements
+    of a scenario.
 
     Args:
         benchmark: Result of the measurement.
@@ -713,20 +713,21 @@ def compose_benchmark(benchmark: Result) -> Iterator[Block]:
 
 
 def _judge_transport(transport: dict[str, Any], needs: dict[str, Any]) -> str:
-    """Returns a sentence that compares the delay of a transport with the needs of a scenario.
+    """Returns a sentence that compares the delay of a transport with a scenario's limits.
 
     A transport is the protocol that carries the samples between sites, such as TCP.
 
     Args:
         transport: Measured delays and losses of the transport. `p99_ms` is the 99th percentile
-            of the delay, None if no message returned. `hidden` is True if it is at most
+            of the delay, `None` if no message returned. `hidden` is True if it is at most
             `held_ms`. `age_ms` is the age at which samples would be used. `spare_ms` is the
-            further age up to which the loop stays stable, None if it is not stable or not
-            known to be. `lost_share` is the fraction of lost messages, and `playout_ms` is the
-            largest delay, rounded up.
-        needs: Sizes, rates and time limits of the scenario. `held_ms` is the time for which its
-            links hold each sample before it is used, so that shorter delays have no effect.
-            `stable_ms` lists the ages at which the loop is stable, None if they are not known.
+            additional age up to which the loop stays stable. It is `None` if the loop is not
+            stable, or if this is not known. `lost_share` is the fraction of lost messages, and
+            `playout_ms` is the largest delay, rounded up.
+        needs: Message sizes, rates and time limits of the scenario. `held_ms` is the time for
+            which its links hold each sample before it is used, so that shorter delays have no
+            effect. `stable_ms` lists the ages at which the loop is stable, `None` if they are
+            not known.
     """
     if transport["p99_ms"] is None:
         return "no message returned"
@@ -753,14 +754,14 @@ def _judge_transport(transport: dict[str, Any], needs: dict[str, Any]) -> str:
 
 
 def compose_metrics(metrics: LogMetrics) -> Iterator[Block]:
-    """Yields the tables with the measured numbers of a run.
+    """Yields the tables with the metrics of a run.
 
     There is a table for each group of quantities, with a column for each subject: the run, an
     arm, a network link, or a wall. Further tables describe what operators feel: forces,
-    stiffness and impedance. Last come the reasons why numbers are missing.
+    stiffness and impedance. The reasons why numbers are missing come last.
 
     Args:
-        metrics: The measured numbers.
+        metrics: The metrics of the run.
     """
     reasons: dict[str, list[str]] = {}
     tables = groupby(quantities(), key=lambda quantity: (quantity.group, quantity.of))
@@ -875,8 +876,9 @@ def _compose_sharing(metrics: LogMetrics) -> Iterator[Block]:
 def _compose_stiffness(metrics: LogMetrics) -> Iterator[Block]:
     """Yields a table of the stiffness that operators felt at the arms.
 
-    It is the change of an operator's torque over the change of the joint angle, for example
-    against a wall that another arm touches. Yields nothing if no stiffness was measured.
+    The stiffness is the change of an operator's torque over the change of the joint angle, for
+    example against a wall that another arm touches. Yields nothing if no stiffness was
+    measured.
     """
     if not metrics.stiffness:
         return
@@ -939,7 +941,8 @@ def _compose_impedance(metrics: LogMetrics) -> Iterator[Block]:
 def _list_response_cells(ratio: FrequencyResponse) -> list[str]:
     """Returns the table cells of one frequency: frequency, gain, phase, coherence and error.
 
-    If the ratio could not be estimated, the last cell has the reason, and the others are empty.
+    If the ratio could not be estimated, the last cell contains the reason, and the others are
+    empty.
     """
     if ratio.gain is None:
         return ["", "", "", "", ratio.why]
@@ -950,7 +953,7 @@ def _list_response_cells(ratio: FrequencyResponse) -> list[str]:
 
 
 def _apply_any(metrics: Iterable[Metric]) -> bool:
-    """Returns True if at least one of some metrics makes sense for the run."""
+    """Returns True if at least one of the metrics is meaningful for the run."""
     return any(metric.applies for metric in metrics)
 
 
@@ -971,10 +974,11 @@ def _tabulate(
     """Yields a table and then an empty line for the terminal.
 
     Args:
-        heads: Header of each column. If the last one is empty, the last column has texts.
+        heads: Header of each column. If the last header is empty, the last column contains
+            texts.
         rows: Cells of each row.
-        text_columns: Number of columns at the left that have texts, and are aligned to the
-            left. The other columns have numbers, and are aligned to the right.
+        text_columns: Number of columns at the left that contain texts and are aligned to the
+            left. The other columns contain numbers and are aligned to the right.
     """
     last_letter = "r" if heads[-1] else "l"
     alignment = "l" * text_columns + "r" * (len(heads) - text_columns - 1) + last_letter

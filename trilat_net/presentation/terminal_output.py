@@ -1,15 +1,16 @@
 """Prints lines, tables, a progress bar and warnings to the terminal, for all commands.
 
 Texts may come from files or from other computers on the network. Such a text could contain
-control characters that move the cursor or hide other texts. Therefore every text passes through
-this module, which makes it safe (`untrusted_text`).
+control characters that move the cursor or hide other texts. Therefore all texts pass through
+this module, which makes them safe (`untrusted_text`).
 
 Invariant:
     - No control character reaches a terminal, whatever the origin of a text: `TextConsole` and
       `print_line` escape control characters.
-    - Text from a file or from another process also passes `sanitize`, which limits its length.
-    - Code below the commands does not know the progress bar. It calls a function with (done,
-      total).
+    - Text from a file or from another process is also passed through `sanitize`, which limits
+      its length.
+    - Code below the commands is independent of the progress bar. It calls a function with
+      (done, total).
     - The top of this module imports only Rich, so that `trilat --help` stays fast.
 """
 
@@ -60,11 +61,11 @@ PATIENCE_S = 1.0
 _REDRAW_PERIOD_S = 0.1
 """Shortest time between two drawings of a progress bar, in s."""
 LINES_AFTER_S = 1.0
-"""Time until `progress_lines` says what is being done, in s."""
+"""Time until `progress_lines` names the current work, in s."""
 LINES_PERIOD_S = 10.0
 """Time between two lines of `progress_lines`, in s."""
 _MAX_DAMAGED = 3
-"""Largest number of listed damaged parts of a log."""
+"""Largest number of damaged parts of a log that are listed."""
 _PIPE_WIDTH = 160
 """Least width of tables, in characters, when the output is not a terminal."""
 
@@ -83,7 +84,7 @@ def print_text(text: object, console: Console = out, head: str = "") -> None:
 
 
 def print_note(text: object) -> None:
-    """Prints a remark for the user to standard error, where it does not disturb results.
+    """Prints a remark for the user to standard error, where it does not mix with results.
 
     Args:
         text: The remark.
@@ -92,7 +93,7 @@ def print_note(text: object) -> None:
 
 
 def print_error(text: object) -> None:
-    """Prints an error message to standard error, so that it does not disturb results.
+    """Prints an error message to standard error, so that it does not mix with results.
 
     Another program can then read the results from standard output.
 
@@ -147,7 +148,7 @@ def print_json(value: Any) -> None:
 
 
 def print_line(text: str) -> None:
-    """Prints a line without buffering, so that a program that reads it need not wait.
+    """Prints a line without buffering, so that a program that reads the output need not wait.
 
     Args:
         text: The line.
@@ -159,7 +160,7 @@ def print_line(text: str) -> None:
 def print_table(table: "TextTable") -> None:
     """Prints a table that is as wide as the terminal permits.
 
-    If the output is not a terminal, it is at least `_PIPE_WIDTH` wide.
+    If the output is not a terminal, the table is at least `_PIPE_WIDTH` wide.
 
     Args:
         table: The table.
@@ -199,7 +200,7 @@ def print_result(result: "Result", *, as_json: bool = False, brief: bool = False
 
 @contextmanager
 def lines_aside(aside: bool) -> Iterator[None]:
-    """Redirects standard output to standard error in a `with` statement, if asked to.
+    """Redirects standard output to standard error in a `with` statement, if requested.
 
     A command with the option --json uses this, so that its standard output contains only JSON.
 
@@ -214,12 +215,12 @@ def lines_aside(aside: bool) -> Iterator[None]:
 def progress_lines(label: str) -> Iterator[Callable[[int, int], None]]:
     """Prints lines on stderr while a `with` statement runs for long.
 
-    The first line appears after `LINES_AFTER_S`, and says what is being done. Further lines
-    follow every `LINES_PERIOD_S`, with the time so far. They come from a thread, because some
-    work cannot report its progress.
+    The first line appears after `LINES_AFTER_S`, and names the work. Further lines follow every
+    `LINES_PERIOD_S`, with the elapsed time. A thread prints them, because some work cannot
+    report its progress.
 
     Args:
-        label: What is being done, as in "judging run.mcap".
+        label: Phrase that names the work, such as "judging run.mcap".
 
     Yields:
         A function that may be called with (done, total). The lines then state the percentage.
@@ -256,10 +257,11 @@ def progress_bar(label: str) -> Iterator[Callable[[int, int], None]]:
     """Yields a function that draws a progress bar, for use in a `with` statement.
 
     The function is called with (done, total), at any rate. The bar appears after `PATIENCE_S`,
-    and only on a terminal. Elsewhere, `progress_lines` prints a few lines.
+    and only on a terminal. If the output is not a terminal, `progress_lines` prints a few lines
+    instead.
 
     Args:
-        label: What is being done, as in "reading run.mcap".
+        label: Phrase that names the work, such as "reading run.mcap".
     """
     if not err.is_interactive:
         with progress_lines(label) as show_lines:
@@ -290,12 +292,12 @@ def progress_bar(label: str) -> Iterator[Callable[[int, int], None]]:
     def show(done: int, total: int) -> None:
         """Draws the progress of a command, for example 12 of 50 runs.
 
-        The bar appears only if the command takes longer than `PATIENCE_S`. Drawings that follow
-        each other too quickly are left out, because they would slow down the work.
+        The bar appears only if the command takes longer than `PATIENCE_S`. Updates that follow
+        each other too quickly are skipped, because they would slow down the work.
 
         Args:
             done: Number of finished items.
-            total: Number of all items.
+            total: Total number of items.
         """
         nonlocal drawn_s
         now_s = display.get_time()
@@ -333,7 +335,7 @@ def open_with_progress(first: Path, *more: Path, **allowed: Any) -> "Log":
 
 
 def warn_of_damage(log: "Log") -> None:
-    """Tells the user which parts of a log are damaged, and which command saves the rest.
+    """Warns the user of damaged parts of a log, and names the command that saves the rest.
 
     Nothing is printed for an intact log.
 
@@ -349,14 +351,14 @@ def warn_of_damage(log: "Log") -> None:
         unlisted_text = (
             f"and {unlisted_count} more damaged parts; " if unlisted_count > 0 else ""
         )
-        advice = "make a whole file of everything that can be read: trilat log recover FILE"
+        advice = "write everything that can be read to a new file with: trilat log recover FILE"
         print_note(f"{unlisted_text}{advice}")
 
 
 def warn_user_laws(log: "Log") -> None:
     """Tells the user which user-written control laws will run when a log is executed again.
 
-    The warning also names the laws that may not run, because the user has not allowed them.
+    The warning also names the laws that may not run because the user has not permitted them.
 
     Args:
         log: The log.
@@ -396,6 +398,6 @@ def warn_if_unfinished(path: Path) -> None:
         print_note(f"{path}: nothing in it can be recovered: {survey.why_empty}")
     else:
         print_note(
-            f"{path}: was not finished: its end and its index are missing; make it whole with: "
+            f"{path}: was not finished: its end and its index are missing; repair it with: "
             f"trilat log recover {path}"
         )

@@ -1,7 +1,7 @@
-"""Writes the sentences on repetitions of a run with small pushes (twins), for people.
+"""Writes the sentences for users on repetitions of a run with small pushes (twins).
 
-`analysis.twins` measures whether the effects of the pushes grow, as names and numbers. For
-example, this module writes that every push dies away, and which of them does so most slowly.
+`analysis.twins` measures whether the effects of the pushes grow, and returns names and numbers.
+For example, this module writes that every push dies away, and which push does so most slowly.
 """
 
 import math
@@ -27,9 +27,11 @@ def _describe_growth(growth: TwinGrowth) -> str:
     if departure is not None:
         span = f"from {departure.from_s:.4g} to {departure.to_s:.4g} s"
         rate = f"{departure.rate_per_s:+.3g} /s at {departure.joint}"
-        return f"twins: {span} the run and its twins left a rest by themselves, {rate}"
+        return (
+            f"twins: {span} the run and its twins left a position of rest by themselves, {rate}"
+        )
     if worst.factor == 0.0:
-        return "twins: every push died down to the rounding of the numbers"
+        return "twins: every push died down to the rounding errors"
     if math.isnan(worst.rate_per_s):
         return "twins: the run is too short to tell"
 
@@ -44,12 +46,12 @@ def _describe_growth(growth: TwinGrowth) -> str:
         return f"twins: a push of {name} grows {change}"
     text = f"twins: a push of {name} shows no clear trend: it changes {change}"
     if growth.needs_s is not None:
-        text += f"; a run of {growth.needs_s:.3g} s would tell"
+        text += f"; a run of {growth.needs_s:.3g} s would be long enough to tell"
     return text
 
 
 def _describe_misses(growth: TwinGrowth) -> str:
-    """Returns a clause on how likely random pushes fail to reveal an unstable run."""
+    """Returns a clause on the probability that random pushes fail to reveal an unstable run."""
     miss = growth.miss_chance
     if miss is None:
         return ""
@@ -72,7 +74,7 @@ def describe_push(twins: PushedTwins, pushed: PushGrowth) -> str:
     if pushed.ended_s is not None:
         outcome = "makes the run diverge"
         if pushed.trend is EnvelopeTrend.DECAYS:
-            outcome = "dies down to the rounding of the numbers"
+            outcome = "dies down to the rounding errors"
         return f"{push} {outcome} in {pushed.ended_s - twins.at_s:.3g} s{rate}"
     if pushed.trend is EnvelopeTrend.GROWS:
         growth = f"grows x {pushed.factor:.3g} in {to_s - twins.growth.from_s:.4g} s"
@@ -85,8 +87,8 @@ def describe_push(twins: PushedTwins, pushed: PushGrowth) -> str:
 def _describe_worst_push(twins: PushedTwins) -> str:
     """Returns a sentence on the worst push, which grows most or dies away most slowly.
 
-    If the user asked for pushes of several sizes, the sentence says instead for which sizes the
-    effect is proportional to the size.
+    If the user requested pushes of several sizes, the sentence states instead for which sizes
+    the effect is proportional to the size.
     """
     if twins.linear is not None:
         return _describe_linear_sizes(twins)
@@ -95,7 +97,7 @@ def _describe_worst_push(twins: PushedTwins) -> str:
 
 
 def _describe_linear_sizes(twins: PushedTwins) -> str:
-    """Returns a sentence on the sizes up to which the effect of a push is proportional.
+    """Returns a sentence on the sizes up to which the effect of a push is proportional to it.
 
     The sentence also describes the effect of the next larger push.
     """
@@ -107,7 +109,7 @@ def _describe_linear_sizes(twins: PushedTwins) -> str:
     beyond = sizes.beyond
     if beyond is None:
         return text
-    outcome = "saturates" if beyond.saturates else "goes another way"
+    outcome = "saturates" if beyond.saturates else "develops differently"
     if beyond.has_wall:
         outcome += " (there is a wall)"
     ratio = f"x {beyond.ratio:.3g} of that at {beyond.at_s:.4g} s"

@@ -8,7 +8,7 @@ import re
 CONTROLS = re.compile(
     r"[\x00-\x08\x0b-\x1f\x7f-\x9f\u00ad\u200b-\u200f\u2028-\u202e\u2060-\u206f\ufeff\ud800-\udfff]"
 )
-"""Characters that move the cursor, ring, colour, or change the direction of writing.
+"""Characters that move the cursor, ring the bell, set colours, or change the text direction.
 
 Line feeds and tabs are not among them.
 """
@@ -33,7 +33,7 @@ def escape_controls(text: str) -> str:
 
 
 def sanitize(text: object, most: int = 300) -> str:
-    """Replaces the harmful characters of a text of unknown origin, and cuts a long text off.
+    """Replaces the harmful characters of a text of unknown origin, and truncates a long text.
 
     Control characters could otherwise control the terminal.
 
@@ -41,7 +41,7 @@ def sanitize(text: object, most: int = 300) -> str:
         text: The text, or an object that is converted to a string.
         most: Largest number of characters.
     """
-    # One character more than the limit tells whether the text is too long.
+    # One character more than the limit shows whether the text is too long.
     beginning = str(text)[: most + 1]
     plain = "".join(letter if letter.isprintable() else "\ufffd" for letter in beginning)
     if len(plain) <= most:

@@ -1,13 +1,13 @@
-"""Writes the sentences about V, the energy function of the stability proof, for people.
+"""Writes the sentences for users about V, the energy function of the stability proof.
 
-`analysis` computes whether and when V rose, as names and numbers. For example, this module
-writes that V rose by 0.2 J at 3.1 s, or which condition of the theorem failed.
+`analysis` determines whether and when V rose, and returns names and numbers. For example, this
+module writes that V rose by 0.2 J at 3.1 s, or which condition of the theorem failed.
 
 Invariant:
-    - Each class of `VerdictFacts` has one function here, in `FACT_DESCRIBERS`.
+    - Each class of `VerdictFacts` has exactly one function in `FACT_DESCRIBERS`.
     - A sentence that names a condition (premise) that fails says in plain words what the
       condition requires.
-    - The theorem is named with its own premises of continuous time, which no log can show.
+    - The name of the theorem mentions its premise of continuous time, which no log can show.
 """
 
 from collections.abc import Callable, Iterable, Sequence
@@ -21,8 +21,8 @@ from .premise_text import (
 )
 
 THEOREM = "the theorem (continuous time; every premise checked here holds)"
-"""What a run rests on if the stability theorem proves it stable."""
-FALSE_RECORDS_TEXT = "these records were not made by the equations that the log claims"
+"""Basis of the judgement of a run if the stability theorem proves the run stable."""
+FALSE_RECORDS_TEXT = "these records do not follow from the equations in the log"
 _PERIOD_OR_FALSE = (
     f"the period is too long for these gains, or {FALSE_RECORDS_TEXT}; "
     "`trilat verify` tells which"
@@ -32,7 +32,7 @@ _PREFIXES = {
     facts.StabilityFinding.BROKEN: "the energy balance is broken: ",
     facts.StabilityFinding.NOT_JUDGED: "V cannot be judged: ",
 }
-"""How a sentence begins if V does not decide."""
+"""Beginning of a sentence if V does not decide."""
 RECORD_GAPS = {
     facts.RecordGap.NO_COMMON_TIME: "there is no time at which every site has records",
     facts.RecordGap.NO_PERIOD: "there is no period whose records are complete",
@@ -52,7 +52,7 @@ REQUIREMENTS = {
     "hands": "must add no energy",
     "presence": "must not be interrupted",
 }
-"""What the theorem requires, by the name of the premise, as the end of a clause."""
+"""Requirements of the theorem as ends of clauses, by the name of the premise."""
 
 
 def name_theorem() -> str:
@@ -83,13 +83,14 @@ def _describe_unclosed_balance(balance: facts.UnclosedBalance) -> str:
     text = f"the energy of {balance.site} does not add up {span}, by {amount}"
     if balance.external:
         arms = f"the external arm of {', '.join(balance.external)}"
-        return f"{text}: {arms} does not move as its theta says, or somebody pushes it"
+        cause = "does not move according to its theta, or an unrecorded torque pushes it"
+        return f"{text}: {arms} {cause}"
     return f"{text}: {FALSE_RECORDS_TEXT if balance.is_certain else _PERIOD_OR_FALSE}"
 
 
 def _describe_wrong_torque(torque: facts.WrongTorque) -> str:
     return (
-        f"the torque of {torque.site} is not that of Eq. (13), by up to "
+        f"the torque of {torque.site} differs from Eq. (13) by up to "
         f"{torque.error_nm:.3g} N m, from {torque.from_s:.4g} s on: {FALSE_RECORDS_TEXT}"
     )
 
@@ -100,7 +101,7 @@ def _describe_ambiguous_weights(weights: facts.AmbiguousWeights) -> str:
 
 def _describe_coarse_energies(energies: facts.CoarseEnergies) -> str:
     return (
-        "the period is too long for these gains, so its energies are known only to "
+        "the period is too long for these gains, so its energies are known only to within "
         f"{energies.tolerance_j:.3g} J of {energies.scale_j:.4g} J"
     )
 
@@ -112,14 +113,14 @@ def _describe_course(course: facts.FunctionalCourse) -> str:
     must not rise.
     """
     if course.rise is not None:
-        context = "though the premises of the theorem hold, which is one of continuous time"
+        context = "although the premises of the theorem, which is about continuous time, hold"
         if course.failed:
             context = _describe_failed(course.failed)
         return f"{context}: {_describe_rise(course.rise, course.largest_j)}"
 
     text = "V did not rise"
     if course.external:
-        text = f"V rose by no more than the {' and '.join(course.external)} gave"
+        text = f"V rose by no more than the {' and '.join(course.external)} supplied"
     first_text = f"{course.first_j:.4g} J at {course.from_s:.4g} s"
     text += f": {first_text}, {course.last_j:.4g} J at {course.to_s:.4g} s"
     undecided_texts = [describe_quantities(quantities) for quantities in course.undecided]
@@ -132,7 +133,7 @@ def _describe_course(course: facts.FunctionalCourse) -> str:
 
 
 def _describe_failed(names: Sequence[str]) -> str:
-    """Returns a sentence: the theorem does not apply, and what each failed premise requires."""
+    """Returns a sentence that the theorem does not apply, with its failed requirements."""
     premises = [f"{name} {REQUIREMENTS[name]}" for name in names]
     return f"the theorem does not apply (premises that fail: {'; '.join(premises)})"
 
@@ -145,7 +146,7 @@ def _describe_rise(rise: facts.FunctionalRise, largest_j: float) -> str:
         f"V rose by {rise.amount:.3g} J ({percent:.3g} % of its largest value) "
         f"from {rise.from_s:.4g} to {rise.at_s:.4g} s"
     )
-    return text + (f"; given by {causes}" if causes else "; nobody gave it")
+    return text + (f"; supplied by {causes}" if causes else "; no source supplied it")
 
 
 FACT_DESCRIBERS: dict[type, Callable[[Any], str]] = {
@@ -163,15 +164,14 @@ FACT_DESCRIBERS: dict[type, Callable[[Any], str]] = {
 def _describe_growth(growth: facts.UnsuppliedGrowth) -> str:
     """Returns a sentence on a growth of the energy V that no operator or wall explains.
 
-    V is the energy of the stability proof. Such a growth is doubtful, even if the run looks
-    stable.
+    V is the energy of the stability proof. Such a growth makes the judgement doubtful, even if
+    the run looks stable.
     """
     energy = f"{growth.energy_j:.3g} J"
     if growth.from_s is None:
-        return f"V ends {energy} above its beginning, and nobody gave that"
-    return (
-        f"V rises at the end: by {energy} from {growth.from_s:.4g} s on, and nobody gave that"
-    )
+        return f"V ends {energy} above its beginning, and no source supplied that energy"
+    span = f"from {growth.from_s:.4g} s on"
+    return f"V rises at the end: by {energy} {span}, and no source supplied that energy"
 
 
 def _describe_evidence(evidence: facts.Evidence) -> str:
@@ -188,14 +188,16 @@ def _describe_lack(doubt: facts.EvidenceDoubt) -> str:
     """Returns a sentence that says why records do not suffice to judge a run."""
     evidence = doubt.evidence
     if doubt.name == "changed log":
-        return f"the log is not as it was made: {evidence.integrity.text}"
+        return f"the log was changed after the run: {evidence.integrity.text}"
     if doubt.name == "missing records":
         coverage = evidence.coverage.describe(evidence.min_coverage)
         return f"records are missing: {coverage}"
     if doubt.name == "missing periods":
         judged_share = evidence.functional_share or 0.0
         return f"V is judged over {100.0 * judged_share:.4g} % of its periods"
-    return f"{' and '.join(evidence.unmet)}, as recorded, did not react to this run"
+    return (
+        f"{' and '.join(evidence.unmet)} replayed recorded motion, without reacting to this run"
+    )
 
 
 DESCRIBERS: dict[type, Callable[[Any], str]] = {

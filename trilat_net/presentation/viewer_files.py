@@ -1,8 +1,8 @@
 """Writes configuration files with which Foxglove, Lichtblick and RViz show the arms of a log.
 
-The files lie beside the log. Some of them serve a bag, a file of standard messages of ROS 2
-(Robot Operating System), into which a log can be exported. A bag has the topics that the live
-bridge to ROS 2 publishes during a session.
+The files are written next to the log. Some of them are for a bag, a file of standard messages
+of ROS 2 (Robot Operating System), into which a log can be exported. A bag has the topics that
+the live bridge to ROS 2 publishes during a session.
 
 Invariant:
     - A file names only topics of the log, and topics of the bag and of the live bridge.
@@ -26,15 +26,14 @@ LAYOUT_SUFFIX = ".foxglove.json"
 def write_foxglove_layout(log: Path, *, force: bool = False) -> Path:
     """Writes the layout of a log or a bag for the viewers Foxglove and Lichtblick.
 
-    With the layout, the viewer opens with plots of all sites, and nothing needs to be arranged
-    by hand.
+    With the layout, the viewer shows plots of all sites without manual arrangement.
 
     Args:
         log: File of the log or bag.
         force: True to replace an existing file.
 
     Returns:
-        The path of the layout, which is beside the log.
+        The path of the layout, which is next to the log.
 
     Raises:
         UsageError: The file contains no channels for viewers, or the layout exists.

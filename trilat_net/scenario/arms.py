@@ -93,10 +93,10 @@ class Arm(fields.Frozen, frozen=True):
     links. Each key belongs to one of the two kinds of arm, or to both.
 
     Attributes:
-        l1_m: This key and the following ones up to I2_kg_m2 are those of `ArmLinks`.
+        l1_m: This key and the following keys up to I2_kg_m2 are those of `ArmLinks`.
         g_m_s2: Gravitational acceleration, in m/s^2.
-        known: False if the masses and inertias are unknown, as those of a robot that has not
-            been identified. They then enter no formula. Only for a real robot.
+        known: False if the masses and inertias are unknown, as for a robot that has not been
+            identified. They are then not used in any formula. Only for a real robot.
         dead_man: True if the arm moves only while somebody holds its dead-man switch
             (`docs/sessions/external-arm.md`). Only for a real robot.
         urdf: Name of the URDF file of the arm, in `Scenario.urdf`. Empty for the planar arm.
@@ -113,7 +113,7 @@ class Arm(fields.Frozen, frozen=True):
         payload_com_m: Centre of mass of the payload in the frame of the tip, in m.
         payload_inertia_kg_m2: Ixx, Ixy, Iyy, Ixz, Iyz, Izz of the payload about its centre of
             mass.
-        armature_kg_m2: Inertia of each drive as seen at its joint, in kg m^2, or in kg for a
+        armature_kg_m2: Inertia of each drive, reflected to its joint, in kg m^2, or in kg for a
             prismatic joint.
         stops: True if the joint limits of the file are mechanical stops, modelled as springs.
         balance_inertia: True if an impossible inertia in the file is replaced by the nearest
@@ -221,8 +221,8 @@ class Task(fields.Frozen, frozen=True, omit_defaults=True):
         axes: Axes along which the site follows its peers, out of x, y, z, rx, ry and rz. By
             default, all axes.
         scale: Number of metres in the shared coordinates per metre of this arm.
-        posture_rad: Joint angles that the arm tends to, as far as the task leaves it free. By
-            default, its start pose.
+        posture_rad: Joint angles that the arm tends to in the directions that the task leaves
+            free. By default, its start pose.
         posture_rate_1_s: Rate at which the arm returns to that posture, in 1/s.
         singular_value: Singular value of the Jacobian below which its inverse is damped.
     """
@@ -239,7 +239,7 @@ class Task(fields.Frozen, frozen=True, omit_defaults=True):
         """Number of coordinates of the end effector that arms send each other: 3 or 6.
 
         These are 3 for a position and 6 for a pose. The number is 0 if they send joint angles
-        instead, because the count of joints depends on the arm.
+        instead, because the number of joints depends on the arm.
         """
         return {"joints": 0, "position": 3, "pose": 6}[self.space]
 
@@ -278,8 +278,8 @@ class Task(fields.Frozen, frozen=True, omit_defaults=True):
         """Settings of the shared coordinates, for the compiled control loop.
 
         They state along which axes of the end effector the arms follow each other, and with
-        which scale and posture. None if the arms follow each other's joint angles, because no
-        settings are needed then.
+        which scale and posture. The value is None if the arms follow each other's joint angles,
+        because no settings are needed then.
         """
         if not self.shared:
             return None
@@ -342,7 +342,7 @@ class ArmModel(NamedTuple):
 
         A stop is moved to the start pose if the joint starts beyond it by at most the margin,
         see `start_margin`. An arm that stands at rest beyond the nominal position of a stop
-        does not touch the real stop, so that the spring of the stop must not push.
+        does not touch the real stop, so the spring of the stop must not push.
 
         Args:
             q0: Start pose, in rad or m, shape (n,).
@@ -442,8 +442,8 @@ class ArmModel(NamedTuple):
     def find_joint_reach(self, limits: MotionLimits) -> HandReach:
         """Returns the range in which each joint of the arm may move.
 
-        The mechanical stops of the arm and the position limits of the experiment both bound it;
-        the narrower of both counts.
+        The range is bounded by the mechanical stops of the arm and by the position limits of
+        the experiment. The narrower bound counts.
 
         Args:
             limits: Position limits of the site that runs the arm.
@@ -591,9 +591,9 @@ class ArmModel(NamedTuple):
     def bound_estimates(self, gains: Gains, limit_nm: Vector, g_m_s2: float) -> Gains:
         """Adds bounds to the gains of an adaptive control law, for the parameters it estimates.
 
-        The motors of the arm can hold it against gravity, which bounds the parameters. Let T
-        be the largest torque of a joint, g the gravitational acceleration, and l the length of
-        a link (for a chain, the reach of the arm):
+        The motors must be able to hold the arm against gravity, which bounds the parameters.
+        Let T be the largest torque of a joint, g the gravitational acceleration, and l the
+        length of a link (for a chain, the reach of the arm):
 
         - a first moment (mass times distance) is at most T / g;
         - a second moment (moment of inertia) is at most l T / g;
@@ -606,7 +606,7 @@ class ArmModel(NamedTuple):
         Args:
             gains: Gains of the control law, with the first estimate of the parameters.
             limit_nm: Largest torque, in N m, as one number or one per joint.
-            g_m_s2: Gravitational acceleration, in m/s^2. Without gravity, no bounds follow.
+            g_m_s2: Gravitational acceleration, in m/s^2. Without gravity, no bounds are added.
         """
         has_box = np.isfinite(gains.low).any()
         if gains.law is not Law.ADAPTIVE or has_box or g_m_s2 == 0.0:
@@ -741,7 +741,7 @@ def _read_cached(
 ) -> UrdfChain:
     """Reads the chain of joints in a URDF file, see `read_urdf`.
 
-    The result is cached, so that the same file is not read again.
+    The result is cached, so the same file is not read again.
     """
     return read_urdf(
         text=text,
@@ -759,7 +759,7 @@ def _place_base(
     """Expresses the joints of an arm, and gravity, in a frame that is common to all arms.
 
     The rotation of the base is R_z(yaw) R_y(pitch) R_x(roll). Only the first joint changes,
-    because the others are expressed in the frame of the joint before them.
+    because the other joints are expressed in the frame of the joint before them.
 
     Args:
         arm: Table of the arm.
@@ -787,7 +787,7 @@ def _build_chain_model(arm: Arm, task: Task, urdf_chain: UrdfChain) -> ArmModel:
     """Builds the model of an arm from the joints that were read from its URDF file.
 
     Raises:
-        ScenarioError: The number of drive inertias differs from that of the joints.
+        ScenarioError: The number of drive inertias differs from the number of joints.
     """
     joint_count = len(urdf_chain.joints)
     if len(arm.armature_kg_m2) not in (1, joint_count):
@@ -823,7 +823,7 @@ def _build_chain_model(arm: Arm, task: Task, urdf_chain: UrdfChain) -> ArmModel:
 
 
 def _build_joint(joint: UrdfJoint, armature_kg_m2: float, *, has_stops: bool) -> ChainJoint:
-    """Converts a joint of a URDF file to the form that the compiled simulation reads.
+    """Converts a joint of a URDF file to the format that the compiled simulation reads.
 
     The ends of the joint's range become stops: a spring that pushes with the effort limit of
     the joint at the depth `STOP_REACH_RAD`, and a damper with `STOP_DAMPING_S` times the

@@ -32,7 +32,7 @@ _ORDER_SENTENCES = {
 
 
 class Change(RecordedChange, frozen=True, omit_defaults=True):
-    """Change during a run: of a network link, of weights, or a command to one arm's process.
+    """Change of a network link or of weights during a run, or a command to one arm's process.
 
     The weights (dominance factors) state how much an arm follows the others. A scenario plans
     changes, and users request further ones. Exactly one of `link`, `dominance` and `site` is
@@ -43,15 +43,15 @@ class Change(RecordedChange, frozen=True, omit_defaults=True):
     def start_ns(self) -> int:
         """Time at which the change takes effect, in ns after the common start of the session.
 
-        Times of the simulation are integers, so that they are the same on every machine.
+        Times of the simulation are integers, so they are the same on every machine.
         """
         return round(self.at_s * 1e9)
 
     @property
     def after(self) -> LinkBase:
-        """All settings of a network link after this change, also those that stay the same.
+        """All settings of a network link after this change, including those that stay the same.
 
-        Only a change of a link has them.
+        Only a change of a link has this property.
         """
         return msgspec.convert(self.to, Link)
 
@@ -70,7 +70,8 @@ class Change(RecordedChange, frozen=True, omit_defaults=True):
         An example is "m2 was stopped by the experimenter at 58.2 s", without a full stop.
 
         Args:
-            ordered_by: Who requested the change, as a noun phrase. Empty if this is not known.
+            ordered_by: Who requested the change, as a noun phrase. Empty if the requester is
+                not known.
         """
         by = f" by {ordered_by}" if ordered_by else ""
         if self.order:
@@ -119,7 +120,7 @@ def describe_event(kind: str, text: str, command: str) -> str:
         command: JSON text of the change that the event reports. Empty for other events.
     """
     if kind == "change" and command and command in text:
-        # The command of an untrusted log may lack the keys of a change: the text then stays.
+        # The command of an untrusted log may lack the keys of a change. The text is then kept.
         with suppress(msgspec.MsgspecError, KeyError, TypeError, ValueError):
             return msgspec.json.decode(command, type=Change).describe()
     return text

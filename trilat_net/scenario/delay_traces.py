@@ -14,11 +14,12 @@ Invariant:
     - A resolved scenario does not need the file any more.
     - Times count from the first point of the trace, and in a measurement from the first sent
       message. Times and delays are whole microseconds.
-    - A message without an answer is lost. A message that took longer than a link may take
-      counts as lost as well.
+    - A message without an answer is lost. A message whose delay exceeds the longest permitted
+      delay of a link also counts as lost.
     - The delay in one direction is taken as half of the round trip, unless it was measured and
       the caller requests it.
-    - Measurements of other people are read where they are. The package ships none.
+    - Published measurements of other people are not part of the package. The user names their
+      files.
 """
 
 import csv
@@ -74,14 +75,14 @@ _ZIPPED_KINDS = {
 def _decode_text(raw: bytes, *, any_code_page: bool = False) -> str:
     """Decodes the bytes of a text file, and refuses files that are not text.
 
-    The encoding is UTF-8, or UTF-16 as Windows PowerShell writes it; the first bytes of the
-    file, such as a byte order mark, tell which of them.
+    The encoding is UTF-8, or UTF-16 as Windows PowerShell writes it. The first bytes of the
+    file, such as a byte order mark, show which of the two it is.
 
     Args:
         raw: Content of the file.
         any_code_page: True to decode a text in another encoding as Latin-1, because programs on
-            Windows print in the code page of their country. Letters beyond ASCII may then be
-            wrong.
+            Windows print in the code page of the user's country. Letters beyond ASCII may then
+            be wrong.
 
     Returns:
         The text, without a byte order mark.
@@ -174,7 +175,7 @@ def read_trace(path: Path, link: str) -> str:
         link: Name of the link whose delays are taken from a log, for example "m1->s".
 
     Returns:
-        The trace in the text form of `format_trace`.
+        The trace as text in the format of `format_trace`.
 
     Raises:
         ScenarioError: The file cannot be read, or contains no trace.
@@ -185,16 +186,16 @@ def read_trace(path: Path, link: str) -> str:
         read_link_delays = find_hook("read the delays of a link")
         return format_trace(read_link_delays(path, link))
     except OSError as error:
-        raise ScenarioError(f"{path}: cannot be read: {error.strerror}") from None
+        raise ScenarioError(f"{path} cannot be read: {error.strerror}") from None
     # UnicodeDecodeError is a ValueError.
     except (ValueError, csv.Error) as error:
         raise ScenarioError(f"{path}: {error}") from None
 
 
 def format_trace(points: Sequence[TracePoint]) -> str:
-    """Returns recorded delays as the text by which an experiment contains them.
+    """Returns recorded delays as text, which becomes part of a scenario.
 
-    The recording is a table of sending times and delays. The form of the text is "t_us
+    The recording is a table of sending times and delays. The format of the text is "t_us
     delay_us, t_us delay_us, ...", in microseconds, with "lost" in place of the delay of a lost
     message. Times count from the first point.
 
@@ -242,7 +243,7 @@ def format_trace(points: Sequence[TracePoint]) -> str:
 
 @lru_cache(maxsize=64)
 def parse_trace(text: str) -> Points:
-    """Converts the text form of a delay trace to an array.
+    """Converts a delay trace from text to an array.
 
     A delay trace is a table of send times and the delay that each message had. The result is
     cached, because the trace of a link is needed many times.
@@ -255,7 +256,7 @@ def parse_trace(text: str) -> Points:
         the delay `LOST`, see `core.vectors.Points`.
 
     Raises:
-        ValueError: The text does not have this form, or a number is out of range.
+        ValueError: The text does not have this format, or a number is out of range.
     """
     pairs = []
     for part in text.split(", "):
@@ -310,9 +311,9 @@ class MeasuredTrace(Result):
     Attributes:
         points: Send time of each message since the first one in s, and its delay in ms. The
             delay of a lost message is infinite.
-        too_long: Number of messages that count as lost because they took longer than a link
-            may.
-        doubled: Number of messages that were left out because another one has the same send
+        too_long: Number of messages that count as lost because their delays exceed the longest
+            delay of a link.
+        doubled: Number of messages that were left out because another message has the same send
             time.
         cut: Number of messages that were left out at the end, because a trace has at most
             `MAX_TRACE_POINTS` points.
@@ -343,7 +344,7 @@ class MeasuredTrace(Result):
         consecutive messages (the lag-one autocorrelation). It is 0 if all delays are equal.
         """
         is_lost = np.array([math.isinf(ms) for _, ms in self.points])
-        # a burst begins where a lost message follows one that was not lost
+        # a burst begins where a lost message follows a message that arrived
         bursts = int(np.sum(np.diff(is_lost.astype(np.int8), prepend=0) == 1))
         statistics: dict[str, Any] = {
             "samples": len(self.points),
@@ -450,9 +451,9 @@ def import_trace(
             only for irtt, and require that its two clocks agree. By default, round trips are
             halved (irtt, ping, and a column "rtt"), and other delays are used as they are.
         column: Name of the column of delays in a table. By default, the first column whose name
-            says that it is a delay.
+            stands for a delay.
         every_s: Interval between the messages of a `ping` that prints no times, in s. `ping`
-            prints none without its option -D, and none on Windows.
+            prints times only with its option -D, and never on Windows.
 
     Raises:
         UsageError: There is no such format, or `way` does not exist for this format.
@@ -469,7 +470,7 @@ def import_trace(
         with open_regular(Path(path)) as stream:
             raw = stream.read(_MAX_BYTES)
     except OSError as error:
-        raise ScenarioError(f"{path}: cannot be read: {error.strerror or error}") from None
+        raise ScenarioError(f"{path} cannot be read: {error.strerror or error}") from None
 
     try:
         if raw.startswith(_GZIP_MAGIC):
@@ -481,9 +482,9 @@ def import_trace(
     try:
         measurement = _READERS[form](text, way, column, every_s)
         return _build_trace(measurement)
-    # A JSON text of another form lacks keys, or has values of other types.
+    # A JSON text in another format lacks keys, or has values of other types.
     except (ValueError, KeyError, TypeError, AttributeError) as error:
-        raise ScenarioError(f"{path}: is not in the format {form}: {error}") from None
+        raise ScenarioError(f"{path} is not in the format {form}: {error}") from None
 
 
 class _Measurement(NamedTuple):
@@ -530,7 +531,7 @@ def _build_trace(measurement: _Measurement) -> MeasuredTrace:
                 f"a delay of {delay_ms:g} ms is impossible: if the two clocks do not agree, "
                 "use half of the round trip"
             )
-        # A message that took longer than a link may take counts as lost.
+        # A message whose delay exceeds the longest delay of a link counts as lost.
         is_too_long = LONGEST_MS < delay_ms < math.inf
         too_long += int(is_too_long)
         points.append((t_us * 1e-6, math.inf if is_too_long else delay_ms))
@@ -543,7 +544,8 @@ def _build_trace(measurement: _Measurement) -> MeasuredTrace:
         begin_known=measurement.begin_known,
         end_known=measurement.end_known,
     )
-    # The text is not needed here, but a trace that a scenario would refuse raises an error now.
+    # The text itself is not needed here. The call raises an error for a trace that a scenario
+    # would refuse.
     format_trace(trace.points)
     return trace
 
@@ -551,9 +553,10 @@ def _build_trace(measurement: _Measurement) -> MeasuredTrace:
 def _read_irtt(text: str, way: str, *_: object) -> _Measurement:
     """Returns the messages in the JSON text of `irtt client -o`.
 
-    The times in this text are nanoseconds. The entry `lost` of a message is a word; only
-    "false" means that the answer arrived. The entry `stats` contains the number of sent
-    packets; if it is larger than the number of messages, the last messages are missing.
+    The times in this text are nanoseconds. The entry `lost` of a message is a word, of which
+    only "false" means that the answer arrived. The entry `stats` contains the number of sent
+    packets. If this number is larger than the number of messages, the last messages are
+    missing.
 
     Args:
         text: The JSON text.
@@ -577,7 +580,7 @@ def _read_irtt(text: str, way: str, *_: object) -> _Measurement:
 def _read_ping(text: str, way: str, _: str, every_s: float) -> _Measurement:
     """Reads the round trips of messages from the output of the programs `ping` or `fping`.
 
-    `ping_output` explains the forms of this output.
+    `ping_output` explains the formats of this output.
 
     Args:
         text: The output.
@@ -601,9 +604,10 @@ def _read_table(text: str, way: str, column: str, _: float) -> _Measurement:
 
     Args:
         text: The table.
-        way: "half" if the column contains round trips, "whole" if it contains the delays.
-            Empty: the name of the column decides.
-        column: Name of the column of delays. Empty: the first column that is named like one.
+        way: "half" if the column contains round trips, "whole" if it contains the delays. If
+            empty, the name of the column decides.
+        column: Name of the column of delays. If empty, the first column whose name stands for a
+            delay.
 
     Raises:
         ValueError: A column is missing, or a line does not contain numbers.
@@ -653,7 +657,8 @@ def _find_column(cells: list[str], names: tuple[str, ...], wanted: str) -> tuple
     Args:
         cells: Cells of the header line.
         names: Names that the quantity may have.
-        wanted: Cell of the column. Empty: the first column that has one of the names.
+        wanted: Cell of the header above the column. If empty, the first column with one of the
+            names is used.
 
     Returns:
         The index of the column, and its unit in s.

@@ -6,8 +6,8 @@ satisfies its condition for stability, and how long an arm needs to come to rest
 
 Invariant:
     - A difference that several arms or links have in common is listed once. If two arms have
-      control laws of different kinds, the laws are compared as a whole. Links are always
-      compared as a whole.
+      control laws of different kinds, each law is listed as a whole. Links are always listed as
+      a whole.
     - Names, titles and expectations only describe an experiment, and are not compared.
 """
 
@@ -78,7 +78,7 @@ def _find_link_delays(links: Mapping[str, LinkBase], rates_hz: Mapping[str, int]
             continue
         rate_hz = rates_hz[receiver]
         delay_us = max(round(model.location), model.playout_us)
-        # rounded up; without a delay, a sample is used from the next tick on
+        # rounded up, because without a delay a sample is used from the next tick on
         ticks = max(1, -(-delay_us * rate_hz // 1_000_000))
         delay_s[index] = ticks / rate_hz
     return delay_s
@@ -106,8 +106,9 @@ def _find_hand_impedances(site: SiteSpec, joints: int) -> tuple[ArmLoad, ...] | 
         joints: Number of joints of its arm.
 
     Returns:
-        The spring and the damper of each. None if one of them acts on the end effector, or if
-        it is live or a program: its reaction is not the same at every pose, or not known.
+        The spring and the damper of each. None if the reaction of an operator depends on the
+        pose, because the operator acts on the end effector, or if the reaction is not known,
+        because the operator is a live operator or a program.
     """
     impedances = []
     for source in (*site.hands, *site.environment):
@@ -115,7 +116,7 @@ def _find_hand_impedances(site: SiteSpec, joints: int) -> tuple[ArmLoad, ...] | 
             continue
         if not isinstance(source, JointSpring | ViscousEnvironment):
             return None
-        # A sampled torque lags behind the motion, so that it is no spring and damper.
+        # A sampled torque lags behind the motion, so it is not that of a spring and damper.
         if source.sampled:
             return None
         stiffness: tuple[float, ...] = (0.0,)
@@ -164,15 +165,15 @@ def list_law_situations(scenario: Scenario) -> Iterator[tuple[str, LawSettings, 
 
 
 _LOOP_GROWS = ", but the roots of the sampled loop grow"
-"""What is said of a condition that holds if the loop is unstable."""
+"""Addition to the line about a satisfied condition if the sampled loop is unstable."""
 _SAMPLING_BREAKS = ", but sampling breaks it here: the roots of the sampled loop grow"
-"""The same of a condition that proves decay in continuous time."""
+"""The same addition for a condition that proves decay in continuous time."""
 
 
 def describe_law_conditions(scenario: Scenario, *, ticks_grow: bool = False) -> list[str]:
     """Returns lines for the user that say whether the conditions of the stability proofs hold.
 
-    Every control law is stable under conditions of its own, for example on its gains and on the
+    Every control law has its own stability conditions, for example on its gains and on the
     delays. Sites with the same law and the same condition share a line.
 
     Most conditions are proved for controllers that act in continuous time. A controller that
@@ -181,7 +182,7 @@ def describe_law_conditions(scenario: Scenario, *, ticks_grow: bool = False) -> 
     Args:
         scenario: Description of the experiment.
         ticks_grow: True if the loop, computed tick by tick, is known to be unstable. The lines
-            of conditions that hold then say so.
+            about satisfied conditions then mention this.
     """
     owners: dict[tuple[str, StabilityCondition], list[str]] = {}
     for name, law, situation in list_law_situations(scenario):
@@ -202,8 +203,8 @@ def describe_law_conditions(scenario: Scenario, *, ticks_grow: bool = False) -> 
 def _describe_idle_shares(scenario: Scenario) -> list[str]:
     """Returns lines about arms for which the weights in the scenario have no effect.
 
-    The weights (dominance factors) state how much an arm follows each of the others. Some
-    control laws determine by other settings how the arms share authority.
+    The weights (dominance factors) state how much an arm follows each of the others. In some
+    control laws, other settings determine how the arms share authority.
     """
     ramped_sites = {change.dominance for change in scenario.timeline}
     owners: dict[str, list[str]] = {}
@@ -261,7 +262,7 @@ def describe_scenario(scenario: str | Path | Mapping[str, Any] | Scenario) -> li
 
 
 def _describe_real_arms(scenario: Scenario) -> list[str]:
-    """Returns a line for each real arm: its limits and start pose, for the user to confirm."""
+    """Returns a line for each real arm with its limits and start pose, which users check."""
     lines = []
     for name in scenario.outside:
         spec = scenario.sites[name]
@@ -283,7 +284,7 @@ def _describe_real_arms(scenario: Scenario) -> list[str]:
 
 
 def _format_per_joint(values: Any, units: Sequence[str]) -> str:
-    """Formats a quantity that each joint has, and writes it once if all joints agree."""
+    """Formats one value per joint of a quantity, or a single value if all joints agree."""
     texts = [f"{value:g}" for value in np.broadcast_to(values, len(units))]
     return _join_equal(texts, units)
 
@@ -302,7 +303,7 @@ def _join_equal(texts: Sequence[str], units: Sequence[str]) -> str:
 def _describe_links(scenario: Scenario) -> list[str]:
     """Returns a line of text for each network link, or a single line if all links are equal.
 
-    Further lines state with which delay the users see the other arms (views).
+    Further lines state the delay with which the users see the other arms (views).
     """
     descriptions = {name: link.describe() for name, link in scenario.links.items()}
     if len(set(descriptions.values())) > 1:
@@ -316,7 +317,7 @@ def _describe_links(scenario: Scenario) -> list[str]:
 
 
 def _describe_shares(scenario: Scenario) -> list[str]:
-    """Returns lines about what follows from the weights with which arms follow each other.
+    """Returns lines about consequences of the weights with which arms follow each other.
 
     The weights form the matrix of dominance factors.
     """
@@ -485,8 +486,8 @@ def _describe_tasks(scenario: Scenario) -> list[str]:
 def _describe_silences(scenario: Scenario) -> list[str]:
     """Returns lines about how often arms will have to wait for late messages from others.
 
-    Only arms under the rule "glide" wait: they come to rest meanwhile. The number is computed
-    with the delays and losses that the network links will draw in the run.
+    Only arms under the rule "glide" wait. They come to rest in the meantime. The number is
+    computed with the delays and losses that the network links will draw in the run.
     """
     lines = []
     for name, spec in scenario.sites.items():
@@ -533,7 +534,7 @@ def _describe_stops(scenario: Scenario) -> list[str]:
 
 
 def _describe_stop(scenario: Scenario, name: str) -> list[str]:
-    """Returns what happens if an arm is stopped, as ends of sentences.
+    """Returns descriptions of an arm's motion after a stop, as ends of sentences.
 
     They say when the arm comes to rest, and whether its motors are strong enough.
     """
@@ -567,7 +568,7 @@ _HASH_DIGITS = 8
 
 _EVERY_LINK = "every link"
 _SOME_LINKS = "link "
-"""Start of the key of a difference of some links, which their names follow."""
+"""Start of the key of a difference between links. The names of the links follow it."""
 
 
 class ScenarioDifference(NamedTuple):
@@ -603,7 +604,8 @@ def compare_scenarios(scenarios: Sequence[Scenario]) -> list[ScenarioDifference]
         scenarios: Descriptions of at least two experiments.
 
     Returns:
-        One entry for each difference, in the order of the keys. Empty if all are equal.
+        One entry for each difference, in the order of the keys. Empty if the experiments are
+        equal.
     """
     differences: list[ScenarioDifference] = []
     site_lists = [", ".join(scenario.names) for scenario in scenarios]
@@ -715,7 +717,7 @@ def describe_law(control: Mapping[str, Any]) -> str:
 def _join_leading(entries: Sequence[str], separator: str) -> str:
     """Joins as many leading entries as fit into `_MAX_VALUE_LENGTH` characters.
 
-    If entries are left out, "..." stands in their place. The first entry is always there.
+    If entries are left out, "..." takes their place. The first entry is always included.
 
     Args:
         entries: Texts of the entries.
@@ -733,8 +735,8 @@ def _join_leading(entries: Sequence[str], separator: str) -> str:
 def describe_value(value: Any) -> str:
     """Returns a value of a scenario as a short text for the user.
 
-    A list of equal numbers is written as one number. Hashes of files are shortened. Of a table
-    or list that is too long, the first entries are written.
+    A list of equal numbers is written as one number. Hashes of files are shortened. A table or
+    list that is too long is cut after its first entries.
 
     Args:
         value: Any value that a scenario may contain.

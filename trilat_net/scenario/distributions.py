@@ -1,9 +1,9 @@
 """Draws numbers of a scenario that are given as probability distributions.
 
-A scenario is a TOML file that describes an experiment. In place of a number, for example of a
-mass or a gain, its author may write `{ normal = [mean, deviation] }` or `{ uniform = [low,
-high] }`. The seed, an integer in the scenario, determines the numbers that are drawn. Another
-seed gives another random instance of the experiment.
+A scenario is a TOML file that describes an experiment. In place of a number, for example a mass
+or a gain, its author may write `{ normal = [mean, deviation] }` or `{ uniform = [low, high] }`.
+The seed, an integer in the scenario, determines the numbers that are drawn. A different seed
+gives a different random instance of the experiment.
 
 Invariant (L4):
     - A drawn number depends only on the seed and on the place of the number in the scenario,
@@ -27,11 +27,11 @@ from ..records import MAX_JOINTS
 from .key_checks import is_distribution, is_number
 
 _MAX_LIST_LENGTH = 64
-"""Longest list in which numbers are drawn. Longer lists are recorded tables."""
+"""Longest list that may contain distributions. Longer lists are recorded tables."""
 
 
 DISTRIBUTION_FORM = "must be { normal = [mean, deviation] } or { uniform = [low, high] }"
-"""What the table of a distribution must be, as the end of a sentence about its key."""
+"""Permitted contents of a distribution's table, as the end of a sentence about its key."""
 
 
 class _DistributionKeys(Frozen, frozen=True, omit_defaults=True, kw_only=True):
@@ -66,7 +66,7 @@ class Distribution(_DistributionKeys, frozen=True, omit_defaults=True, kw_only=T
 
     The author of a scenario, the description of an experiment, may state a distribution in
     place of a number. The value can also be a pose of an operator that was copied from the
-    random start pose of an arm. Then both distributions are None.
+    random start pose of an arm. In this case, both distributions are None.
 
     Attributes:
         value: The drawn number, or the copied pose.
@@ -84,10 +84,10 @@ class Distribution(_DistributionKeys, frozen=True, omit_defaults=True, kw_only=T
             seed: Seed of the scenario.
             key: Dotted key of the number in the scenario.
         """
-        # Few scenarios need this import, which takes some milliseconds.
+        # The import is here because it takes some milliseconds and few scenarios need it.
         from statistics import NormalDist
 
-        # 52 bits select one of 2^52 intervals; its middle is never 0 or 1.
+        # 52 bits select one of 2^52 intervals, whose middle is never 0 or 1.
         interval = link_key(seed, key) >> 12
         uniform_number = (interval + 0.5) / 2.0**52
         if self.normal is not None:
@@ -122,7 +122,7 @@ def has_distribution(value: Any) -> bool:
 def dotted_key(path: str) -> str:
     """Converts a path in an error message to a dotted key.
 
-    For example, hands[0].peak_nm becomes hands.0.peak_nm, which is the form of a key in an
+    For example, hands[0].peak_nm becomes hands.0.peak_nm, which is the format of a key in an
     override.
 
     Args:
@@ -135,7 +135,7 @@ class Draws:
     """Draws the numbers of a scenario whose author stated random distributions.
 
     It also remembers them, so that the resolved scenario, in which every value is a number,
-    states their distributions too.
+    also states the distributions.
 
     Args:
         seed: Seed of the scenario.
@@ -154,12 +154,12 @@ class Draws:
     def draw_numbers(self, table: TomlTable, path: str) -> TomlTable:
         """Replaces all distributions in a table by drawn numbers.
 
-        Tables and lists within the table are included. The table itself does not change.
+        Lists in the table are included, but inner tables are not. The given table is unchanged.
 
         Args:
             table: Table of a scenario.
-            path: Path of the table in the scenario. It decides, with the seed, which numbers
-                are drawn.
+            path: Path of the table in the scenario. The path and the seed determine the
+                numbers.
 
         Returns:
             A copy of the table with numbers.
@@ -222,7 +222,7 @@ class Draws:
 
 
 def _read_distribution(table: TomlTable, path: str) -> Distribution:
-    """Reads a random distribution from a table of a scenario; no number is drawn from it yet.
+    """Reads a random distribution from a table of a scenario, without drawing a number from it.
 
     Raises:
         ScenarioError: The table does not state a distribution.

@@ -65,9 +65,9 @@ class ExpectWindow(_JointPart, frozen=True, kw_only=True):
     """Expected ranges of quantities in a part of a run, which a test checks.
 
     For each quantity, the smallest and the largest permitted value may be stated. The force of
-    the walls is computed from the logged state. It is the force along the normal, added up over
-    the walls of the experiment. If a run ends before the window ends, the quantities are not
-    measured, and the expectations count as not satisfied.
+    the walls is computed from the logged state. This force acts along the normal, and is summed
+    over the walls of the experiment. If a run ends before the window ends, the quantities are
+    not measured, and the expectations count as not satisfied.
 
     Attributes:
         from_s: Nominal time of the first tick of the window, in s.
@@ -99,8 +99,8 @@ class ExpectWindow(_JointPart, frozen=True, kw_only=True):
     def limits(self) -> Iterator[tuple[str, tuple[float, ...]]]:
         """Yields each quantity that is checked in this part of a run, with its limits.
 
-        An item is, for example, the name of a quantity, which ends in its unit, and the pair
-        (0.0, 0.01) of the smallest and the largest permitted value. Yields nothing if no
+        Each item is the name of a quantity, which ends in its unit, and a pair of the smallest
+        and the largest permitted value, for example (0.0, 0.01). Nothing is yielded if no
         quantity is checked.
         """
         for key in _QUANTITIES:
@@ -268,10 +268,10 @@ class Expect(
     """Conditions that every run of an experiment must satisfy, for every random seed.
 
     The command `trilat test` checks them. The error of an arm is e = q_i - q_id, Eq. (9): its
-    joint angles q_i minus the position q_id that it should follow. |e| is taken for each joint.
-    "Largest" and "smallest" refer to all arms (or network links), all joints and all control
-    periods. If an arm diverges, the run ends there. Only the part before counts, and the run
-    fails unless `stable = false` is expected.
+    joint angles q_i minus the position q_id that it should follow. |e| is evaluated for each
+    joint separately. "Largest" and "smallest" refer to all arms (or network links), all joints
+    and all control periods. If an arm diverges, the run ends there. Only the part before the
+    divergence counts, and the run fails unless `stable = false` is expected.
 
     Attributes:
         stable: True if the run must be stable, False if it must be unstable. A run whose
@@ -331,8 +331,8 @@ class Expect(
     def has_expectations(self) -> bool:
         """True if the experiment states at least one condition that its runs must satisfy.
 
-        A tolerance alone only says how precisely other conditions are judged, and does not
-        count.
+        A tolerance alone does not count, because it only says how precisely other conditions
+        are judged.
         """
         tolerances = {"synchronised_rad": 0.01, "end_pose_within_rad": 0.01}
         return msgspec.structs.replace(self, **tolerances) != Expect()

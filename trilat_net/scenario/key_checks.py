@@ -28,8 +28,8 @@ StructType = type[msgspec.Struct]
 class VectorCounts(NamedTuple):
     """Lengths of the vectors that belong to one arm, for example 6 gains for 6 joints.
 
-    An author may state one number where a vector is needed. The counts say how long the vector
-    becomes, and check vectors that are given in full.
+    An author may state one number where a vector is needed. The counts determine the length of
+    that vector, and serve to check vectors that are given in full.
 
     Attributes:
         joints: Length of a vector with one number per joint.
@@ -46,7 +46,7 @@ class VectorCounts(NamedTuple):
 
     @classmethod
     def of_chain(cls, joints: int, shared: int = 0) -> "VectorCounts":
-        """Returns the lengths of the vectors that belong to an arm of several joints in space.
+        """Returns the lengths of the vectors that belong to a spatial arm with several joints.
 
         Gains per joint, for example, need as many numbers as the arm has joints.
 
@@ -64,10 +64,10 @@ class VectorCounts(NamedTuple):
 
 
 def find_extra(hint: Any, name: str) -> str | None:
-    """Returns what the annotation of a type states in `Meta.extra` under a name.
+    """Returns the value that the annotation of a type states in `Meta.extra` under a name.
 
     For example, `Annotated[str, Meta(extra={"must_be": "a name"})]` states "a name" under
-    "must_be". None if the type states nothing under this name.
+    "must_be". The result is None if the type states nothing under this name.
     """
     # Only a type of the form `Annotated[type, ...]` has this attribute.
     for annotation in getattr(hint, "__metadata__", ()):
@@ -79,17 +79,17 @@ def find_extra(hint: Any, name: str) -> str | None:
 
 @cache
 def _vector_keys(kind: StructType, extra: str) -> Mapping[str, str]:
-    """Finds which keys of a table are vectors, and on which count the length of each depends.
+    """Finds the keys of a table that are vectors, and the count that determines each length.
 
     The fields of a structure type are the keys of a table in a scenario. The length of a vector
-    depends on the arm, for example on its number of joints. The annotation of its field says
-    so: a field `Kd: Annotated[tuple[float, ...], Meta(extra={"per": "joints"})]` has one number
-    per joint, and its entry in the result is `"Kd": "joints"`.
+    depends on the arm, for example on its number of joints. The annotation of its field states
+    the count: a field `Kd: Annotated[tuple[float, ...], Meta(extra={"per": "joints"})]` has one
+    number per joint, and its entry in the result is `"Kd": "joints"`.
 
     Args:
         kind: The structure type of the table.
-        extra: Which vectors are searched for, as a key of `Meta.extra`. "per" for vectors that
-            a single number may stand for. "point" for points in space, which must be written in
+        extra: Kind of vectors to find, as a key of `Meta.extra`. "per" for vectors that a
+            single number may stand for. "point" for points in space, which must be written in
             full.
 
     Returns:
@@ -110,7 +110,7 @@ def list_fields(kind: StructType) -> tuple[msgspec.structs.FieldInfo, ...]:
     """Returns the fields of a type that describes a table of a scenario file, such as `Arm`.
 
     The result is cached, because `msgspec.structs.fields` evaluates the annotations of the type
-    anew in each call, and a scenario has many tables of the same type.
+    again in each call, and a scenario has many tables of the same type.
     """
     return msgspec.structs.fields(kind)
 
@@ -252,14 +252,14 @@ def describe_unknown_key(key: str, valid: Sequence[str], elsewhere: Sequence[str
 def hint_at_quotes(text: str) -> str:
     """Returns a hint for a text that a shell has cut off at the ">" of the name of a link.
 
-    A shell takes ">" outside quotes as an order to write into a file. Of
-    `links.m1->s.delay_ms=5` the program then receives "links.m1-".
+    A shell interprets ">" outside quotes as a redirection of the output into a file. The
+    program then receives only "links.m1-" of `links.m1->s.delay_ms=5`.
 
     Args:
         text: A key or an override.
 
     Returns:
-        The end of a sentence. Empty if the text does not end like this.
+        The end of a sentence. Empty if the text does not end in this way.
     """
     if not text.endswith("-"):
         return ""

@@ -3,7 +3,7 @@
 Some URDF files (XML descriptions of robots) contain inertias that no body can have, for example
 because one principal moment exceeds the sum of the other two. The author of an experiment can
 state other values in the scenario, or let the program balance the inertia, which replaces it by
-the nearest possible one. A link is here one body of a robot arm.
+the nearest possible one. A link is one body of a robot arm here.
 
 Invariant:
     - A key in the scenario replaces the value in the file. Without the key, the file applies.
@@ -38,12 +38,12 @@ class LinkInertia(fields.Frozen, frozen=True, omit_defaults=True):
     Many such files contain inertias that are wrong or missing.
 
     Attributes:
-        mass_kg: Mass, in kg. 0 removes the body of the link. By default, as in the file.
-        com_m: Centre of mass in the frame of the link, in m. By default as in the file, or the
-            origin of the frame if the file does not state it.
+        mass_kg: Mass, in kg. 0 removes the body of the link. By default, the mass in the file.
+        com_m: Centre of mass in the frame of the link, in m. By default, the centre of mass in
+            the file, or the origin of the frame if the file states none.
         inertia_kg_m2: Ixx, Ixy, Iyy, Ixz, Iyz, Izz about the centre of mass, in the axes of the
-            link's frame. By default as in the file, or zero (a point of mass) if the file does
-            not state it.
+            link's frame. By default, the inertia in the file, or zero (a point mass) if the
+            file states none.
     """
 
     mass_kg: fields.NotNegative | None = None

@@ -17,12 +17,12 @@ PRESETS_FILE = SHIPPED_FOLDER / "_presets.toml"
 
 GRID_ROUND_TRIPS_MS = (8, 68, 136, 272, 544, 1088)
 GRID_LOSSES_PERCENT = (0, 10, 25, 50)
-"""Round trips and losses of the grid of presets.
+"""Losses of the grid of presets, in percent. The round trips are in `GRID_ROUND_TRIPS_MS`.
 
 The ranges are those of Rodriguez-Seda, Lee and Spong, "Experimental Comparison Study of Control
 Architectures for Bilateral Teleoperators", IEEE Trans. Robotics 25 (2009): round trips of 8 to
-1088 ms and losses of 0 to 50 %. The grid points are our choice; the points of that study are
-not known to us.
+1088 ms and losses of 0 to 50 %. The grid points are our choice, because the study does not
+state its own.
 """
 
 _GRID: dict[str, dict[str, Any]] = {

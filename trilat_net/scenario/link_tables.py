@@ -1,12 +1,13 @@
 """Completes the tables of the links of a scenario: delay models, presets, recorded delays.
 
 A scenario is a TOML file that describes an experiment. A link is the one-way network connection
-between two sites, the processes of the arms. The table `link` holds for all links, and the
+between two sites, the processes of the arms. The table `link` applies to all links, and the
 table `links` contains the settings of single links, for example of "m1->s".
 
 Invariant:
     - A complete link contains the keys of its preset, but not the preset's name, so that an
-      experiment does not change with a preset. It contains recorded delays, but no file.
+      experiment does not change if the preset is changed. It contains recorded delays, but does
+      not name a file.
 """
 
 from ..errors import ScenarioError, suggest_nearest
@@ -57,7 +58,7 @@ def complete_link(
     """Returns the complete table of a link, or of the delayed view of a site.
 
     A view is the delay with which the user of a site sees the other arms. It has the keys of a
-    link, but inherits none.
+    link, but does not inherit their values.
 
     Args:
         written: Table of the link as its author wrote it.
@@ -91,8 +92,8 @@ def _join_link(written: TomlTable, common: TomlTable, path: str) -> TomlTable:
     The source of settings that the author left out depends on what the author wrote:
 
     - If the link names a preset, they are taken from the preset.
-    - If it names only a delay model, no other settings are taken over, because each model has
-      its own.
+    - If it names only a delay model, no other settings are inherited, because each model has
+      its own settings.
     - Otherwise they are taken from the common settings of all links.
 
     Files with recorded delays are not read here.
@@ -119,7 +120,8 @@ def _join_link(written: TomlTable, common: TomlTable, path: str) -> TomlTable:
         )
     check_link(written, model, path)
 
-    # Delays that are written out replace the file of the defaults, and a file replaces delays.
+    # Delays that the author writes out replace a default file, and a file that the author names
+    # replaces default delays.
     replaced_keys: tuple[str, ...] = ("preset",)
     if "trace" in written:
         replaced_keys = ("preset", *TRACE_KEYS)

@@ -5,8 +5,8 @@ robot arms, and files with the delays of a network. A complete scenario contains
 these files instead of their names.
 
 Invariant:
-    - Without a folder, no file may be named: a scenario from a log or from another computer
-      reads nothing on this one.
+    - Without a folder, no file may be named, because a scenario from a log or from another
+      computer must not read files on this computer.
 """
 
 from collections.abc import Mapping
@@ -71,7 +71,7 @@ class NamedFiles(NamedTuple):
     def list_used_texts(self, sites: TomlTable) -> dict[str, str]:
         """Returns the texts of the URDF files that complete sites use, by the name of the file.
 
-        The file that `[arm]` names is not used if every site has an arm of its own.
+        The file that `[arm]` names is not used if every site has its own arm.
 
         Args:
             sites: Complete tables of the sites, by name.
@@ -83,7 +83,7 @@ class NamedFiles(NamedTuple):
         """Returns the recorded delays of a link, from its table or from the file that it names.
 
         The file is a table of times and delays, or a log. From a log, the delays of the link
-        `of` are taken, by default those of the link with the same name.
+        `of` are taken, by default the delays of the link with the same name.
 
         Args:
             link: Table of a link with the delay model "trace".
@@ -123,7 +123,7 @@ def _read_urdf(name: str, folder: Path | None, path: str) -> str:
 
     Args:
         name: Name of the file, as the arm names it.
-        folder: Folder of the scenario. None refuses every file.
+        folder: Folder of the scenario. If None, no file may be named.
         path: Path of the key that names the file, for error messages.
 
     Raises:
@@ -155,6 +155,7 @@ def _find_file(name: str, folder: Path) -> Path:
 def use_unix_line_ends(text: str) -> str:
     r"""Returns a text with line feeds as line ends, as on Linux.
 
-    A file that was written on Windows would otherwise be another experiment with another hash.
+    A file that was written on Windows would otherwise count as a different experiment, because
+    its hash would differ.
     """
     return text.replace("\r\n", "\n").replace("\r", "\n")

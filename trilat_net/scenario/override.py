@@ -6,7 +6,7 @@ and of every network link is written out.
 
 Invariant:
     - In a resolved scenario, a key without the name of a site or link (`control.Kd`,
-      `link.delay_ms`, `rate_hz`) applies to every site or link that can have it.
+      `link.delay_ms`, `rate_hz`) applies to every site or link that can have the key.
     - A key of a single site or link (`sites.s.control.Kd`) has priority, regardless of the
       order.
     - A key of `control` that no built-in law has is an argument of a user's control law.
@@ -33,7 +33,7 @@ _USER_LAW = "own"
 """Kind of all control laws that users wrote."""
 
 _WRONG_VALUE = "expected "
-"""Start of the problem of a value that has a wrong type or range."""
+"""Beginning of the text about a value of a wrong type or range."""
 
 Override = tuple[str, Any]
 """Dotted key and its new value."""
@@ -122,7 +122,7 @@ def _expand_group(
 ) -> list[str]:
     """Returns the paths of a key of a group, one for each law or link that can have the key.
 
-    Whether a law or link can have it depends on its kind after the overrides.
+    Whether a law or link can have the key depends on its kind after the overrides.
 
     Args:
         scenario: The scenario.
@@ -214,9 +214,9 @@ def split_entries(
     """Separates overrides that can be applied to a scenario file at once from all others.
 
     An override replaces one value of a scenario, the description of an experiment. Some
-    overrides replace one entry of a list, such as the stiffness of joint 2. The file may not
-    contain this list, because its author wrote one number for all joints or left the setting
-    out. These overrides must wait until the scenario has been completed with all lists.
+    overrides replace one entry of a list, such as the stiffness of joint 2. The file may lack
+    this list, because its author wrote one number for all joints or left the setting out. These
+    overrides must wait until the scenario has been completed with all lists.
 
     Args:
         tables: Content of the scenario file.
@@ -255,7 +255,7 @@ def _find_value(tables: TomlTable, key: str) -> Any:
 
 
 def _find_law(scenario: Scenario, site: str, overridden: Mapping[str, Any]) -> Any:
-    """Returns the name of an arm's control law as it will be after the overrides."""
+    """Returns the name of an arm's control law after the overrides."""
     for path in (f"sites.{site}.control.law", "control.law"):
         if path in overridden:
             return overridden[path]
@@ -289,7 +289,7 @@ def apply_overrides(tables: TomlTable, overrides: Mapping[str, Any] | Sequence[s
         overrides: Values by dotted key, or texts KEY=VALUE.
 
     Raises:
-        ScenarioError: An override does not have this form, or its key does not exist.
+        ScenarioError: An override does not have the form KEY=VALUE, or its key does not exist.
     """
     pairs = parse_overrides(overrides)
     overridden_keys = {key for key, _ in pairs}
@@ -346,10 +346,11 @@ def _reach_table(tables: TomlTable, parents: Sequence[str], last: str) -> TomlTa
     Args:
         tables: Tables of the scenario.
         parents: Keys of the path.
-        last: Key in the table or list. If it is a number, a missing container is a list.
+        last: Key in the table or list. If this key is a number, a list is added, otherwise a
+            table.
 
     Raises:
-        ScenarioError: There is a value in place of a table, or no such entry of a list.
+        ScenarioError: A value stands in place of a table, or a list has no such entry.
     """
     container: Any = tables
     for depth, name in enumerate(parents):
@@ -397,7 +398,7 @@ def parse_overrides(overrides: Mapping[str, Any] | Sequence[str]) -> list[Overri
             in TOML, or as a bare word.
 
     Raises:
-        ScenarioError: A text does not have this form.
+        ScenarioError: A text does not have the form KEY=VALUE.
     """
     if isinstance(overrides, Mapping):
         return list(name_law_classes(overrides).items())
@@ -419,8 +420,8 @@ def find_written_path(error: ScenarioError, tables: TomlTable) -> str:
     The author may have set the key for all sites or links at once. For example, the path
     "links.m2->m1.delay_ms" becomes "link.delay_ms" if only that key was written. Values of a
     wrong type or range are wrong for every site or link, and so is a URDF file that cannot be
-    used. Other errors, such as a list of the wrong length, may concern only the site that they
-    name, so their paths stay.
+    used. Other errors, such as a list of the wrong length, may concern only the site in their
+    path, so these paths are kept.
 
     Args:
         error: The error, with the path of the key of a single site or link. An index in square
@@ -445,7 +446,8 @@ def find_written_path(error: ScenarioError, tables: TomlTable) -> str:
     common_key = ".".join(names[1:])
     if group == "links":
         common_key = f"link.{common_key}"
-    # An argument of a user's law stands in a table of its own, which the author need not write.
+    # In a complete scenario, the arguments of a user's law have a separate table, which the
+    # author need not write.
     for written_key in (common_key, common_key.replace("control.settings.", "control.", 1)):
         value = _find_value(tables, written_key)
         if isinstance(value, list):
@@ -459,7 +461,7 @@ def find_written_path(error: ScenarioError, tables: TomlTable) -> str:
 
 
 def nest_overrides(pairs: Sequence[Override]) -> TomlTable:
-    """Returns overrides with dotted keys as nested tables, as if they stood in a scenario file.
+    """Returns overrides with dotted keys as nested tables, as in a scenario file.
 
     `find_written_path` searches these tables for the key of an error.
 
@@ -485,7 +487,7 @@ def split_assignment(text: str) -> Override | None:
     For example, "links.delay_ms=5" gives the key "links.delay_ms" and the value 5.
 
     Args:
-        text: The text. A value that is not valid TOML is a bare word, and is taken as a string.
+        text: The text. A value that is not valid TOML is treated as a string without quotes.
 
     Returns:
         The key and the value. None if the text does not have this form.
@@ -495,6 +497,6 @@ def split_assignment(text: str) -> Override | None:
         return None
     try:
         return key.strip(), tomllib.loads(f"value = {value}")["value"]
-    # TOMLDecodeError is a ValueError; a number of 5000 digits raises a plain ValueError.
+    # TOMLDecodeError is a ValueError. A number of 5000 digits raises a plain ValueError.
     except ValueError:
         return key.strip(), value.strip()

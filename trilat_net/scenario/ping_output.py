@@ -9,13 +9,13 @@ macOS, busybox, fping and Windows are supported:
     192.0.2.5 : [0], 64 bytes, 5.00 ms (5.00 avg, 0% loss)            fping
 
 Invariant:
-    - A probe without an answer counts as lost, also before the first answer and after the last
-      one. Which probes were sent follows from the sequence numbers, from lines about missing
+    - A probe without an answer counts as lost, even before the first answer and after the last
+      one. The sent probes are derived from the sequence numbers, from lines about missing
       answers, and from the number of packets in the summary at the end.
-    - Only numbers and units are read, not words, so that the language of the program does not
-      matter. A decimal comma is read as a decimal point.
+    - Only numbers and units are read, so the language of the program does not matter. A decimal
+      comma is read as a decimal point.
     - Output that contradicts its own summary is refused. If the output does not show how the
-      measurement began or ended, the result says so.
+      measurement began or ended, the result records this fact.
 """
 
 import math
@@ -180,7 +180,7 @@ def _read_numbered(lines: Sequence[str], every_s: float) -> _PingProbes:
             answers[number] = _Answer(_parse_decimal(rtt[1]), printed_s)
 
     if first is None and summary is not None:
-        # iputils counts from 1. If the number 0 occurs, `_arrange_probes` starts there instead.
+        # iputils counts from 1. If the number 0 occurs, `_arrange_probes` starts at 0 instead.
         first = 1
     return _arrange_probes(
         answers=answers, mentioned=mentioned, first=first, summary=summary, every_s=every_s
@@ -188,7 +188,7 @@ def _read_numbered(lines: Sequence[str], every_s: float) -> _PingProbes:
 
 
 def _unwrap_number(previous: int, number: int) -> int:
-    """Returns a sequence number as if `ping` never started from 0 again.
+    """Returns the sequence number that `ping` would print if it never restarted from 0.
 
     The result is the number nearest to the previous one that agrees with the printed number
     modulo `_SEQUENCE_NUMBERS`.
@@ -204,14 +204,14 @@ def _unwrap_number(previous: int, number: int) -> int:
 
 
 def _parse_decimal(text: str) -> float:
-    """Converts a text to a number; the decimal separator may be a comma."""
+    """Converts a text to a number. The decimal separator may be a comma."""
     return float(text.replace(",", "."))
 
 
 def _read_fping(lines: Sequence[str], every_s: float) -> _PingProbes:
     """Reads the round trips from the output of `fping`, which numbers the probes from 0.
 
-    In contrast to `ping`, the numbers never start again from 0.
+    In contrast to `ping`, the numbers never restart from 0.
 
     Args:
         lines: Lines of the output.
@@ -268,7 +268,7 @@ def _arrange_probes(
     Raises:
         ValueError: The lines contradict the summary, or the summary counts too many packets.
     """
-    # Without any line, the range of probes begins at the first number and is empty.
+    # If there are no lines, the range of probes begins at the first number and is empty.
     assumed_first = first or 0
     lowest = min(mentioned, default=assumed_first)
     highest = max(mentioned, default=assumed_first - 1)
@@ -332,11 +332,11 @@ def _find_sending_times(
     mean_s = every_s
     if len(timed_answers) > 1:
         mean_s = (sent_s[-1] - sent_s[0]) / (timed_numbers[-1] - timed_numbers[0])
-    # The clock may have been set back, and NaN is not positive either.
+    # The interval is not positive if the clock was set back, and may be NaN.
     if not mean_s > 0.0:
         mean_s = every_s
 
-    # `np.interp` is constant beyond the ends. The extrapolation is added to that.
+    # `np.interp` is constant beyond the ends. The extrapolation is added to this constant.
     before = np.minimum(numbers - timed_numbers[0], 0.0)
     after = np.maximum(numbers - timed_numbers[-1], 0.0)
     interpolated_s = np.interp(numbers, timed_numbers, sent_s)
@@ -348,7 +348,7 @@ def _read_windows(lines: Sequence[str], every_s: float) -> _PingProbes:
 
     The output has a header that ends in a colon, one line per probe, and then the summary,
     whose first line ends in a colon as well. A line about a missing answer is a sentence in the
-    language of the user; it is recognised by its full stop.
+    language of the user, and is recognised by its full stop.
 
     Args:
         lines: Lines of the output.

@@ -8,7 +8,7 @@ Invariant:
     - The state that a plant returns is treated as a measurement, like the state of a real
       robot. The log stores it as the joint positions q, the joint velocities qd and the
       external torques tau_x. Therefore the control can be executed again from a log without the
-      plant, and no check of a log judges the motion of the plant.
+      plant, and the checks of a log do not judge the motion of the plant.
 """
 
 import math
@@ -78,10 +78,10 @@ class _PlantProgram(Protocol):
         """
 
     def poses(self) -> Sequence[Sequence[float]]:
-        """Returns the current poses of the bodies that the model moves besides the arm.
+        """Returns the current poses of the bodies that the model moves in addition to the arm.
 
-        The order is that of `PlantContext.bodies_m`. The method is called only if there are
-        bodies.
+        The bodies have the order of `PlantContext.bodies_m`. The method is called only if there
+        are bodies.
 
         Returns:
             Seven numbers per body: x, y and z of its centre in the frame of the arm's base, in
@@ -90,7 +90,7 @@ class _PlantProgram(Protocol):
 
 
 class PlantPlayer:
-    """Runs a user's arm model (plant) at one arm, one control period after another.
+    """Runs a user's arm model (plant) for one site, one control period after another.
 
     A plant is a class that computes the motion of an arm from the torques of its motors.
 
@@ -141,7 +141,7 @@ class PlantPlayer:
         self.state = PlantState(spec.q0_rad, spec.qd0_rad_s, (), bodies)
 
     def move(self, tick: int, tau: Sequence[float]) -> None:
-        """Lets the user's arm model compute the motion from one control period to the next.
+        """Computes the motion from one control period to the next by the user's arm model.
 
         The result is stored in `state`.
 

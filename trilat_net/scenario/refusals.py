@@ -1,16 +1,18 @@
-"""Words what is wrong with a table of a scenario, for the author of the scenario.
+"""Explains errors in the tables of a scenario to its author.
 
 A scenario is a TOML file that describes an experiment. The library msgspec compares its tables
 with types, and refuses the first value that does not fit. Its message is written for
 programmers: "Expected `float | object`, got `str` - at `$.sites[...].arm.l1_m`". This module
-turns the message into an error that names the key as it stands in the file, and states what
-the author may write there.
+converts the message to an error that names the key as it is written in the file, and states the
+permitted values.
 
-A type may say in its own words what a value must be: `Meta(extra={"must_be": "a time in s"})`.
+The annotation of a type may describe the permitted values in words: `Meta(extra={"must_be": "a
+time in s"})`.
 
 Invariant:
-    - Every refusal of a scenario's table by msgspec is worded by `refuse`, except those of
-      operators and environments, whose keys have texts of their own (`operators.VALUE_TEXTS`).
+    - `refuse` composes every error message about a table that msgspec has refused. The tables
+      of operators and environments are an exception, because their keys have their own texts
+      (`operators.VALUE_TEXTS`).
 """
 
 import re
@@ -49,7 +51,7 @@ _VECTOR_ENTRY = {
     "axes": "axis",
     "shared": "coordinate that the sites share",
 }
-"""What a vector has one number for, by the name of its length in `VectorCounts`."""
+"""Noun for one entry of a vector, by the name of the vector's length in `VectorCounts`."""
 
 MAX_QUOTED_LENGTH = 60
 """Length up to which an error message quotes a value."""
@@ -66,10 +68,10 @@ def refuse(
     path: str,
     elsewhere: Sequence[str] = (),
 ) -> ScenarioError:
-    """Converts an error of the library msgspec to one for the author of the refused table.
+    """Converts an error of the library msgspec to an error for the author of the refused table.
 
-    The new error names the wrong key by its path in the scenario, and says what may stand
-    there.
+    The new error names the wrong key by its path in the scenario, and states the permitted
+    values.
 
     Args:
         error: Error that msgspec raised when it compared the table with its type.
@@ -139,7 +141,7 @@ def convert_drawn(
 
     Raises:
         ScenarioError: A value has a wrong type or range. If the value was drawn at random, the
-            error says so, because its author did not write this number.
+            error mentions this, because the author did not write the number.
     """
     try:
         return msgspec.convert(table, kind)
@@ -168,11 +170,11 @@ def _join_path(path: str, location: Location) -> str:
 
 
 def _describe_wrong_type(value: Any, expected: str) -> str:
-    """Explains what is wrong with a value from a scenario file that has the wrong type.
+    """Explains why a value from a scenario file has the wrong type.
 
     Args:
         value: The value as it was read from TOML.
-        expected: What the value would have to be, such as "a number".
+        expected: Description of the permitted values, such as "a number".
 
     Returns:
         The problem, such as "expected a number, got text", as the end of a sentence about the
@@ -192,7 +194,7 @@ def _describe_wrong_type(value: Any, expected: str) -> str:
 def _describe_wrong_value(
     message: str, table: Any, kind: Any, location: Location, path: str
 ) -> str:
-    """Explains what is wrong with a value that has a wrong type or is out of range.
+    """Explains why a value has a wrong type or is out of range.
 
     Args:
         message: Message of msgspec without the location.
@@ -225,14 +227,14 @@ def _describe_wrong_value(
 
 
 def _describe_table_for_number(table: TomlTable, kind: Any, location: Location) -> str:
-    """Explains what is wrong with a table in place of a number, as a wrong distribution."""
+    """Explains why a table in place of a number is not a valid distribution."""
     if is_distribution(table):
         return f"{DISTRIBUTION_FORM}, but is {table}"
     return _describe_wrong_number(table, kind, location)
 
 
 def _describe_wrong_number(value: Any, kind: Any, location: Location) -> str:
-    """Explains what is wrong with a value that should be a number, and what may stand there.
+    """Explains why a value is not a permitted number, and states the permitted values.
 
     Args:
         value: The value.
@@ -247,7 +249,7 @@ def _describe_wrong_number(value: Any, kind: Any, location: Location) -> str:
 
 
 def _quoted_key(problem: str, start: str) -> str | None:
-    """Returns the key that a message quotes after a certain start, or None for other messages.
+    """Returns the key that a message quotes after the words `start`, or None if there is none.
 
     For example, "Object missing required field `name`" quotes the key "name".
     """
@@ -283,7 +285,7 @@ def _split_message(message: str, table: Any, kind: Any) -> tuple[str, Location]:
         try:
             value = value[step]
         except (LookupError, TypeError):
-            # An unknown key of a hostile table may look like the end of a message.
+            # The name of an unknown key may be chosen to look like the end of a message.
             break
         location.append(step)
     return match["problem"], location
@@ -314,11 +316,11 @@ def _find_refused_key(message: str, table: Any, kind: Any, location: Location) -
 
 
 def _isolate(table: Any, location: Location, value: Any) -> Any:
-    """Returns a copy of a table with another value at a location, and without other tables.
+    """Returns a copy of a table with one value replaced, and without other tables.
 
-    The plain values beside the location are kept, because one of them may decide about
-    the type, as the key `law` does. Without the other tables, a long scenario of a stranger is
-    not compared again for each of its entries.
+    Values in the same table that are not tables are kept, because one of them may determine the
+    type, as the key `law` does. The other tables are left out, because comparing them again for
+    every entry of a long scenario would take too much time.
     """
     if not location:
         return value
@@ -331,7 +333,7 @@ def _isolate(table: Any, location: Location, value: Any) -> Any:
 
 
 def _value_at(table: Any, location: Location) -> Any:
-    """Returns the value at a place inside nested tables and lists."""
+    """Returns the value at a location inside nested tables and lists."""
     value = table
     for part in location:
         value = value[part]
@@ -339,10 +341,10 @@ def _value_at(table: Any, location: Location) -> Any:
 
 
 def _find_table_for_number(table: Any, kind: Any, location: Location) -> Location | None:
-    """Finds a table that stands where a number belongs, around a refused value.
+    """Finds a table around a refused value that was written in place of a number.
 
-    Such a table states a random distribution, or was meant to. The result is None if there is
-    no such table.
+    Such a table states, or was meant to state, a random distribution. The result is None if
+    there is no such table.
     """
     for length in range(1, len(location) + 1):
         start = location[:length]
@@ -353,7 +355,7 @@ def _find_table_for_number(table: Any, kind: Any, location: Location) -> Locatio
 
 
 def _list_hints(kind: Any, location: Location) -> list[Any]:
-    """Returns the types that a value may have at a given place of a scenario's table.
+    """Returns the types that a value may have at a location in a scenario's table.
 
     Args:
         kind: Type of the table.
@@ -367,7 +369,7 @@ def _list_hints(kind: Any, location: Location) -> list[Any]:
 
 
 def _list_alternatives(hint: Any) -> Iterator[Any]:
-    """Yields the members of a union of types, or a type that is no union."""
+    """Yields the members of a union of types, or the type itself if it is not a union."""
     base = _strip_annotation(hint)
     if get_origin(base) not in (Union, UnionType):
         yield hint
@@ -400,13 +402,13 @@ def _strip_annotation(hint: Any) -> Any:
 
 
 def _find_extra(kind: Any, location: Location, name: str) -> str | None:
-    """Returns what the annotation of a value states in `Meta.extra` under a name, or None."""
+    """Returns the entry of a value's annotation in `Meta.extra` under a name, or None."""
     extras = (find_extra(hint, name) for hint in _list_hints(kind, location))
     return next((extra for extra in extras if extra is not None), None)
 
 
 def _list_keys(hint: Any) -> tuple[str, ...]:
-    """Returns the keys that a table of a type may have; none if the type is no table."""
+    """Returns the keys that a table of a type may have. Empty if the type is not a table."""
     is_struct = isinstance(hint, type) and issubclass(hint, msgspec.Struct)
     return field_names(hint) if is_struct else ()
 

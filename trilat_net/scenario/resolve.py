@@ -15,8 +15,8 @@ Afterwards, `validate.build_scenario` converts the result to the type `Scenario`
 conditions that involve several tables.
 
 Invariant:
-    - A key is checked in the table in which its author wrote it. Therefore an author finds the
-      path in an error message in the file.
+    - A key is checked in the table in which its author wrote it. Therefore the author can find
+      the path of an error message in the file.
 """
 
 from collections.abc import Sequence
@@ -39,14 +39,14 @@ from .written_tables import WrittenChange, WrittenScenario
 
 
 def resolve_scenario(tables: TomlTable, folder: Path | None) -> TomlTable:
-    """Writes out every default of a scenario file, and every file that it names.
+    """Returns the tables of a scenario file with every default and every named file filled in.
 
     The result describes the experiment completely, without any other file.
 
     Args:
         tables: Tables of the scenario file, as its author wrote them.
-        folder: Folder in which the files are searched that the tables name. None refuses
-            tables that name a file.
+        folder: Folder of the files that the tables name. If None, tables that name a file are
+            refused.
 
     Returns:
         Tables with the keys of `Scenario`.
@@ -57,8 +57,8 @@ def resolve_scenario(tables: TomlTable, folder: Path | None) -> TomlTable:
     written = WrittenScenario.check(tables)
     files = NamedFiles.of_arms(tables, written.urdf, folder)
     draws = Draws(written.seed, written.drawn)
-    # The tables of sites are completed as they were written, and not as typed values: the order
-    # of their keys is the order of the random draws.
+    # The tables of sites are completed as they were written and not as typed values, because
+    # the order of their keys is the order of the random draws.
     sites = complete_site_tables(tables, written.rate_hz, draws, files)
     site_names = list(sites)
     expect = complete_expect(tables.get("expect", {}), sites, files.urdf_texts)
@@ -95,8 +95,8 @@ def resolve_dominance_row(written: Any, names: list[str], site: str, path: str) 
     0.
 
     Args:
-        written: Row as its author wrote it. A peer that it does not name has the factor 0. None
-            if there is no row.
+        written: Row as its author wrote it. A peer that is not named in the row has the factor
+            0. None if there is no row.
         names: Names of all sites of the scenario.
         site: Name of the site that follows.
         path: Path of the row, for error messages.
@@ -130,7 +130,7 @@ def _complete_timeline(
 
     A change affects a network link, or the weights with which an arm follows the others. An
     author may state only those settings of a link that change. In the result, each change
-    states all settings: the others have the values that the earlier changes left.
+    states all settings. The other settings keep their values from earlier changes.
 
     Args:
         written: Changes as their author wrote them.

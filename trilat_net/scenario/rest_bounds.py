@@ -3,7 +3,7 @@
 An arm must stop if, for example, the network fails. Its controller then damps each joint in
 proportion to its speed, within the limits of the torques (`core.resting`). From the model of
 the arm and these limits, this module computes bounds of the time and of the speeds. It also
-tells whether the motors are strong enough for the arm's gravity and Coriolis torques.
+determines whether the motors are strong enough for the arm's gravity and Coriolis torques.
 
 The formulas are derived in docs/theory/coming-to-rest.md, and the numbers of equations in
 comments refer to it.
@@ -53,8 +53,9 @@ class _RestBounds(NamedTuple):
     Attributes:
         rest_s: Time within which the arm is at rest, in s. Infinite if its motors cannot hold
             the arm against gravity.
-        bearable_share: Ratio of two speeds of the joints: the speed up to which the motors can
-            balance the Coriolis torques besides gravity, and the speed at the beginning.
+        bearable_share: Ratio of two speeds of the joints: the largest speed at which the motors
+            can balance both gravity and the Coriolis torques, divided by the speed at the
+            beginning.
         kinetic_j: Largest kinetic energy of the arm at the beginning, in J.
         blend_j: Largest energy that the motors add to the arm, in J, because their torques fade
             out gradually instead of stopping at once.
@@ -89,8 +90,8 @@ class _ArmSamples(NamedTuple):
 def find_rest_bounds(scenario: Scenario, site: str) -> _RestBounds:
     """Computes bounds of the time, energy and speeds with which an arm comes to rest.
 
-    A user needs them before a real arm moves: how long and how fast may it still move after a
-    stop?
+    Before a real arm moves, its user needs to know how long and how fast the arm may still move
+    after a stop.
 
     Args:
         scenario: Description of the experiment. The site must have the stale rule "glide",
@@ -261,7 +262,7 @@ def _sample_chain(model: ArmModel, q0: Array, speed: Array) -> _ArmSamples:
     def compute_torque(v: Array) -> Array:
         """Returns the torque that gravity and Coriolis forces require in a pose, in N m.
 
-        The pose is the one for which the chain was placed last.
+        The pose is that for which the chain was placed most recently.
 
         Args:
             v: Joint velocities, in rad/s, shape (n,). The joints do not accelerate.

@@ -62,8 +62,7 @@ def resolve_change(
     """Completes and checks a change that a user requests during a run.
 
     It changes a network link, or the weights with which one arm follows the others. A user may
-    state only the settings of a link that change; the others are taken from its present
-    settings.
+    state only the settings of a link that change. All others keep their present values.
 
     Args:
         scenario: Description of the experiment.
@@ -106,7 +105,7 @@ def resolve_change(
 def parse_core_change(scenario: Scenario, site: str, text: str) -> CoreChange:
     """Converts the text of a change in a log to the form that the compiled control loop reads.
 
-    The log may come from a stranger, so the change is checked completely.
+    The log may come from an untrusted source, so the change is checked completely.
 
     Args:
         scenario: Scenario of the run.
@@ -142,7 +141,7 @@ def parse_core_change(scenario: Scenario, site: str, text: str) -> CoreChange:
         )
 
     if is_order:
-        # called only for its check
+        # called only to check the change
         scenario.make_site_order(site, change.order, change.start_ns)
     check_change(change, "cmd")
     if change.dominance:

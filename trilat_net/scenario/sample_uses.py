@@ -1,4 +1,4 @@
-"""Computes which messages of the other arms a controller used and a user saw, without the run.
+"""Computes which messages of other arms a controller used and a user saw, without a run.
 
 In each control period, an arm sends its state to the other arms. These messages are delayed and
 lost at random, but the random numbers follow from a seed in the scenario, the description of
@@ -7,8 +7,8 @@ saw although the log does not contain it.
 
 Invariant:
     - The random numbers of a connection are the same as in a run.
-    - What a user sees depends only on the scenario, its seed and the number of the control
-      period.
+    - The picture that a user sees depends only on the scenario, its seed and the number of the
+      control period.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -40,15 +40,15 @@ class LinkSchedule:
 
     Every arm's process sends its state (a sample) once per control period. The arrival times
     follow from the delays and losses in the description of the experiment, and are computed by
-    the same function as during a run. Each model of delay applies to messages sent at its first
-    time or later.
+    the same function as during a run. Each delay model applies to messages that are sent at or
+    after its start time.
 
     Args:
         setup: Setup of the link, as the kernel reads it.
         changed_models: Models of delay and loss that the link gets by changes during the run.
 
     Attributes:
-        models: All models of the link, in the order of their first stamps.
+        models: All models of the link, in the order of their start times.
         row: State of the link: a row of the array that the kernel reads.
     """
 
@@ -62,7 +62,8 @@ class LinkSchedule:
                     points.append((int(t_us), int(delay_us)))
             models.append(model)
         models += changed_models
-        # The sort is stable: of two models with the same first stamp, the changed one applies.
+        # The sort is stable, so if two models have the same start time, the changed model
+        # applies.
         models.sort(key=lambda model: model.from_ns)
         self.models = np.array(models, LINK_MODEL_DTYPE)
         self._points = np.array([*points, *setup.outages], dtype=np.int64).reshape(-1, 2)
@@ -122,7 +123,7 @@ class LinkSchedule:
         samples = np.arange(int(self.row.scheduled) + 1, end)
         due_ns = self.draw(end)
         stamp_ns = samples * NS_PER_S // int(self.row.rate_hz)
-        # A sample never comes into use at the time of its own stamp.
+        # A sample never comes into use at its own sending time.
         ticks = first_ticks(np.maximum(due_ns, stamp_ns + 1), receiver_hz)
         is_delivered = due_ns != LOST
         return samples[is_delivered], ticks[is_delivered]
@@ -218,7 +219,7 @@ def count_silences(used: IntArray, receiver_hz: int, silence_ns: int) -> int:
     Args:
         used: Number of the sample in use in every tick. -1 before the first sample.
         receiver_hz: Tick rate of the site, in Hz.
-        silence_ns: Longest time without a new sample that does not count, in ns.
+        silence_ns: Longest time without a new sample that is not counted as a silence, in ns.
     """
     new_sample_ticks = np.flatnonzero(np.diff(used, prepend=-1) > 0)
     if not len(new_sample_ticks):
@@ -273,12 +274,12 @@ class PictureDelay:
         self._shown = dict.fromkeys(self._links, -1)
 
     def advance_to(self, tick: int, used: Mapping[str, int]) -> Mapping[str, int]:
-        """Returns which state of each other arm the user sees in one control period.
+        """Returns the state of each other arm that the user sees in one control period.
 
         The states are called samples, and the other arms peers.
 
         Args:
-            tick: The tick. It must not be before that of the previous call.
+            tick: The tick. It must not be earlier than the tick of the previous call.
             used: For each peer, the sample that the controller uses in this tick.
 
         Returns:
@@ -294,9 +295,9 @@ class PictureDelay:
         return {**used, **self._shown}
 
     def list_shown_samples(self, ticks: int) -> dict[str, IntArray]:
-        """Returns which state of each other arm the user sees in each control period of a run.
+        """Returns the states of the other arms that the user sees in all control periods.
 
-        The picture is delayed, so that it shows states of earlier periods.
+        The picture is delayed, so it shows states of earlier periods.
 
         Args:
             ticks: Number of control periods of the user's site, from the start of the run.
@@ -312,9 +313,9 @@ class PictureDelay:
         }
 
     def _draw_until(self, tick: int) -> Iterator[tuple[str, tuple[IntArray, IntArray]]]:
-        """Yields the states that each other arm sent, and from when on the user sees them.
+        """Yields the states that other arms sent, and the tick from which the user sees each.
 
-        The time is a control period (tick) of this arm.
+        A tick is a control period of this arm.
 
         Args:
             tick: Tick of the site.

@@ -72,7 +72,7 @@ def read_shipped(name: str) -> str:
     shipped_names = list_shipped()
     if name not in shipped_names and not (len(name) < _MAX_NAME_LENGTH and file.is_file()):
         hint = suggest_nearest(name, shipped_names)
-        # A question mark ends a sentence.
+        # A hint is a complete sentence, which ends in a question mark.
         separator = " The" if hint else "; the"
         raise ScenarioError(
             f"there is no scenario of that name{hint}{separator} shipped scenarios are "
@@ -162,7 +162,8 @@ def _change_scenario(
         changed = scenario
         if overrides:
             changed = parse_scenario(scenario.text, scenario.name, expanded)
-        # A person who names the class of a law, hand or plant in an override allows its code.
+        # A person who names the class of a law, hand or plant in an override permits its code
+        # to run.
         named_classes = re.findall(r"[\w.]+:\w+", repr(list(expanded.values())))
         return allow_own_code(changed, named_classes, scenario)
     except ScenarioError as error:
@@ -266,7 +267,7 @@ def _read_source(source: str | Path) -> tuple[str, Path]:
             in ".toml" or contains a slash or backslash.
 
     Returns:
-        The text, and the folder that contains the files that the scenario names.
+        The text, and the folder with the files that the scenario names.
 
     Raises:
         ScenarioError: The source cannot be read.
@@ -284,7 +285,9 @@ def _read_source(source: str | Path) -> tuple[str, Path]:
 
 
 _PARSE_LOCK = RLock()
-"""Held while a scenario is parsed: msgspec 0.22 crashes if two threads use a type at first.
+"""Held while a scenario is parsed.
+
+msgspec 0.22 crashes if two threads use a type for the first time at once.
 """
 
 
@@ -300,7 +303,8 @@ def parse_scenario(
         text: TOML text of a scenario file.
         source: Name of the text, for error messages.
         overrides: Changed keys, see `load_scenario`.
-        folder: Folder of the files that the text names. None refuses a text that names a file.
+        folder: Folder of the files that the text names. If None, a text that names a file is
+            refused.
 
     Raises:
         ScenarioError: The text is not a valid scenario. The error contains the path of the key.
@@ -332,8 +336,8 @@ def parse_scenario(
 def _parse_toml(text: str) -> bytes:
     """Returns the tables of a TOML text, pickled.
 
-    Runs of a study are made of the same text with other overrides. A copy of its tables takes
-    far less time than its parsing.
+    The runs of a study have the same text with different overrides. Copying the tables takes
+    far less time than parsing the text again.
 
     Raises:
         ScenarioError: The text is not TOML, or has a key of very many parts.
@@ -341,7 +345,7 @@ def _parse_toml(text: str) -> bytes:
     _refuse_long_keys(text)
     try:
         return pickle.dumps(tomllib.loads(text))
-    # TOMLDecodeError is a ValueError; a number of 5000 digits raises another one.
+    # TOMLDecodeError is a ValueError. A number of 5000 digits raises a plain ValueError.
     except ValueError as error:
         raise ScenarioError(f"is not TOML: {error}") from None
 
@@ -356,7 +360,7 @@ def _refuse_long_keys(text: str) -> None:
     """Refuses a text with a dotted key that has very many parts.
 
     The time that a TOML parser needs grows faster than the square of the number of parts, so a
-    short text of a stranger could block the program.
+    short text from an untrusted source could block the program.
 
     Raises:
         ScenarioError: There is such a key. The error contains the number of its line.

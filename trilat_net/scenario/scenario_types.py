@@ -65,8 +65,8 @@ _ABSENT_VALUES: dict[str, tuple[Any, ...]] = {
 }
 """Values that mean the same as a missing key, for keys that were added in later versions.
 
-They are left out of the canonical text. Otherwise the text of an older scenario, and with it
-the hash, would change.
+They are left out of the canonical text. Otherwise the text of an older scenario, and thereby
+its hash, would change.
 """
 _POSE_NUMBERS = 7
 """Number of values of the pose of a body: three for the position, four for the quaternion."""
@@ -99,7 +99,7 @@ def _drop_absent_values(table: dict[str, Any]) -> None:
 
 
 def _join_number_list(match: re.Match[str]) -> str:
-    """Returns a list of numbers that TOML text spreads over several lines as one line."""
+    """Returns a list of numbers, which TOML text spreads over several lines, on one line."""
     return " ".join(match[0].split()).replace("[ ", "[").replace(", ]", "]")
 
 
@@ -194,8 +194,8 @@ class Scenario(Frozen, frozen=True, dict=True):
         """Matrix of the weights with which the arms follow each other, shape (N, N), Eq. (6).
 
         The entry of row i and column j states how much arm i follows arm j at the start of the
-        run; it is called a dominance factor. An arm without an entry for another one does not
-        follow it.
+        run; it is called a dominance factor. An arm with the factor 0 for another arm does not
+        follow that arm.
         """
         return np.array(
             [[self.dominance[i].get(j, 0.0) for j in self.names] for i in self.names]
@@ -232,9 +232,9 @@ class Scenario(Frozen, frozen=True, dict=True):
 
         N is the number of sites, the processes of the arms. The dominance matrix alpha contains
         the weights with which the sites follow each other. The weights beta are positive, have
-        the sum 1 and satisfy beta' alpha = beta', where the prime denotes the transpose. None
-        if a site follows another site neither directly nor through other sites, because beta is
-        not unique then.
+        the sum 1 and satisfy beta' alpha = beta', where the prime denotes the transpose. The
+        value is None if a site follows some other site neither directly nor through other
+        sites, because beta is not unique then.
         """
         if not dominance.is_irreducible(self.alpha):
             return None
@@ -259,7 +259,7 @@ class Scenario(Frozen, frozen=True, dict=True):
             _drop_absent_values(site["control"])
             _drop_absent_values(site["limits"])
 
-        # Texts for people have several lines. The tables with numbers do not.
+        # Texts for people may have several lines. Lists of numbers are written on one line.
         urdf_texts = tables.pop("urdf", None)
         description_text = tomli_w.dumps(descriptions, multiline_strings=True)
         number_text = _NUMBER_LIST.sub(_join_number_list, tomli_w.dumps(tables))
@@ -280,17 +280,17 @@ class Scenario(Frozen, frozen=True, dict=True):
     def assign_colours(self, colours: int) -> list[int]:
         """Chooses a colour for each arm, for figures.
 
-        The slave, the arm that works at the environment, gets a fixed colour, so that it looks
-        the same in all figures. This colour is reserved until a slave has been met. The other
-        arms get the first free colours.
+        The slave, the arm that touches the environment, gets a fixed colour, so that it looks
+        the same in all figures. No other arm gets this colour before the slave. The other arms
+        get the first free colours.
 
         Args:
             colours: Number of colours of the palette.
 
         Returns:
-            A permutation of the colours. The first entries belong to the sites in their order;
-            the others are not used. If there are more sites than colours, the caller starts
-            again from the first entry.
+            A permutation of the colours. The first entries belong to the sites in their order,
+            and further entries are not used. If there are more sites than colours, the caller
+            repeats the entries from the first one.
         """
         free = list(range(colours))
         assigned = []
@@ -340,7 +340,7 @@ class Scenario(Frozen, frozen=True, dict=True):
         """
         if name not in self.sites:
             hint = suggest_nearest(name, self.names)
-            # A question mark ends a sentence.
+            # A hint is a complete sentence, which ends in a question mark.
             listing = " The sites are " if hint else "; the sites are "
             raise ScenarioError(
                 f"there is no site {name!r}{hint}" + listing + ", ".join(self.names),
@@ -373,7 +373,7 @@ class Scenario(Frozen, frozen=True, dict=True):
 
     @property
     def random(self) -> bool:
-        """True if any number of the experiment is random: another seed gives another run.
+        """True if any number of the experiment is random, so that the seed changes the run.
 
         The numbers may be drawn when the scenario is loaded, or during the run.
         """
@@ -383,8 +383,8 @@ class Scenario(Frozen, frozen=True, dict=True):
     def links_random(self) -> bool:
         """True if a link draws its delays, losses or duplicates at random during the run.
 
-        This includes links that do so only after a planned change. Results then depend on the
-        seed, and one run is only an example.
+        A link also counts if it has such draws only after a planned change. Results then depend
+        on the seed, and one run is only an example.
         """
         return any(link.random for link in self._all_links())
 
@@ -406,10 +406,10 @@ class Scenario(Frozen, frozen=True, dict=True):
 
     @property
     def slave(self) -> str:
-        """Name of the slave, the arm that works at the environment.
+        """Name of the slave, the arm that touches the environment.
 
-        If several arms have the role "slave", it is the first of them. If none has, it is the
-        last arm of the experiment.
+        If several arms have the role "slave", it is the first of them. If no arm has this role,
+        it is the last arm of the experiment.
         """
         slaves = [name for name, spec in self.sites.items() if spec.role == "slave"]
         return slaves[0] if slaves else self.names[-1]
@@ -485,7 +485,7 @@ class Scenario(Frozen, frozen=True, dict=True):
         """Names of the sites whose arms any member of the session may move.
 
         A member is a process that takes part in the session, such as a page or a bridge. The
-        arm of a user's program is not open: that program alone moves it.
+        arm of a user's program is not open, because only that program moves the arm.
         """
         return tuple(
             name
@@ -514,7 +514,7 @@ class Scenario(Frozen, frozen=True, dict=True):
         return zlib.crc32(f"{self.seed}/{site}".encode())
 
     def channel(self, site: str) -> LawChannel:
-        """Returns which numbers the control law of an arm sends to the others, in their order.
+        """Returns the vectors that the control law of an arm sends to others, in their order.
 
         Most laws send nothing but the state of the arm. A law that sends waves, for example,
         has a vector for them.
@@ -560,8 +560,8 @@ class Scenario(Frozen, frozen=True, dict=True):
         """Returns all settings from which the compiled control loop of a site is built.
 
         A site is the process that runs one arm. The result contains its arm, control law,
-        network connections and limits. It is kept, because the check of a scenario needs it
-        before the run does.
+        network connections and limits. The result is cached, because both the check of a
+        scenario and the run need it.
 
         Args:
             site: Name of the site.
@@ -572,11 +572,11 @@ class Scenario(Frozen, frozen=True, dict=True):
 
     @cached_property
     def _setups(self) -> dict[str, SiteSetup]:
-        """The results of `setup` so far, by the name of the site."""
+        """The results of earlier calls of `setup`, by the name of the site."""
         return {}
 
     def _build_setup(self, site: str) -> SiteSetup:
-        """Builds the result of `setup`.
+        """Builds the settings that `setup` returns and caches.
 
         Args:
             site: Name of the site.
@@ -663,9 +663,9 @@ class Scenario(Frozen, frozen=True, dict=True):
     def _rest_gains(self, site: str) -> RestGains:
         """Returns the gains of the controller that brings an arm to rest.
 
-        It acts, for example, when another arm has fallen silent. The gains depend on the
-        inertia of the arm, its largest torque, the control period, and the damping of the
-        control law.
+        This controller acts, for example, when another arm has fallen silent. The gains depend
+        on the inertia of the arm, its largest torque, the control period, and the damping of
+        the control law.
         """
         spec = self.sites[site]
         arm = self.arms[site]
@@ -681,7 +681,7 @@ class Scenario(Frozen, frozen=True, dict=True):
         )
 
     def _link_setup(self, peer: str, site: str) -> LinkSetup:
-        """Returns the network link between two arms as the compiled simulation reads it.
+        """Returns the network link between two arms in the format of the compiled simulation.
 
         It includes the planned changes of the link.
 
@@ -718,7 +718,7 @@ class Scenario(Frozen, frozen=True, dict=True):
         )
 
     def _followed_sites(self, index: int) -> int:
-        """Returns which arms an arm follows, as an integer with bit n set for arm n.
+        """Returns the arms that an arm follows, as an integer with bit n set for arm n.
 
         For example, 0b101 stands for the first and the third arm. The compiled code needs this
         compact form.

@@ -56,7 +56,7 @@ class SimulatedArm:
         self._gravity = np.array(model.chain.gravity_m_s2)
 
     def accelerate(self, torque: ArrayLike) -> Array:
-        """Computes the joint accelerations that a torque would cause; the arm does not move.
+        """Computes the joint accelerations that a torque would cause, without moving the arm.
 
         Args:
             torque: Torque that acts ON the joints, in N m, shape (n,).

@@ -33,11 +33,11 @@ class OnStale(Frozen, frozen=True, omit_defaults=True):
     Every arm's process (site) sends its state, a sample, in each period of its control loop.
 
     Attributes:
-        action: What the site does. "use": It goes on with the old sample. "hold": It keeps its
-            last reference. "brake": It keeps the position where its arm is. "glide": At the
-            start, it waits for all peers. If no sample of a peer has come into use for
-            `silence_ms`, its reference decelerates to rest. Later it aligns with its peers
-            without a jump.
+        action: What the site does. "use": The site continues with the old sample. "hold": The
+            site keeps its last reference. "brake": The site holds the present position of its
+            arm. "glide": At the start, the site waits for all peers. If no sample of a peer has
+            come into use for `silence_ms`, its reference decelerates to rest. Later it aligns
+            with its peers without a jump.
         age_ms: Age of a sample beyond which it is too old, in ms. Not used by "glide".
         return_s: Duration of the return to the reference after a fresh sample has come into
             use, in s. Not used by "glide".
@@ -48,8 +48,8 @@ class OnStale(Frozen, frozen=True, omit_defaults=True):
         align_limit_rad: For "glide": longest path that the site moves by itself, in rad, or in
             m if the sites share a position.
         on_lost: For "glide": reaction to a silent peer. "hold": The site waits for the peer.
-            "degrade": It goes on without a silent master, as long as the remaining sites all
-            reach each other.
+            "degrade": The site continues without a silent master, as long as the remaining
+            sites all reach each other.
     """
 
     action: Literal["use", "hold", "brake", "glide"] = "use"
@@ -115,10 +115,11 @@ class Limits(Frozen, frozen=True):
         tau_limit_nm: Largest control torque of a joint, in N m. A larger torque is cut off. By
             default, the efforts in the URDF file of a chain.
         qd_limit_rad_s: Joint speed beyond which a run counts as diverged and ends, in rad/s.
-            Under the stale rule "glide", only the site stops with a fault, and the run goes on.
-            By default, the speeds in the URDF file of a chain.
+            Under the stale rule "glide", only the site stops with a fault, and the run
+            continues. By default, the speeds in the URDF file of a chain.
         tau_rate_limit_nm_s: Largest rate of change of a joint's control torque, in N m/s. By
-            default there is no limit, but `GLIDE_TAU_RATE_NM_S` under the stale rule "glide".
+            default, there is no limit, except under the stale rule "glide", where it is
+            `GLIDE_TAU_RATE_NM_S`.
         qd_des_limit_rad_s: Largest speed of the reference, in rad/s, or in m/s if the sites
             share a position.
         q_min_rad: Smallest angle of a joint, in rad. Beyond it, the site stops with a fault.
@@ -137,7 +138,7 @@ class Limits(Frozen, frozen=True):
     def motion(self) -> MotionLimits:
         """Limits of angles, reference speed and torque rate, as the control loop reads them.
 
-        A limit that the author left out is infinite, so that the loop needs no special case.
+        A limit that the author left out is infinite, so the loop needs no special case.
         """
         return MotionLimits(
             q_min=-math.inf if self.q_min_rad is None else self.q_min_rad,

@@ -38,14 +38,14 @@ _BELONGS_TO_CHAIN = "belongs to an arm with a urdf, but this arm is planar"
 
 
 class _SharedByAll(NamedTuple):
-    """Tables and files of a scenario that concern all its arms, while each arm is completed.
+    """Tables and files that concern all arms, for completing the table of each arm.
 
     Attributes:
         rate_hz: Tick rate of the sites that state no other, in Hz.
         control: Table `control` for all sites, as its author wrote it.
         draws: Draws the numbers that are given as distributions.
         files: Files that the sites name.
-        chains: Whether the arms are modelled as general chains of joints.
+        chains: True if the arms are modelled as general chains of joints.
     """
 
     rate_hz: int
@@ -77,7 +77,8 @@ def complete_site_tables(
     sites = {name: _join_groups(site, tables) for name, site in tables["sites"].items()}
 
     # The kernel computes planar arms with their own formulas, and all other arms as chains. If
-    # one arm is a chain, all arms are: every run uses the same functions for all its sites.
+    # one arm is a chain, all arms are modelled as chains, because every run uses the same
+    # functions for all its sites.
     chains = False
     for site in sites.values():
         shares_pose = site["task"].get("space", "joints") != "joints"
@@ -106,7 +107,8 @@ def _join_groups(written: TomlTable, tables: TomlTable) -> TomlTable:
         common = tables.get(group, {})
         local = written.get(group, {})
         if "urdf" in local:
-            # An arm with its own file inherits nothing: the keys for all arms mean another arm.
+            # An arm with its own file inherits nothing, because the keys for all arms describe
+            # another arm.
             common = {}
         joined = {**common, **local}
         if "links" in common and "links" in local:
@@ -186,7 +188,8 @@ def _complete_arm(
             raise ScenarioError(
                 f"is empty: give at least one of {keys}", path=f"{path}.links.{name}"
             )
-    # The tables of links are drawn one by one, as `Draws` looks into no inner table.
+    # The numbers in the tables of links are drawn table by table, because
+    # `Draws.draw_numbers` leaves out inner tables.
     drawn_links = {
         name: shared.draws.draw_numbers(link, f"{path}.links.{name}")
         for name, link in links.items()
@@ -249,8 +252,8 @@ def _check_arm_keys(arm: Arm, table: TomlTable, chains: bool, path: str) -> None
 
     Args:
         arm: The arm.
-        table: Table from which the arm was built. It shows which keys the author wrote.
-        chains: Whether the arms of the scenario are general chains of joints.
+        table: Table from which the arm was built. The table shows which keys the author wrote.
+        chains: True if the arms of the scenario are general chains of joints.
         path: Path of the table, for error messages.
     """
     foreign_keys = ArmLinks._fields if arm.urdf else CHAIN_KEYS
@@ -274,10 +277,9 @@ def _check_arm_keys(arm: Arm, table: TomlTable, chains: bool, path: str) -> None
 def _list_default_limits(site: TomlTable, model: ArmModel) -> TomlTable:
     """Returns the limits of an arm that apply if its author states none.
 
-    The efforts and speeds of a chain's joints come from its URDF file. A joint for which the
-    file states no positive finite limit has the default of `Limits`. A simulated arm that comes
-    to rest while others are silent (rule "glide") also has a limit on the torque's rate of
-    change.
+    The efforts and speeds of a chain's joints come from its URDF file. A joint without a
+    positive finite limit in the file has the default of `Limits`. A simulated arm that comes to
+    rest while others are silent (rule "glide") also has a limit on the torque's rate of change.
     """
     limits: TomlTable = {}
     if site["on_stale"].get("action") == "glide" and site.get("plant") != "external":

@@ -4,8 +4,8 @@
 user then edits code that works instead of starting from an empty file.
 
 Invariant:
-    - The skeletons are files of this package, such as `scenarios/_law.txt`. The class gets its
-      name from the file: mylaw.py contains the class MyLaw.
+    - The skeletons are files of this package, such as `scenarios/_law.txt`. The name of the
+      class is derived from the file name: mylaw.py contains the class MyLaw.
     - The written code runs unchanged, and its test passes.
 """
 
@@ -20,7 +20,7 @@ from .named_files import SHIPPED_FOLDER
 
 
 def new_law(path: str | Path, *, force: bool = False) -> list[Path]:
-    """Writes a file with an incomplete control law to start from, and a file with its test.
+    """Writes a template of a control law, and a test of the law.
 
     The corresponding command is `trilat new law`.
 
@@ -29,7 +29,7 @@ def new_law(path: str | Path, *, force: bool = False) -> list[Path]:
 
     Args:
         path: File to write, which is a Python module. mylaw.py contains the class MyLaw.
-        force: If True, existing files of these names are replaced.
+        force: If True, existing files with these names are replaced.
 
     Returns:
         The written files.
@@ -41,7 +41,7 @@ def new_law(path: str | Path, *, force: bool = False) -> list[Path]:
 
 
 def new_hand(path: str | Path, *, force: bool = False) -> list[Path]:
-    """Writes a file with an incomplete operator to start from, and a file with its test.
+    """Writes a template of an operator, and a test of the operator.
 
     An operator is a program that moves an arm in place of a person. The corresponding command
     is `trilat new hand`. The arguments are those of `new_law`.
@@ -53,7 +53,7 @@ def new_hand(path: str | Path, *, force: bool = False) -> list[Path]:
 
 
 def new_plant(path: str | Path, *, force: bool = False) -> list[Path]:
-    """Writes a file with an incomplete plant to start from, and a file with its test.
+    """Writes a template of a plant, and a test of the plant.
 
     A plant is a program that computes the motion of an arm. The corresponding command is
     `trilat new plant`. The arguments are those of `new_law`.
@@ -65,7 +65,7 @@ def new_plant(path: str | Path, *, force: bool = False) -> list[Path]:
 
 
 def _write_skeleton(kind: str, file: Path, *, force: bool) -> list[Path]:
-    """Writes a Python file with an incomplete class to start from, and one with its test.
+    """Writes a Python file with a template of a class, and a file with its test.
 
     Args:
         kind: "law", "hand" or "plant".
@@ -117,7 +117,7 @@ def name_skeleton_class(module: str, kind: str) -> str:
 
     Args:
         module: Name of the Python module that contains the skeleton.
-        kind: What the class is: "law" (a control law), "hand" (an operator) or "plant".
+        kind: Kind of the class: "law" (a control law), "hand" (an operator) or "plant".
     """
     parts = re.sub(rf"(?<=[a-z0-9]){kind}$", f"_{kind}", module).split("_")
     return "".join(part[:1].upper() + part[1:] for part in parts) or kind.title()

@@ -12,8 +12,9 @@ Invariant:
     - Everything that is attached to a moving link is part of its body. A link that does not
       lead to the tip never makes an arm unusable. If its inertia is impossible, a note says how
       the link was treated.
-    - A link on the way to the tip with an impossible inertia is refused with its name, unless
-      the caller permits to balance inertias or states another inertia for the link.
+    - If a link on the way to the tip has an impossible inertia, the arm is refused and the link
+      is named, unless the caller permits the balancing of inertias or states another inertia
+      for the link.
     - The text is not trusted: no file that it names is opened, and no entity is expanded.
     - The numbers of an arm have the same bits on every machine. Therefore
       `core.elementary.sincos` computes sines and cosines, and sums have a fixed order.
@@ -37,8 +38,8 @@ from .link_inertia import LinkInertia, balance_tensor, fill_tensor
 MAX_CHARACTERS = 1_000_000
 """Largest length of a file, in characters."""
 MAX_NUMBER_LENGTH = 100
-"""Largest length of the text of a number. The regular expression needs a time that grows with
-the square of the length if the text is not a number.
+"""Largest length of the text of a number. If the text is not a number, the time that the
+regular expression takes grows with the square of the length.
 """
 MAX_OFFSET_M = 100.0
 """Largest coordinate of an origin, in m. A file with larger ones is wrong, or in millimetres.
@@ -71,7 +72,7 @@ _NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?", re.ASCII)
 _MOVING_KINDS = ("revolute", "continuous", "prismatic")
 _KINDS = (*_MOVING_KINDS, "fixed", "floating", "planar")
 _plain_sincos = getattr(sincos, "py_func", sincos)
-"""The function `sincos` as plain Python. Its compilation would take longer than the reading."""
+"""The function `sincos` as plain Python. Compiling it takes longer than reading a file."""
 
 
 class UrdfPayload(NamedTuple):
@@ -159,7 +160,7 @@ class _Pose(NamedTuple):
         """Returns the product of two poses, which places one frame inside another.
 
         The pose `inner` is expressed in the frame of this pose. The result is the same frame,
-        expressed where this pose is expressed.
+        expressed in the frame in which this pose is expressed.
         """
         x, y, z = apply(self.rotation, inner.origin_m)
         ox, oy, oz = self.origin_m
@@ -175,7 +176,7 @@ class _Edge(NamedTuple):
         name: Name of the joint.
         kind: Type of the joint in URDF, for example "revolute" or "fixed".
         parent: Name of the link that carries the joint.
-        child: Name of the link that hangs on the joint.
+        child: Name of the link that the joint connects to the parent.
         element: XML element of the joint.
     """
 
@@ -359,7 +360,7 @@ def _joint(name: str) -> str:
 
 
 def _list_names(names: Sequence[str]) -> str:
-    """Returns a short text with the first names of a list, and how many others there are."""
+    """Returns a short text with the first names of a list, and the number of further names."""
     text = ", ".join(map(_quote, names[:_MAX_LISTED_NAMES]))
     more = len(names) - _MAX_LISTED_NAMES
     return f"{text} and {more} more" if more > 0 else text
@@ -369,9 +370,9 @@ def _list_names(names: Sequence[str]) -> str:
 
 
 def _parse_xml(text: str) -> Element:
-    """Parses the XML text of a URDF file, which may come from a stranger.
+    """Parses the XML text of a URDF file, which may come from an untrusted source.
 
-    Constructs with which a short text could fill the memory are refused.
+    Constructs by which a short text could fill the memory are refused.
 
     Args:
         text: The document.
@@ -450,8 +451,8 @@ def _read_tree(root: Element) -> _Robot:
         root: Root element of the document.
 
     Raises:
-        ScenarioError: The links and joints do not form trees: a link hangs on two joints, or on
-            itself.
+        ScenarioError: The links and joints do not form trees, because a link has two parent
+            joints or is its own ancestor.
     """
     links = _name_elements(root, "link")
     above: dict[str, _Edge] = {}
@@ -514,7 +515,7 @@ def _read_edge(name: str, element: Element, links: Mapping[str, Element]) -> _Ed
 
 
 def _walk(robot: _Robot, root: str) -> Iterator[tuple[str, bool]]:
-    """Yields a link of a robot and all links that hang on it, directly or through others.
+    """Yields a link of a robot and all of its descendants in the tree of links.
 
     The order is depth first.
 
@@ -535,7 +536,7 @@ def _walk(robot: _Robot, root: str) -> Iterator[tuple[str, bool]]:
 
 
 def _check_end(robot: _Robot, end: str, link: str) -> str:
-    """Checks that the link which was chosen as the base or the tip of an arm exists.
+    """Checks that the link that was chosen as the base or the tip of an arm exists.
 
     Args:
         robot: The robot.
@@ -551,7 +552,7 @@ def _check_end(robot: _Robot, end: str, link: str) -> str:
 
 
 def _find_base(robot: _Robot) -> str:
-    """Returns the only link of a robot that hangs on no joint: the base of its tree.
+    """Returns the only link of a robot that has no parent joint: the base of its tree.
 
     Raises:
         ScenarioError: There are several such links.
@@ -708,7 +709,8 @@ def _read_bodies(
             advice = _advise_key(name, "inertia_kg_m2")
             _refuse(_link(name), f"its <inertial> has no <inertia>; {advice}")
 
-        # The other links do not lead to the tip, or have what the scenario states.
+        # The other links do not lead to the tip, or the scenario states their missing
+        # quantities.
         if problem:
             notes.append(
                 f"{_link(name)} does not lead to the end link and is left out: {problem}"
@@ -1060,7 +1062,7 @@ class _Inertial(NamedTuple):
 
 _TENSOR_KEYS = ("ixx", "ixy", "iyy", "ixz", "iyz", "izz")
 _POINT_TENSOR = fill_tensor((0.0,) * 6)
-"""Inertia of a point of mass about itself."""
+"""Inertia of a point mass about its own position."""
 
 
 def _read_inertial(link: Element, name: str, supplied: LinkInertia | None) -> _Inertial | None:
@@ -1146,7 +1148,7 @@ def _read_stated_inertial(
 
 
 def _find_mass_problem(inertial: _Inertial) -> str:
-    """Returns why no real body can have the mass of a link, or "" if it is possible."""
+    """Returns why no real body can have the mass of a link, or "" if the mass is possible."""
     if inertial.lacks == "mass":
         return "its <inertial> has no <mass>"
     if inertial.mass < 0.0:
@@ -1251,8 +1253,8 @@ def _move_body(mass: float, centre: _Pose, tensor: Matrix, pose: _Pose) -> BodyP
 def _lump_bodies(edge: _Edge, bodies: Sequence[_LinkBody], notes: list[str]) -> BodyParameters:
     """Adds up the masses and inertias of all links that one joint moves together.
 
-    Links on side branches may have impossible moments of inertia. They count as stated if the
-    sum is a possible body all the same, otherwise as points of mass.
+    Links on side branches may have impossible moments of inertia. Their stated moments are used
+    if the sum is nevertheless a possible body. Otherwise these links count as point masses.
 
     Args:
         edge: The joint.
@@ -1307,7 +1309,7 @@ def _find_sum_problem(total: BodyParameters) -> str:
             "needs mass"
         )
     x, y, z = (moment / mass for moment in total[1:4])
-    # A body of negative mass moves the tensor back to the centre of mass.
+    # Shifting the tensor with a negative mass expresses it about the centre of mass.
     about_centre = _move_body(
         -mass, _Pose(_IDENTITY, (x, y, z)), fill_tensor(total[4:]), _Pose()
     )

@@ -9,9 +9,9 @@ real robots.
 
 Invariant:
     - An error contains the path of the key in the scenario file.
-    - Some control laws need something that not every scenario provides, such as knowledge of
-      the arm, or exactly two sites. If it is missing, the scenario is refused before anything
-      runs, with the reason.
+    - Some control laws have requirements that not every scenario satisfies, such as a known arm
+      or exactly two sites. If a requirement is not satisfied, the scenario is refused with the
+      reason before anything runs.
 """
 
 import math
@@ -59,8 +59,8 @@ _ASSUMED_LIMITS = {
 }
 """Limits that a scenario always has, because a simulated arm has defaults for them.
 
-For each key: the attribute of the arm with the limits of its URDF file, their attribute in the
-element `<limit>` of that file, and an example.
+The entry of a key consists of the arm's attribute with the limits of its URDF file, the
+attribute of the element `<limit>` in that file, and an example.
 """
 
 
@@ -68,8 +68,8 @@ def _refuse_assumed_limit(scenario: Scenario, name: str, key: str) -> None:
     """Refuses a limit of a real robot that neither the author nor the URDF file stated.
 
     A complete scenario contains the defaults as if its author had written them. A limit counts
-    as assumed if it equals the default, a single number for the planar arm, or in a list of the
-    URDF file's limits at a joint for which the file states none.
+    as assumed if it equals the default. For the planar arm, the default is a single number. For
+    a chain, it occurs in the list of limits at joints for which the URDF file states no limit.
 
     Args:
         scenario: Description of the experiment.
@@ -93,8 +93,8 @@ def _refuse_assumed_limit(scenario: Scenario, name: str, key: str) -> None:
         return
     alternative = f", or as <limit {file_attribute}=...> in its URDF file"
     raise ScenarioError(
-        f"is missing: {default:g} is the default of simulated arms, and nobody has stated it "
-        f"of this external arm: write its own limit, as in {example}"
+        f"is missing: {default:g} is the default of simulated arms, but an external arm "
+        f"needs a limit of its own: write one, as in {example}"
         f"{alternative if arm.chain is not None else ''}",
         path=f"sites.{name}.limits.{key}",
         source=scenario.name,
@@ -102,12 +102,11 @@ def _refuse_assumed_limit(scenario: Scenario, name: str, key: str) -> None:
 
 
 def check_outside_arms(scenario: Scenario) -> None:
-    """Refuses real robots that lack limits, or that a jump of the reference could move.
+    """Refuses real robots that lack limits, or whose reference could jump.
 
-    The reference is the position that an arm follows. It could jump when another arm falls
-    silent or is heard again, except under the rule "glide". The check is made before a session
-    and not for every scenario, because the scenarios in logs of earlier versions may lack these
-    keys.
+    The reference is the position that an arm follows. It could jump when messages of another
+    arm stop arriving or arrive again, except under the rule "glide". The check is made only
+    before a session, because the scenarios in logs of earlier versions may lack these keys.
 
     Args:
         scenario: Description of the experiment.
@@ -121,10 +120,9 @@ def check_outside_arms(scenario: Scenario) -> None:
         for key in OUTSIDE_LIMITS:
             if getattr(site.limits, key) is None:
                 raise ScenarioError(
-                    "is missing: an external arm needs limits of its position "
-                    "(q_min_rad, q_max_rad), its reference (qd_des_limit_rad_s) and the rate "
-                    "of its torque (tau_rate_limit_nm_s), besides tau_limit_nm and "
-                    "qd_limit_rad_s",
+                    "is missing: an external arm needs limits on its position (q_min_rad, "
+                    "q_max_rad), its reference speed (qd_des_limit_rad_s) and its torque rate "
+                    "(tau_rate_limit_nm_s), in addition to tau_limit_nm and qd_limit_rad_s",
                     path=f"sites.{name}.limits.{key}",
                     source=scenario.name,
                 )
@@ -274,7 +272,7 @@ def build_scenario(resolved: TomlTable) -> Scenario:
 
 
 def _normalise_change(change: Change) -> Change:
-    """Returns a change with its link written in the same form as the links of the scenario.
+    """Returns a change with its link written in the same format as the links of the scenario.
 
     Authors may write 350 or 350.0. Both must give the same text, so that both are the same
     experiment with the same hash.
@@ -384,10 +382,10 @@ def _check_damping(scenario: Scenario) -> None:
 
 
 def _check_received(scenario: Scenario) -> None:
-    """Refuses vectors that an arm receives from several laws under one name, unequally long.
+    """Refuses vectors of unequal length that an arm receives from several laws under one name.
 
     A control law may send additional vectors to the other arms, each with a name. A receiver
-    stores those of one name in one array, so their lengths must agree.
+    stores vectors of the same name in one array, so their lengths must agree.
     """
     for site in scenario.names:
         first_senders: dict[str, tuple[str, int]] = {}
@@ -564,7 +562,7 @@ def _check_task_pose(scenario: Scenario, name: str) -> None:
 
     directions, singular_values, _ = np.linalg.svd(J)
     if singular_values[-1] < RANK_TOLERANCE * singular_values[0]:
-        # The last left singular vector is the direction that the end effector cannot move in.
+        # The last left singular vector is the direction in which the end effector cannot move.
         lost_direction = " + ".join(
             f"{component:.2g} {axis}"
             for component, axis in zip(directions[:, -1], followed, strict=True)
@@ -604,7 +602,7 @@ def find_row_problem(row: Array, site: int) -> str | None:
 def _check_actors(
     actors: Sequence[operators.Operator | operators.Environment], path: str
 ) -> None:
-    """Refuses persons (operators) or environments such as walls whose settings contradict.
+    """Refuses operators, or environments such as walls, whose settings contradict each other.
 
     Args:
         actors: The operators or bodies of one site.
@@ -617,7 +615,7 @@ def _check_actors(
 
 
 def _check_hands(site: SiteSpec, path: str) -> None:
-    """Refuses persons and programs who cannot move an arm as the experiment states.
+    """Refuses operators who cannot move an arm in the way that the experiment states.
 
     An arm has at most one live operator: a person, or a program in the session, who moves the
     arm during the run. The program must simulate this arm. A user's program acts in every n-th
@@ -651,7 +649,7 @@ def _check_hands(site: SiteSpec, path: str) -> None:
 
 
 def check_links_memory(scenario: Scenario, site: str) -> None:
-    """Refuses network links on which more messages would wait than memory permits.
+    """Refuses network links on which too many messages would wait for the memory.
 
     A message waits at the receiver until its simulated delay has passed. The memory grows with
     the delay, the rate of the control loop and the number of arms. `MAX_LINKS_BYTES` is the
@@ -715,10 +713,10 @@ def _check_stale_rules(scenario: Scenario) -> None:
 
 
 def _check_lost(scenario: Scenario) -> None:
-    """Refuses the rule "degrade" if no site can go on without any of the masters.
+    """Refuses the rule "degrade" if no site can continue without one of the masters.
 
-    Under this rule, a site goes on without a master (an arm that leads) that has become silent.
-    It then needs another site that it follows.
+    Under this rule, a site continues without a master (an arm that leads) that has become
+    silent. It then needs another site that it follows.
 
     Args:
         scenario: Description of the experiment.
@@ -742,7 +740,7 @@ def _check_lost(scenario: Scenario) -> None:
 
 
 def _can_lose_master(scenario: Scenario, name: str) -> bool:
-    """Returns True if an arm can go on after some master that it follows has fallen silent.
+    """Returns True if an arm can continue after some master that it follows has fallen silent.
 
     A master is an arm that a person moves. The arm must follow another arm as well. The
     remaining arms must all follow each other, directly or through others (irreducible matrix of

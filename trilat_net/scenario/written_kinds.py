@@ -22,7 +22,7 @@ from .key_checks import StructType, find_extra, list_fields
 def written_kind(
     kind: StructType, *other_keys: str, takes_distributions: bool = True
 ) -> StructType:
-    """Returns the type of a table as its author may write it, from that of the complete one.
+    """Derives the type of a table that an author may write from the type of the complete table.
 
     Every key may be left out. A single number may stand for a vector with one number per joint,
     axis or parameter.
@@ -30,13 +30,13 @@ def written_kind(
     Args:
         kind: Type of the complete table, for example `Limits`.
         other_keys: Keys that an author may write in addition. Their values are texts.
-        takes_distributions: Whether a random distribution may stand for each number.
+        takes_distributions: True if a random distribution may take the place of each number.
     """
     fields: list[tuple[str, Any, Any]] = [(key, str, UNSET) for key in other_keys]
     for field in list_fields(kind):
         hint = written_type(field.type, takes_distributions)
         if field.default == ():
-            # An empty vector as default means that a written vector must be complete.
+            # If the default is an empty vector, a written vector must be complete.
             hint = _list_type(field.type, takes_distributions)
         fields.append((field.name, hint, UNSET))
     return msgspec.defstruct(f"Written{kind.__name__}", fields, bases=(Frozen,), frozen=True)
@@ -45,14 +45,14 @@ def written_kind(
 def written_type(hint: Any, takes_distributions: bool) -> Any:
     """Returns the type that an author may write for a key, from the type of its complete value.
 
-    For example, a single number may stand for a vector with a number per joint.
+    For example, a single number may take the place of a vector with a number per joint.
 
-    For example, a number may be a number or a distribution, and a vector with one entry per
-    joint may be a number, a distribution, or a list of both.
+    In place of a number, an author may write a distribution. In place of a vector with one
+    entry per joint, an author may write a number, a distribution, or a list of both.
 
     Args:
         hint: Type of the complete value.
-        takes_distributions: Whether a random distribution may stand for a number.
+        takes_distributions: True if a random distribution may take the place of a number.
     """
     base, _ = _split_annotation(hint)
     origin = get_origin(base)
@@ -60,7 +60,7 @@ def written_type(hint: Any, takes_distributions: bool) -> Any:
         return hint | StatedDistribution
 
     if origin in (Union, UnionType):
-        # TOML has no None: a key is left out instead.
+        # TOML has no null value. A key is left out instead.
         members = [member for member in get_args(base) if member is not type(None)]
         written_members = [written_type(member, takes_distributions) for member in members]
         return Union[tuple(written_members)]  # noqa: UP007 - the members are computed

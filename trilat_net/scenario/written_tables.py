@@ -1,7 +1,7 @@
-"""Describes the tables that the author of a scenario may write, and refuses all others.
+"""Defines the tables that the author of a scenario may write, and refuses all other tables.
 
 A scenario is a TOML file that describes an experiment. Its author writes less than the program
-needs: most keys may be left out, tables such as `[arm]` hold for all sites, one number may
+needs: most keys may be left out, tables such as `[arm]` apply to all sites, one number may
 stand for a vector, and a random distribution may stand for a number. `WrittenScenario` is the
 type of such a file, and `scenario_types.Scenario` the type of the complete description.
 
@@ -39,7 +39,7 @@ MAX_SITES = 32
 """Largest number of sites of an experiment. Every pair of sites has two links."""
 _SITE_NAME = re.compile(r"[a-z][a-z0-9_]{0,31}")
 _RESERVED_NAME = "recorder"
-"""Name that no site may have, since the program that writes the log has it."""
+"""Name that no site may have, because it is the name of the program that writes the log."""
 TRACE_KEYS = ("file", "of")
 """Keys of a link that name a file of delays. A resolved link contains the delays instead."""
 
@@ -75,7 +75,8 @@ _LAW_TABLES: dict[str, StructType] = {
 }
 """Types of the tables of a link and of a control law, by the name of the model or law."""
 for _kind in _LINK_TABLES.values():
-    # A link may change during a run: msgspec 0.22 crashes if two threads use a type at first.
+    # The types are used once now, because msgspec 0.22 crashes if two threads first use a type
+    # at once.
     msgspec.convert({}, _kind)
 _USER_LAW = "own"
 """Name that all laws of users have. Since their arguments differ, a message about a misplaced
@@ -160,7 +161,7 @@ class WrittenScenario(Frozen, frozen=True, kw_only=True):
 
     @classmethod
     def check(cls, tables: TomlTable) -> "WrittenScenario":
-        """Refuses a scenario file with an unknown key, or with a value that no key may have.
+        """Refuses a scenario file with an unknown key, or a value of a wrong type or range.
 
         Conditions that involve several tables are checked later.
 
@@ -192,7 +193,7 @@ def _check_site_names(names: Collection[str]) -> None:
         names: Names of the sites.
 
     Raises:
-        ScenarioError: A name is not valid, or the number of sites.
+        ScenarioError: A name or the number of sites is not valid.
     """
     for name in names:
         if not _SITE_NAME.fullmatch(name) or name == _RESERVED_NAME:
@@ -234,7 +235,8 @@ def check_link(table: TomlTable, model: str, path: str) -> None:
         path: Dotted path of the table.
     """
     _check_foreign_keys(table, _LINK_TABLES, "model", model, path)
-    # The settings of one link stand in the table `links`, those of all links in `link`.
+    # The table `links` contains the settings of single links, and the table `link` those of all
+    # links.
     link_paths = [f"links.{key}" for key in table if path == "link" and "->" in key]
     check_table(table, _LINK_TABLES[model], path, link_paths)
 
@@ -242,10 +244,11 @@ def check_link(table: TomlTable, model: str, path: str) -> None:
 def _check_foreign_keys(
     table: TomlTable, kinds: Mapping[str, StructType], group: str, chosen: str, path: str
 ) -> None:
-    """Refuses a key that belongs to another control law or delay model than the chosen one.
+    """Refuses a key that does not belong to the chosen control law or delay model.
 
-    Upper and lower case count as equal, so that the user of `control.D` learns of `d`. A key
-    that differs from a valid one only in its case is left to `check_table`, which suggests it.
+    Upper and lower case count as equal, so that the user of `control.D` learns of `d`. If a key
+    differs from a valid key only in its case, `check_table` refuses it and suggests the valid
+    key.
 
     Args:
         table: Table of a control law or a delay model.

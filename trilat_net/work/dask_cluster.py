@@ -40,7 +40,7 @@ _PACKAGES = ("numpy", "numba", "scipy")
 
 
 def _import_distributed() -> Any:
-    """Imports `distributed`, the package of Dask that runs work on a cluster of machines.
+    """Imports `distributed`, the Dask package that runs work on a cluster of machines.
 
     Raises:
         UsageError: The package is not installed.
@@ -87,63 +87,74 @@ def _find_sources() -> list[Path]:
 
 
 class WorkerRequirements(NamedTuple):
-    """What a worker of a cluster must have to compute the same results as this machine.
+    """Requirements that make a worker of a cluster compute the same results as this machine.
 
     The requirements are the version of the program, equal arithmetic, and equal files of users'
     control laws.
 
     Attributes:
         identity: Properties that the worker must have.
-        laws: Name of each imported control law, such as "mylaws:Spring", with the SHA-256 of
-            its file, which the worker must have.
+        laws: Pairs of an imported control law, such as "mylaws:Spring", and the SHA-256 of the
+            law's file. The worker must have this file.
     """
 
     identity: WorkerIdentity
     laws: tuple[tuple[str, str], ...] = ()
 
+    def explain_unfit_worker(self, identity: WorkerIdentity, lacks: Sequence[str]) -> str:
+        """Explains why a worker of a cluster may not run items of a study.
 
-def explain_unfit_worker(
-    required: WorkerRequirements, identity: WorkerIdentity, lacks: Sequence[str]
-) -> str:
-    """Explains why a worker of a cluster may not run items of a study.
+        A worker must have the same source files, the same versions of packages, the same
+        floating point results, and the same files of control laws as the process that started
+        the study. Its Git commit may differ, since commits can differ in documentation only. If
+        the source files differ, the explanation also names the commits, as a hint.
 
-    A worker must have the same source files, the same versions of packages, the same floating
-    point results, and the same files of control laws as the process that started the study.
-    Its Git commit may differ, since commits can differ in documentation only. If the source
-    files differ, the explanation also names the commits, as a hint.
+        Args:
+            identity: Versions and other properties of the worker.
+            lacks: Imported control laws whose file the worker does not have.
 
-    Args:
-        required: What a worker must have.
-        identity: Versions and other properties of the worker.
-        lacks: Imported control laws whose file the worker does not have.
+        Returns:
+            The end of a sentence that begins with "the worker". Empty if the worker may run
+            items.
+        """
+        local = self.identity
+        differing = [
+            name for name in local if name != "commit" and identity.get(name) != local[name]
+        ]
+        if differing:
+            if "source files" in differing:
+                differing.append("commit")
+            remote_text = _list_properties(identity, differing)
+            local_text = _list_properties(local, differing)
+            return (
+                f"has {remote_text}, but the study needs {local_text}; "
+                "results from both cannot be mixed"
+            )
 
-    Returns:
-        The end of a sentence that begins with "the worker". Empty if the worker may run items.
-    """
-    local = required.identity
-    differing = [
-        name for name in local if name != "commit" and identity.get(name) != local[name]
-    ]
-    if differing:
-        if "source files" in differing:
-            differing.append("commit")
-        remote_text = _list_properties(identity, differing)
-        local_text = _list_properties(local, differing)
-        return (
-            f"has {remote_text}, but the study needs {local_text}; results from both cannot "
-            "be mixed"
-        )
+        if lacks:
+            return (
+                f"lacks the control law {', '.join(lacks)}, or has another file of it: "
+                "put the file that the scenario names into the worker's folder or PYTHONPATH"
+            )
+        return ""
 
-    if lacks:
-        return (
-            f"lacks the control law {', '.join(lacks)}, or has another file of it: "
-            "put the file that the scenario names into the worker's folder or PYTHONPATH"
-        )
-    return ""
+    def check_this_worker(self) -> None:
+        """Checks that this worker of a cluster would compute the same results as the study.
+
+        A worker that joins during the study must check itself, because the results of different
+        program versions must not be mixed.
+
+        Raises:
+            UsageError: This process differs. The message names the worker and the differences.
+        """
+        reason = self.explain_unfit_worker(describe_worker(), find_missing_laws(self.laws))
+        if reason:
+            worker = _import_distributed().get_worker()
+            raise UsageError(f"the worker {worker.address} {reason}")
 
 
 def _list_properties(identity: WorkerIdentity, names: Sequence[str]) -> str:
-    """Returns some properties of a worker as a string for an error message."""
+    """Formats some properties of a worker as text for an error message."""
     return ", ".join(f"{name} {identity.get(name, 'unknown')}" for name in names)
 
 
@@ -166,32 +177,14 @@ def find_missing_laws(laws: Sequence[tuple[str, str]]) -> list[str]:
     return missing
 
 
-def check_this_worker(required: WorkerRequirements) -> None:
-    """Checks in a worker of a cluster that it would compute the same results as the study.
-
-    A worker that joins during the study has not been checked before. Results from different
-    program versions must not be mixed.
-
-    Args:
-        required: Versions of the program and its packages, and files of control laws, that
-            every worker must have.
-
-    Raises:
-        UsageError: This process differs. The message names the worker and the differences.
-    """
-    reason = explain_unfit_worker(required, describe_worker(), find_missing_laws(required.laws))
-    if reason:
-        worker = _import_distributed().get_worker()
-        raise UsageError(f"the worker {worker.address} {reason}")
-
-
 def _make_probe() -> Callable[
     [Sequence[tuple[str, str]]], tuple[WorkerIdentity, Sequence[str]]
 ]:
     """Returns a function that describes the process in which it is called.
 
-    A worker may have another version of this program, or none. Dask sends the code of a nested
-    function itself, and not only its name, so that the function runs on such a worker too.
+    A worker may have another version of this program, or lack the program. Dask sends the code
+    of a nested function itself, and not only its name, so that the function runs on such a
+    worker too.
     """
 
     def probe(laws: Sequence[tuple[str, str]]) -> tuple[WorkerIdentity, Sequence[str]]:
@@ -269,7 +262,7 @@ class DaskCluster:
         return sum(worker["nthreads"] for worker in workers.values())
 
     def require(self, laws: Sequence[tuple[str, str]]) -> WorkerRequirements:
-        """Determines what workers of the cluster need for a study, and checks all present ones.
+        """Determines the requirements of a study, and checks all workers of the cluster.
 
         A worker must have the same program, arithmetic and versions of packages as this
         process, and the files of all imported control laws. Otherwise, results would differ.
@@ -310,7 +303,7 @@ class DaskCluster:
             if isinstance(answer, BaseException):
                 raise UsageError(f"the worker {worker} does not report its version: {answer}")
             identity, missing_laws = answer
-            reason = explain_unfit_worker(required, identity, missing_laws)
+            reason = required.explain_unfit_worker(identity, missing_laws)
             if reason:
                 raise UsageError(f"the worker {worker} {reason}")
         return required
@@ -322,7 +315,7 @@ class DaskCluster:
         could wait forever.
 
         Raises:
-            RunFailed: The scheduler is gone, or had no worker for `NO_WORKER_S`.
+            RunFailed: The scheduler no longer responds, or had no worker for `NO_WORKER_S`.
         """
         try:
             workers = self.workers
@@ -342,9 +335,8 @@ class DaskCluster:
     def is_worker_loss(self, error: BaseException) -> bool:
         """Distinguishes the death of a worker process from an error in its item.
 
-        After the death of a worker its items may be tried again on another one. After an error
-        of the item, such as a worker that does not meet the requirements, this would be
-        useless.
+        After the death of a worker, its items may be tried again on another worker. After an
+        error of the item, such as unmet requirements, this would be useless.
 
         Args:
             error: Error with which an item ended.
@@ -353,7 +345,7 @@ class DaskCluster:
             True if the workers of the item died.
 
         Raises:
-            RunFailed: The scheduler is gone, or a worker cannot receive items.
+            RunFailed: The scheduler no longer responds, or a worker cannot receive items.
         """
         if isinstance(error, _import_distributed().KilledWorker):
             return True

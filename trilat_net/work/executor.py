@@ -34,7 +34,7 @@ from ..files import require_libraries
 from ..net import SystemClock
 from ..own_code import CodeConsents, allowed_code, allowing_any_settings
 from ..workers import count_cores, worker_pool
-from .dask_cluster import DaskCluster, WorkerRequirements, check_this_worker
+from .dask_cluster import DaskCluster, WorkerRequirements
 
 T = TypeVar("T")
 R = TypeVar("R")
@@ -42,11 +42,11 @@ R = TypeVar("R")
 Progress = Callable[[int, int], None]
 """Function that is called with the number of finished items and the number of all items."""
 Workers = str | Executor | None
-"""Address of a Dask scheduler, an executor, or None for processes of this machine."""
+"""Address of a Dask scheduler, an executor, or `None` for worker processes on this machine."""
 
 Together = Callable[[Sequence[T]], Iterable[R]]
-"""Function of several items that computes them together. It yields their results in order, and
-raises the error of an item in place of its result.
+"""Function that computes several items together. It yields their results in order, and raises
+the error of an item in place of the item's result.
 """
 
 BATCH_S = 0.4
@@ -58,11 +58,11 @@ MAX_BATCH = 400
 _SMALLEST_FRACTION = 16
 """The last batches have at least the number of items of a full batch divided by this number."""
 MAX_LOSSES = 3
-"""Number of lost workers after which an item is given up."""
+"""Number of workers that an item may kill before it is given up."""
 _BATCHES_PER_WORKER = 2
-"""Number of batches per worker in flight: one runs and one waits, so that no worker is idle."""
+"""Number of batches in flight per worker: one runs and one waits, so that no worker is idle."""
 _POLL_S = 1.0
-"""Period in which a cluster is checked while no batch ends, in s."""
+"""Interval between checks of a cluster while no batch ends, in s."""
 _MAX_NAME = 200
 """Largest number of characters of an item's name in an error message."""
 
@@ -77,7 +77,7 @@ class _BatchResult(NamedTuple):
     Attributes:
         results: Results of the items, up to the first error.
         wall_s: Duration of these items, in s.
-        error: First error. None if all items have a result.
+        error: First error. `None` if all items have a result.
     """
 
     results: list[Any]
@@ -100,8 +100,8 @@ def run_batch(
     Args:
         function: Function of one item that returns its result.
         items: The items, each of which is the argument of one call.
-        required: Requirements on the worker, such as the version of the program. None if there
-            are no requirements.
+        required: Requirements on the worker, such as the version of the program. `None` if
+            there are no requirements.
         allowed: Imported control laws that the user allowed to run.
         together: Function that replaces `function` if the batch has several items.
 
@@ -112,7 +112,7 @@ def run_batch(
         UsageError: This worker does not meet the requirements.
     """
     if required is not None:
-        check_this_worker(required)
+        required.check_this_worker()
     clock = SystemClock()
     start_ns = clock.monotonic_ns()
     results: list[Any] = []
@@ -133,7 +133,7 @@ def run_batch(
 class _Batch(NamedTuple):
     """A group of items that one worker process is working on.
 
-    If the worker dies, its items are known from here and return to the queue.
+    It lists the items that return to the queue if the worker dies.
 
     Attributes:
         numbers: Numbers of the items in the study, counted from 0.
@@ -149,15 +149,16 @@ class _Batch(NamedTuple):
 class _Feed(Generic[T]):
     """Queue of the items that wait for a worker. It groups them into batches.
 
-    The size of a batch follows from the measured duration of the items, so that a batch takes
+    The size of a batch is chosen from the measured duration of the items, so that a batch takes
     about `batch_s`. Items whose worker died come back to this queue.
 
     Args:
         items: The items, each of which is the argument of one call.
-        count: Number of items. None if it is not known.
+        count: Number of items. `None` if it is not known.
         workers: Number of workers that take items from the queue.
         batch_s: Intended duration of a batch, in s.
-        least: Number of items for which a batch may take longer than that.
+        least: Smallest number of items in a batch, even if the batch then takes longer than
+            `batch_s`.
     """
 
     def __init__(
@@ -180,7 +181,7 @@ class _Feed(Generic[T]):
         self._wall_s = 0.0
 
     def add_timing(self, runs: int, wall_s: float) -> None:
-        """Updates the mean duration of an item, from which the size of later batches follows.
+        """Updates the mean duration of an item, which determines the size of later batches.
 
         Short items are sent in large batches, because sending takes time as well.
 
@@ -198,8 +199,8 @@ class _Feed(Generic[T]):
         in its last attempt is a suspect: it probably kills its worker. It runs while no other
         batch is in flight, so that it cannot take other items with it.
 
-        Otherwise the batch consists of new items. From the mean duration of the finished items
-        follows how many items take about `batch_s`.
+        Otherwise the batch consists of new items. Their number is chosen from the mean duration
+        of the finished items, so that the batch takes about `batch_s`.
 
         Args:
             idle: True if no batch is in flight.
@@ -260,17 +261,17 @@ class _Feed(Generic[T]):
 
 
 class WorkerPool:
-    """Runs the items of a study in parallel, by processes of this machine or of a cluster.
+    """Runs the items of a study in parallel, in processes on this machine or on a cluster.
 
     An item is an independent piece of work, such as one simulated run. `open_worker_pool`
     creates this object. A study passes its items to `map`, or to `iterate_results` if it stores
     each result at once.
 
     Args:
-        executor: Executor that runs the batches. None if the items run in this process.
+        executor: Executor that runs the batches. `None` if the items run in this process.
         workers: Number of items that run at the same time.
-        restart: Function that returns a new executor after a dying worker broke the old one.
-            None if the executor cannot be replaced.
+        restart: Function that returns a new executor after a dying worker broke the old
+            executor. `None` if the executor cannot be replaced.
         cluster: Cluster to which the executor belongs, if any.
         required: Requirements on each worker of the cluster.
         hint: Advice for the user that follows the message about a dead worker.
@@ -307,14 +308,13 @@ class WorkerPool:
     ) -> Iterator[tuple[int, R]]:
         """Runs a function on each item with all workers, and yields each result as it arrives.
 
-        An item is an independent piece of work, such as one simulated run. The order of the
-        results may differ from that of the items, so that a study can store each result at
-        once.
+        An item is an independent piece of work, such as one simulated run. The results may come
+        in a different order from the items. A study can therefore store each result at once.
 
         Args:
             function: Function at module level, so that another process can import it.
             items: The items. Error messages name an item by its `str`.
-            lost: Function that returns the result of an item that killed its workers. None if
+            lost: Function that returns the result of an item that killed its workers. `None` if
                 such an item is an error.
             count: Number of items, if it is known.
             together: Function that replaces `function` for several items at once.
@@ -404,7 +404,7 @@ class WorkerPool:
         pending: dict[Future[_BatchResult], _Batch],
         together: Together[T, R] | None,
     ) -> None:
-        """Sends groups of items (batches) to the workers, so that each has one waiting.
+        """Sends groups of items (batches) to the workers until each worker has one waiting.
 
         A batch that waits keeps the worker busy until the results of the previous batch have
         been processed.
@@ -452,7 +452,7 @@ class WorkerPool:
                 `iterate_results`.
 
         Raises:
-            RunFailed: An item killed its workers, and `lost` is None.
+            RunFailed: An item killed its workers, and `lost` is `None`.
         """
         try:
             result = future.result()
@@ -484,7 +484,7 @@ class WorkerPool:
             yield number, lost(item)
 
     def _replace_executor(self, broken: Executor) -> None:
-        """Starts a new pool of worker processes in place of a broken one.
+        """Starts a new pool of worker processes in place of a broken pool.
 
         Several batches of the broken pool fail one after another. Only the first failure starts
         a new pool.
@@ -510,16 +510,16 @@ def open_worker_pool(
     laws: Sequence[tuple[str, str]] = (),
     hint: str = "",
 ) -> Iterator[WorkerPool]:
-    """Starts the worker processes of a study, or connects to those of a cluster.
+    """Starts the worker processes of a study, or connects to the workers of a cluster.
 
-    The function is used in a `with` statement. The processes that were started end when the
-    statement is left. Processes of a cluster keep running.
+    The function is used in a `with` statement. Processes that it started end when the statement
+    is left. Workers of a cluster keep running.
 
     Args:
-        jobs: Number of processes of this machine. None uses all cores, and 1 runs the items in
-            this process.
-        on: Workers to use instead of processes of this machine.
-        most: Number of items, so that no more processes are started.
+        jobs: Number of processes on this machine. If `None`, all cores are used. If 1, the
+            items run in this process.
+        on: Workers to use instead of processes on this machine.
+        most: Number of items. No more processes than this are started.
         laws: Name of each imported class that the items need, with the SHA-256 of its file.
             Each worker must have the files.
         hint: Advice for the user that follows the message about a dead worker.
@@ -559,13 +559,13 @@ def open_worker_pool(
 
 
 def check_workers(jobs: int | None, on: Workers) -> None:
-    """Refuses the options --jobs and --on together, since --jobs has no effect on a cluster.
+    """Rejects the options --jobs and --on together, because --jobs has no effect on a cluster.
 
-    The option --jobs sets the number of processes of this machine, and --on selects a cluster.
+    The option --jobs sets the number of processes on this machine, and --on selects a cluster.
 
     Args:
-        jobs: Value of --jobs. None if it was not given.
-        on: Value of --on. None if it was not given.
+        jobs: Value of --jobs. `None` if it was not given.
+        on: Value of --on. `None` if it was not given.
 
     Raises:
         UsageError: Both options are given.
@@ -582,8 +582,8 @@ def count_workers(jobs: int | None, on: Workers = None) -> int:
     For a cluster, this connects to its scheduler and checks its workers.
 
     Args:
-        jobs: Number of processes of this machine. None stands for all cores.
-        on: Workers to use instead of processes of this machine.
+        jobs: Number of processes on this machine. If `None`, all cores are used.
+        on: Workers to use instead of processes on this machine.
 
     Raises:
         UsageError: The cluster cannot be reached, or a worker does not meet the requirements.

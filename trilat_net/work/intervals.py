@@ -5,7 +5,7 @@ Studies print such a fraction with its Wilson interval, and a mean with its inte
 Student's t distribution.
 
 Invariant:
-    - An interval is a function of the numbers alone.
+    - An interval depends only on the given numbers.
     - The interval of a mean has a positive width unless all numbers are equal.
 """
 
@@ -16,9 +16,9 @@ import numpy as np
 
 
 def wilson_interval(successes: int, runs: int) -> tuple[float, float]:
-    """Returns the 95 % Wilson score interval of a fraction, such as that of stable runs.
+    """Returns the 95 % Wilson score interval of a fraction, for example of stable runs.
 
-    Unlike the simplest interval, this one has a positive width even if all runs agree.
+    Unlike the normal approximation, this interval has a positive width even if all runs agree.
 
     Source: Wilson, "Probable inference, the law of succession, and statistical inference", J.
     American Statistical Association 22 (1927); recommended by Brown, Cai and DasGupta,
@@ -42,10 +42,10 @@ def wilson_interval(successes: int, runs: int) -> tuple[float, float]:
 
 
 class MeanInterval(NamedTuple):
-    """Mean of a number over several runs, with its 95 % confidence interval.
+    """Mean of a quantity over several runs, with its 95 % confidence interval.
 
-    The interval follows from Student's t distribution. It shows how much the mean may change
-    with other random seeds.
+    The interval is computed from Student's t distribution. It shows how much the mean may
+    change with other random seeds.
 
     Attributes:
         mean: The mean.
@@ -60,15 +60,15 @@ class MeanInterval(NamedTuple):
 
     @classmethod
     def of_values(cls, values: Sequence[float | None]) -> "MeanInterval | None":
-        """Returns the mean of the numbers of several runs, with its 95 % interval.
+        """Returns the mean of a quantity over several runs, with its 95 % interval.
 
         The interval says how uncertain the mean is because there are only a few runs.
 
         Args:
-            values: One number per run. None stands for a run without a number.
+            values: One value per run. `None` stands for a run without a value.
 
         Returns:
-            The mean. None if there are fewer than two numbers, or if a number is missing.
+            The mean. `None` if there are fewer than two values, or if a value is missing.
         """
         known = [value for value in values if value is not None]
         count = len(known)

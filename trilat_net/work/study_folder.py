@@ -6,7 +6,7 @@ the journal. A line is JSON, a tab, and a checksum in hexadecimal digits: the CR
 that identifies the study, followed by the JSON. The journal is only appended to.
 
 Invariant:
-    - A torn line, and a line of another study, has a wrong checksum and is ignored.
+    - A torn line or a line of another study has a wrong checksum and is ignored.
     - A process that dies at any moment loses no earlier line and spoils no later line.
     - A run that is in the journal is never repeated.
 """
@@ -32,8 +32,8 @@ from .executor import Progress, Together, WorkerPool
 def extend_file(path: Path) -> BinaryIO:
     """Opens a file for appending without a buffer, and creates it if it does not exist.
 
-    No buffer means that a line is in the file as soon as it was written, even if the process is
-    killed then.
+    Without a buffer, a line is in the file as soon as it is written, even if the process is
+    killed afterwards.
 
     Args:
         path: Path of the file.
@@ -67,14 +67,14 @@ def encode_csv(
 ) -> str:
     """Converts a table to CSV text.
 
-    None becomes an empty field.
+    `None` becomes an empty field.
 
     Args:
         rows: The rows, as values by column.
-        columns: The columns. Empty stands for all keys of the rows, in the order in which they
-            first appear.
-        header: True if the text begins with a line of the names of the columns. A table that
-            is written in pieces has it only in the first one.
+        columns: The columns. If empty, all keys of the rows are used, in the order of their
+            first appearance.
+        header: True if the text begins with a line of column names. Of a table that is written
+            in pieces, only the first piece needs this line.
     """
     stream = io.StringIO()
     all_keys = itertools.chain.from_iterable(rows)
@@ -97,8 +97,8 @@ class _JournalEntry(Protocol):
     def cell(self) -> Hashable:
         """Identifier of the part of the study to which the run belongs.
 
-        For example, the number of a grid point in a sweep over parameters. The journal must
-        tell which runs of a cell are finished, so that an interrupted study can continue.
+        An example is the number of a grid point in a parameter sweep. The journal must show
+        which runs of a cell are finished, so that an interrupted study can continue.
         """
 
     @property
@@ -127,9 +127,9 @@ _KEYS = msgspec.json.Decoder(_RunKey)
 
 
 def _read_key(text: bytes, kind: type[E]) -> _RunKey:
-    """Reads from a line of the journal which run of the study it describes.
+    """Reads the cell and the seed of the run that a line of the journal describes.
 
-    The rest of the line is not decoded if possible, because a journal may have many runs.
+    If possible, the rest of the line is not decoded, because a journal may have many runs.
 
     Args:
         text: The line without its checksum.
@@ -144,8 +144,8 @@ def _read_key(text: bytes, kind: type[E]) -> _RunKey:
         return _RunKey(entry.cell, entry.seed)
 
 
-class StoredRuns(Mapping[tuple[Any, int], E]):
-    """Finished runs of a study, by cell and seed, which stay in the file of the journal.
+class _StoredRuns(Mapping[tuple[Any, int], E]):
+    """Finished runs of a study by cell and seed, which are read from the journal when needed.
 
     Only the offsets of the lines are in memory, about 120 bytes for each run, so that a study
     may have millions of runs. Runs with the same seed are iterated in the order of the lines.
@@ -162,7 +162,7 @@ class StoredRuns(Mapping[tuple[Any, int], E]):
         self._file: BinaryIO | None = None
 
     def add_offset(self, key: _RunKey, offset: int) -> None:
-        """Notes where in the file a finished run is stored.
+        """Remembers where in the file a finished run is stored.
 
         If a run occurs twice, the first one counts.
 
@@ -223,7 +223,7 @@ class RunJournal(Generic[E]):
         self._path = path
         self._study = study
         self._remedy = remedy
-        self.done: StoredRuns[E] = StoredRuns(path, kind)
+        self.done: _StoredRuns[E] = _StoredRuns(path, kind)
 
         # Read the runs that an interrupted study has stored already.
         offset = 0
@@ -348,7 +348,7 @@ class RunJournal(Generic[E]):
 class StudyFolder(NamedTuple, Generic[P, E]):
     """The folder of a study, such as a sweep, with its plan, the finished runs and the results.
 
-    `StudyFolder` is what a command needs to continue a study that was interrupted.
+    A command needs it to continue an interrupted study.
 
     Attributes:
         path: Path of the folder.

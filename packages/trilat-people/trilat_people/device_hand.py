@@ -11,7 +11,7 @@ Invariant:
       Positions that are not finite numbers, jumps, and the position of a device that was just
       connected do not move the target, because they are not motions of the operator.
     - The target never leaves the region that the arm can reach. A motion of the device that
-      would lead out of it is ignored, so that a motion back moves the arm at once.
+      would lead out of this region is ignored, so that a motion back moves the arm at once.
     - If the device sends nothing for some time, the arm is released. After any release, the
       operator must press the clutch again, so that the arm never starts to move unexpectedly.
     - The rendered force is zero while the clutch is not pressed, and if no recent record of the
@@ -35,18 +35,18 @@ from trilat_net.scenario import DeviceSettings
 RETRY_NS = 1_000_000_000
 """Time between two attempts to connect to the device, in ns."""
 _MIN_STATE_GAP_S = 0.005
-"""Shortest time between two states that is assumed when a jump is detected, in s.
+"""Shortest time between two states that the detection of jumps assumes, in s.
 
 The operating system may deliver states late, and several at once.
 """
 _MAX_STATE_GAP_S = 0.05
-"""Longest time between two states that is assumed when a jump is detected, in s."""
+"""Longest time between two states that the detection of jumps assumes, in s."""
 _TRIPS_KEPT = 60_000
 """Number of round trips that are kept for statistics."""
 
 
 class DeviceHand:
-    """Lets a person move an arm with an input device, and feel the force of the arm on it.
+    """Lets a person move an arm with an input device, and feel the arm's force on the device.
 
     The process of a live operator creates the object and calls `run`. It is an operator of the
     arm: the motion of the device moves the target that the arm follows.
@@ -54,7 +54,7 @@ class DeviceHand:
     Args:
         hand: Connection to the site that runs the arm, in the role of its operator.
         device: The input device, which a person moves.
-        settings: How the device moves the arm, and how force is rendered.
+        settings: Settings for moving the arm with the device, and for rendering the force.
         clock: Clock of this machine.
         reach: Region that the arm can reach. The target never leaves it.
 
@@ -62,8 +62,8 @@ class DeviceHand:
         states: Number of states of the device (position, velocity, buttons) that were read.
         jumps: Number of states that were ignored because the position had jumped.
         unreadable: Number of states that were ignored because they contained NaN or infinity.
-        trips_ns: Times from a position of the device until the force that it caused was
-            rendered, in ns.
+        trips_ns: Times from a position of the device until the force caused by this position
+            was rendered, in ns.
     """
 
     def __init__(
@@ -104,13 +104,13 @@ class DeviceHand:
         self._position_m: Vector | None = None
         # A clutch that is still pressed does not count as pressed again.
         self._was_pressed = True
-        # Time at which the clutch was pressed. None while it is not pressed.
+        # Time at which the clutch was pressed. `None` while the clutch is not pressed.
         self._pressed_since_ns: int | None = None
         self._received_ns = self._clock.monotonic_ns()
         self._sent.clear()
 
     def serve(self) -> None:
-        """Moves the target of the arm as the device moved, and renders the force of the arm.
+        """Moves the target of the arm with the device, and renders the force of the arm.
 
         The method is called repeatedly. Each call takes one period of the device: it reads the
         position, sends the new target to the site of the arm, and lets the device apply a force
@@ -173,7 +173,8 @@ class DeviceHand:
                 self._target = list(self._hand.pose)
             return
 
-        # After a release of the arm, a clutch that is still pressed moves nothing.
+        # After a release of the arm, the target does not move while the clutch is still
+        # pressed.
         is_clutch_active = self._pressed_since_ns is not None
         if is_clutch_active and previous_position_m is not None:
             positions = zip(state.position_m, previous_position_m, strict=True)
@@ -181,7 +182,7 @@ class DeviceHand:
             self._move_target(step_m, elapsed_s)
 
     def _move_target(self, step_m: list[float], elapsed_s: float) -> None:
-        """Moves the target of the arm by a motion of the device, in rotated and scaled form.
+        """Moves the target of the arm by a motion of the device, rotated and scaled.
 
         A motion that is faster than the speed limit of the scenario is a jump, for example
         after a lost message. It is counted and ignored.
@@ -234,8 +235,8 @@ class DeviceHand:
         """Measures the round trip time from a position of the device to the rendered force.
 
         Each target was sent with a number. The newest record of the site states the number of
-        the target that the arm follows. The round trips of this target and of all earlier ones
-        end with the force that was just rendered.
+        the target that the arm follows. The round trips of this target and of all earlier
+        targets end with the force that was just rendered.
         """
         used_number = self._hand.number
         now_ns = self._clock.monotonic_ns()
@@ -260,21 +261,21 @@ class DeviceHand:
         """
         states = count_nouns(self.states, "state")
         jumps = count_nouns(self.jumps, "jump")
-        counts = f"{states} of the device, dropped {jumps}, {self.unreadable} unreadable"
+        counts = f"{states} of the device; dropped: {jumps}, {self.unreadable} unreadable"
         if not self.trips_ns:
             return counts
 
         median_ms, p99_ms = np.percentile(self.trips_ns, [50, 99]) / 1e6
         return (
-            f"{counts}; from its place to the force of it "
+            f"{counts}; round trip from device position to rendered force: "
             f"p50 {median_ms:.1f} ms, p99 {p99_ms:.1f} ms"
         )
 
     def run(self, stopped: Callable[[], bool], say: Callable[[str], None]) -> None:
         """Moves the arm with the device until the session ends.
 
-        If the connection to the device is lost, the arm is released, and the device is tried
-        again until it is back.
+        If the connection to the device is lost, the arm is released, and connecting is
+        attempted until the device is back.
 
         Args:
             stopped: Function that returns True to end the call.
@@ -288,13 +289,13 @@ class DeviceHand:
                         self.serve()
                         if not is_present:
                             button = repr(self._settings.clutch)
-                            say(f"the device is there: its button {button} takes hold")
+                            say(f"the device is connected; its button {button} holds the arm")
                         is_present = True
 
             except OSError as problem:
                 self.release()
                 if is_present is not False:
-                    say(f"{problem}; the arm is let go, and the device is tried again")
+                    say(f"{problem}; the arm is released, and the device is tried again")
                 is_present = False
                 self._clock.sleep_until(self._clock.monotonic_ns() + RETRY_NS)
 

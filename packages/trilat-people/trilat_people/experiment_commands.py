@@ -1,7 +1,7 @@
 """The commands `trilat experiment`: they write, check, run and analyse an experiment.
 
 In an experiment, people operate the arms under different conditions, such as two network
-delays. Models of people can take their place, to try out a protocol before anybody is invited.
+delays. Models of people can replace them, to try out a protocol before anybody is invited.
 
 Invariant:
     - An interrupted experiment continues if the same command is entered again.
@@ -44,7 +44,7 @@ def experiment_new_command(
     people = f"trilat experiment run {file} --live"
     models = f"trilat experiment run {file}"
     terminal.print_text(
-        f"{file}: a protocol; with people: {people}; with models of people: {models}"
+        f"{file} is a protocol; run it with people: {people}; with models of people: {models}"
     )
 
 

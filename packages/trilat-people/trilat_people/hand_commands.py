@@ -1,8 +1,8 @@
-"""The commands `trilat hand` and `trilat identify hand`, about those who operate an arm.
+"""The commands `trilat hand` and `trilat identify hand`, which concern the operators of an arm.
 
 `trilat hand` connects an operator to an arm of a session. The operator is a program of the
 user, or a person with an input device such as a SpaceMouse. `trilat identify hand` estimates
-from a log how stiff, damped and heavy the hand was with which a person held an arm.
+from a log the stiffness, damping and mass of the hand with which a person held an arm.
 """
 
 from typing import Annotated
@@ -28,7 +28,7 @@ def hand_command(
     ] = "",
     session: Annotated[str | None, value("--session", "ID")] = None,
     join_timeout: Annotated[
-        float, seconds("--join-timeout", "Longest wait for the site, s.")
+        float, seconds("--join-timeout", "Longest wait for the site, in s.")
     ] = 60.0,
     duration: options.DurationOption = None,
     seed: options.SeedOption = None,

@@ -1,7 +1,7 @@
 """Identifies mass, damping and stiffness of a person's hand from the log of a run.
 
-While the person holds an arm, a simulated operator of the kind `multisine` shakes the arms with
-a sum of sines. The force F of the hand on the arm and the position X of the end effector
+While the person holds an arm, a simulated operator of the kind `multisine` excites the arms
+with a sum of sines. The force F of the hand on the arm and the position X of the end effector
 contain responses to the sines. At the angular frequency w of each sine, these responses satisfy
 
     F(j w) = -(M (j w)^2 + B j w + K) X(j w)
@@ -62,13 +62,13 @@ NEIGHBOUR_CORRELATION = 1.0 / 6.0
 MAX_CONDITION = 1e3
 """Largest condition number of the motions with which the axes can be distinguished."""
 _TINY = 1e-300
-"""Smallest divisor, so that 0 / 0 gives 0."""
+"""Smallest divisor, which makes 0 / 0 give 0."""
 UNITS = {"M": "kg", "B": "N s/m", "K": "N/m"}
 """Unit of each matrix."""
 
 
 class _SineResponse(NamedTuple):
-    """Response of the hand and the arm to one of the sines that shake the arm.
+    """Response of the hand and the arm to one of the sines that excite the arm.
 
     To identify the hand that holds an arm, small forces of several frequencies act on the arm.
     The run is divided into segments, whose spectra are compared.
@@ -138,7 +138,7 @@ class HandImpedance(Result):
         }
 
     def to_rows(self) -> list[dict[str, Any]]:
-        """Returns a table of how the hand responded to forces, one row per frequency.
+        """Returns a table of the hand's responses to forces, one row per frequency.
 
         A row has the amplitudes of motion and force, their coherence, and the part of the force
         that mass, damping and stiffness do not explain.
@@ -146,7 +146,7 @@ class HandImpedance(Result):
         return [response._asdict() for response in self.responses]
 
     def to_hand(self) -> dict[str, Any]:
-        """Returns settings of the simulated operator that is most similar to this hand.
+        """Returns the settings of the simulated operator that is most similar to this hand.
 
         This operator consists of a spring and a damper along each axis, and has no mass. The
         settings are the entries of its table in a scenario, the file that describes an
@@ -162,7 +162,7 @@ class HandImpedance(Result):
         """Yields the parts of the text that `trilat identify hand` prints.
 
         The parts are the mass, damping and stiffness matrices with their confidence intervals,
-        a table of the motion and force at each frequency of the shaking, and the settings of
+        a table of the motion and force at each frequency of the excitation, and the settings of
         the most similar simulated operator.
         """
         segments = count_nouns(self.segments, "segment")
@@ -210,8 +210,8 @@ def _format_response(response: _SineResponse) -> tuple[str, ...]:
 def _round_diagonal(matrix: Array) -> list[float]:
     """Returns the diagonal of a matrix with four digits, for a scenario that models the hand.
 
-    A negative entry is an error of the measurement, because mass, damping and stiffness are not
-    negative. It becomes 0.
+    A negative entry is a measurement error, because mass, damping and stiffness are not
+    negative. It is replaced with 0.
 
     Args:
         matrix: Identified mass, damping or stiffness, shape (D, D).
@@ -226,8 +226,8 @@ def _round_diagonal(matrix: Array) -> list[float]:
 def identify_hand(log: Log | str | Path, site: str = "m1") -> HandImpedance:
     """Identifies mass, damping and stiffness of the hand that holds an arm.
 
-    While the person holds the arm, a simulated operator must shake the arms with a sum of sines
-    (kind `multisine`). The command is `trilat identify hand`.
+    While the person holds the arm, a simulated operator must excite the arms with a sum of
+    sines (kind `multisine`). The command is `trilat identify hand`.
 
     >>> hand = tn.identify_hand("run.mcap", "m1")  # doctest: +SKIP
     >>> hand.K.diagonal(), hand.halves["K"].diagonal()  # doctest: +SKIP
@@ -298,8 +298,8 @@ def _list_responses(
 ) -> tuple[_SineResponse, ...]:
     """Returns the response of hand and arm at each frequency, averaged over the segments.
 
-    The responses show how well a frequency determines the hand: the amplitudes, how well they
-    repeat (coherence), and which part of the force the fit does not explain.
+    The responses show how well a frequency determines the hand. They contain the amplitudes,
+    their repeatability (coherence), and the part of the force that the fit does not explain.
 
     Args:
         F: Phasors (complex amplitudes) of the force, shape (segments, F, n), in N.
@@ -330,7 +330,7 @@ def _list_responses(
 
 
 class _Sines(NamedTuple):
-    """Sinusoidal forces that shake an arm, to identify a person's hand by its response.
+    """Sinusoidal forces that excite an arm, to identify a person's hand by its response.
 
     Attributes:
         hz: Frequencies of all sines in rising order, in Hz.
@@ -344,13 +344,13 @@ class _Sines(NamedTuple):
 
 
 def _find_sines(scenario: Scenario) -> _Sines:
-    """Finds the sines with which simulated operators shake the arms, at any site.
+    """Finds the sines with which simulated operators excite the arms, at any site.
 
     The hand is identified by its response to these sines.
 
     Raises:
-        UsageError: No operator of the scenario is of the kind `multisine`. The error says why
-            the hand cannot be identified then.
+        UsageError: No operator of the scenario is of the kind `multisine`. The error explains
+            why the hand cannot be identified without it.
     """
     multisines: list[Multisine] = []
     for site_settings in scenario.sites.values():
@@ -376,7 +376,8 @@ def _compute_hand_force(records: AlignedRecords, scenario: Scenario) -> tuple[Ar
     """Returns the force of the hand ON the end effector, and the end effector's position.
 
     The recorded torque of the operators contains the hand and the simulated operators of the
-    same arm. Operators that follow a script, such as sines, are subtracted from it.
+    same arm. The torques of operators that follow a script, such as sines, are subtracted from
+    it.
 
     Args:
         records: Records of the arm.
@@ -456,8 +457,8 @@ def _compute_coherence(phasors: Complex) -> Array:
     """Returns the coherence of phasors over segments and all axes, shape (F,).
 
     If z is the phasor of a segment, the coherence is |mean of z|^2 / mean of |z|^2, where the
-    means are taken over the segments. It is 1 if all segments are equal, and near 0 if the
-    phasors are random.
+    means are taken over the segments. The coherence is 1 if all segments are equal, and near 0
+    if the phasors are random.
 
     Args:
         phasors: The phasors, shape (segments, F, n).
@@ -477,7 +478,7 @@ class _HandFit(NamedTuple):
     The fit finds the matrices M, B and K for which force = M acceleration + B velocity + K
     displacement holds best.
 
-    There are n axes and F frequencies.
+    Shapes use n axes and F frequencies.
 
     Attributes:
         matrices: M, B and K, shape (3, n, n).
@@ -590,7 +591,7 @@ def _can_distinguish(motions: Complex) -> bool:
 def _stack_real_and_imaginary(phasors: Complex) -> Array:
     """Returns the real parts of complex numbers followed by their imaginary parts.
 
-    This turns K complex equations into 2 K real ones, whose unknowns stay real.
+    This turns K complex equations into 2 K real equations, whose unknowns stay real.
 
     Args:
         phasors: Array of the shape (K, ...).
@@ -604,9 +605,9 @@ def _fit_impedance(force: Complex, motions: Complex, segments: NDArray[np.int64]
     The model is force = motions @ impedance. It is solved by weighted least squares: at each
     frequency, the residual averaged over the segments is divided by the standard deviation of
     the residuals over the segments, so that noisy frequencies count less. The standard
-    deviation itself depends on the impedance, because the person's own movements make the
-    measured motion noisy too. Therefore the problem is nonlinear and needs a first guess, which
-    comes from ordinary least squares.
+    deviation itself depends on the impedance, because the person's own movements also make the
+    measured motion noisy. The problem is therefore nonlinear and needs an initial guess, which
+    is computed by ordinary least squares.
 
     Args:
         force: Phasors of the force along the axis, shape (segments, F).
@@ -621,7 +622,7 @@ def _fit_impedance(force: Complex, motions: Complex, segments: NDArray[np.int64]
     smallest_deviation = 1e-6 * np.abs(mean_force).max()  # avoids a division by zero
 
     def compute_weighted_residuals(impedance: Array) -> Array:
-        """Computes how far the measured force is from the force of the hand model.
+        """Computes the weighted difference between the measured force and the model's force.
 
         At each frequency, the difference is averaged over the segments of the run, and divided
         by its standard deviation over the segments. The forces and motions, and their means,
@@ -632,8 +633,8 @@ def _fit_impedance(force: Complex, motions: Complex, segments: NDArray[np.int64]
                 one after the other, shape (3 n,). n is the number of axes of the motion.
 
         Returns:
-            The real parts and then the imaginary parts, shape (2 F,), for F frequencies. They
-            have no unit.
+            The real parts, followed by the imaginary parts, shape (2 F,), for F frequencies.
+            They have no unit.
         """
         residuals = force - motions @ impedance  # in N, shape (segments, F)
         deviation_over_segments = residuals.std(axis=0)

@@ -1,4 +1,4 @@
-"""Command-line options on how a web page is served: address, port, encryption and browser.
+"""Command-line options for serving a web page: address, port, encryption and browser.
 
 Several commands show a running session on a web page. They share these options, so that an
 option has the same name and meaning in all of them.

@@ -16,8 +16,8 @@ Invariant:
       The arm would otherwise move back and forth between two targets.
     - If no target arrives for 200 ms, the arm is released, because the program may have died.
     - A robot for which no valid torque is available receives its safe command repeatedly.
-    - A message that cannot be used does not end the bridge. It is refused, and counted by the
-      reason. The first refusal for each reason is printed.
+    - A message that cannot be used does not end the bridge. The message is refused, and counted
+      by reason. The first refusal for each reason is printed.
 """
 
 import math
@@ -82,9 +82,9 @@ SAFE_PERIOD_NS = 10_000_000
 DRIVE_PERIOD_S = 0.001
 """Time between two checks for a new torque, in s."""
 NOTICE_PERIOD_S = 0.5
-"""Time between two checks whether a robot measures, in s."""
+"""Time between two checks for measurements of a robot, in s."""
 FIRST_NOTICE_NS = 2 * NS_PER_S
-"""Time without a measurement of a robot after which the user is told, in ns."""
+"""Time without a measurement of a robot after which the user is first told, in ns."""
 NEXT_NOTICE_NS = 60 * NS_PER_S
 """Time without a measurement after which the user is told again, in ns."""
 REQUEST_PERIOD_S = 0.05
@@ -95,14 +95,14 @@ INBOX_MESSAGES = 4096
 """Capacity of each queue of messages from the session."""
 
 JointNames = Sequence[Sequence[str]]
-"""For each joint of an arm, the names that it may have in ROS messages."""
+"""For each joint of an arm, the names that the joint may have in ROS messages."""
 
 
 class _SingleSender:
     """Checks for each message of a topic that only one program publishes on the topic.
 
     Two programs that command the same arm would move it back and forth. The messages of both
-    are refused until one of them has published nothing for `SENDER_TIMEOUT_NS`.
+    are refused until one of them has not published for `SENDER_TIMEOUT_NS`.
 
     Args:
         clock: Clock of this process.
@@ -116,7 +116,7 @@ class _SingleSender:
         self._conflict_ns = self._received_ns
 
     def admit(self, publisher: bytes) -> int:
-        """Accepts a message of a publisher, or refuses it if another publisher is present.
+        """Accepts a publisher's message, or refuses it if another publisher is present.
 
         While two publishers send messages, the messages of both are refused.
 
@@ -178,7 +178,7 @@ class TargetTopic:
         self._clock = clock
         self._sender = _SingleSender(clock)
         self._lock = threading.Lock()
-        # Time of the newest target; None while the topic does not hold the arm.
+        # Time of the newest target; `None` while the topic does not hold the arm.
         self._received_ns: int | None = None
 
     def receive(self, data: bytes, attachment: Attachment) -> None:
@@ -193,7 +193,7 @@ class TargetTopic:
 
         Raises:
             ValueError: The message cannot be read, or two programs publish on the topic. In the
-                second case, the site is told that nobody holds the arm.
+                second case, the arm is released.
             TrilatError: The target is refused.
         """
         with self._lock:
@@ -221,9 +221,9 @@ class TargetTopic:
                 self._release_hand()
 
     def _release_hand(self) -> None:
-        """Stops moving the arm to the targets of a ROS 2 topic, if they move it at present.
+        """Releases the arm if the targets of a ROS 2 topic move it at present.
 
-        The next target then takes control of the arm again.
+        The next target takes control of the arm again.
         """
         if self._received_ns is not None:
             self._received_ns = None
@@ -234,12 +234,12 @@ class DominanceTopic:
     """Subscription to a ROS topic that sets the weights with which a site follows its peers.
 
     The topic is `set_dominance`. Requests to the site wait for its reply and are therefore sent
-    by a thread of their own. If several messages arrive meanwhile, only the newest is used.
-    Messages that repeat the last request are ignored, unless no message has arrived for a
+    by a thread of their own. If several messages arrive during this wait, only the newest is
+    used. Messages that repeat the last request are ignored, unless no message has arrived for a
     second.
 
     Args:
-        peers: Names of the peers, in the order of the numbers in a message.
+        peers: Names of the peers, in the order of the weights in a message.
         change: Function that requests weights from the site, and waits for its reply.
         clock: Clock of this process.
     """
@@ -293,7 +293,7 @@ class DominanceTopic:
         arrived since the last call, it does nothing.
 
         Raises:
-            TrilatError: The site refuses the weights.
+            TrilatError: The site rejects the weights.
         """
         requested = self._requested
         if requested is not None and requested != self._sent_request:
@@ -301,11 +301,11 @@ class DominanceTopic:
             self._change(requested)
 
 
-class SilenceNotice:
+class _SilenceNotice:
     """Composes notices for the user while a robot sends no measurement.
 
-    The first notice is due after `FIRST_NOTICE_NS` without a measurement, and further ones
-    each time after `NEXT_NOTICE_NS`. A measurement starts this sequence again.
+    The first notice is due after `FIRST_NOTICE_NS` without a measurement, and further notices
+    are due every `NEXT_NOTICE_NS`. A measurement restarts this sequence.
 
     Args:
         joints: Names that each joint of the arm may have in ROS messages.
@@ -321,7 +321,7 @@ class SilenceNotice:
         self._other_joints: Sequence[str] = ()
 
     def note_message(self, other_joints: Sequence[str] = ()) -> None:
-        """Notes that a message of the robot has arrived, which need not be a measurement.
+        """Records that a message of the robot has arrived, which need not be a measurement.
 
         Args:
             other_joints: Names of the joints in the message if none of them belongs to the arm.
@@ -331,17 +331,17 @@ class SilenceNotice:
             self._other_joints = other_joints
 
     def note_measurement(self) -> None:
-        """Notes that a measurement of the robot was sent to the site (arm controller).
+        """Records that a measurement of the robot was sent to the site (arm controller).
 
-        No notice of a silent robot is due then.
+        The sequence of notices then starts again.
         """
         self._has_measurement = True
         self._due_ns = self._clock.monotonic_ns() + FIRST_NOTICE_NS
 
     def pop(self, topic: str, site: str) -> str:
-        """Returns a notice that the robot sends no measurement, if one is due. Empty otherwise.
+        """Returns a notice that the robot sends no measurement. Empty if no notice is due.
 
-        The user learns whether the driver of the robot is silent, or sends joints with other
+        The notice states whether the driver of the robot is silent, or sends joints with other
         names.
 
         Args:
@@ -370,7 +370,7 @@ class RobotArm:
     """A ROS robot that is the external arm of a site.
 
     The joint states of the robot are sent to the site, and the torque of the site is sent to
-    the controller of the robot, as a driver with `ArmClient` does. While the arm must brake,
+    the controller of the robot, as in a driver that uses `ArmClient`. While the arm must brake,
     the controller receives its safe command repeatedly.
 
     Args:
@@ -410,7 +410,7 @@ class RobotArm:
 
         self._commands = commands
         self._clock = clock
-        self.silence = SilenceNotice(joints, clock)
+        self.silence = _SilenceNotice(joints, clock)
         self._sender = _SingleSender(clock)
         self._lock = threading.Lock()
         # Process start (boot) and tick of the record whose torque was published last.
@@ -418,9 +418,9 @@ class RobotArm:
         self._safe_ns = clock.monotonic_ns() - SAFE_PERIOD_NS
 
     def receive(self, data: bytes, attachment: Attachment) -> None:
-        """Sends the joint states in a message to the site. It is called in a thread of Zenoh.
+        """Sends the joint states in a message to the site. A thread of Zenoh calls this method.
 
-        A message with none of the joints belongs to another robot and is ignored.
+        A message without any of the joints belongs to another robot and is ignored.
 
         Args:
             data: The message, encoded in CDR, the binary format of ROS 2.
@@ -430,7 +430,7 @@ class RobotArm:
             ValueError: The message cannot be read, or two programs publish.
         """
         self.silence.note_message()
-        state = cdr.read_joint_state(data)
+        state = cdr.RosJoints.read(data)
         known_names = {name for names in self._joints for name in names}
         is_other_robot = bool(state.names) and known_names.isdisjoint(state.names)
         if is_other_robot:
@@ -453,7 +453,7 @@ class RobotArm:
     def send_command(self) -> None:
         """Sends the robot the newest torque of the site, or the safe command if it must brake.
 
-        A torque that has been sent already is not sent again.
+        A torque that has already been sent is not sent again.
         """
         # A site that was restarted needs another client, as a client follows one process.
         if self._client.over:
@@ -461,7 +461,7 @@ class RobotArm:
                 self._client = self._make_client()
 
         record = self._client.record
-        torque = self._client.torque()  # that of `record`, or of a newer record
+        torque = self._client.torque()  # from `record`, or from a newer record
         if record is None or torque is None or not self._may_apply(torque):
             waited_ns = self._clock.monotonic_ns() - self._safe_ns
             if waited_ns >= SAFE_PERIOD_NS:
@@ -477,7 +477,7 @@ class RobotArm:
     def _may_apply(self, torque: Sequence[float]) -> bool:
         """Returns True if a torque may be passed on to the robot.
 
-        The robot must be armed, and the torque must have one number for each joint.
+        The robot must be armed, and the torque must have one entry for each joint.
         """
         return self.armed and len(torque) == len(self._joint_order)
 
@@ -494,8 +494,8 @@ def _order_joints(
 ) -> list[int]:
     """Finds the joint of the scenario to which each joint of the controller corresponds.
 
-    A controller of a robot may list its joints in another order than the scenario, and may have
-    further joints.
+    A robot's controller may list its joints in an order that differs from the scenario, and may
+    have further joints.
 
     Args:
         joints: Names that each joint may have, in the order of the scenario.
@@ -572,7 +572,7 @@ def _find_joint_indices(joints: JointNames, state: cdr.RosJoints) -> list[int]:
 def read_joint_target(joints: JointNames, data: bytes) -> list[float]:
     """Returns the joint angles to which a ROS program commands an arm, from its message.
 
-    The program names the joints, so that their order need not be that of the scenario.
+    The program names the joints, so their order may differ from the order in the scenario.
 
     Args:
         joints: Names that each joint may have, in the order of the arm.
@@ -584,7 +584,7 @@ def read_joint_target(joints: JointNames, data: bytes) -> list[float]:
     Raises:
         ValueError: The message cannot be read, or lacks a joint.
     """
-    state = cdr.read_joint_state(data)
+    state = cdr.RosJoints.read(data)
     indices = _find_joint_indices(joints, state)
     return _check_finite([state.position[index] for index in indices])
 
@@ -615,7 +615,7 @@ def read_vector_target(
     Args:
         frame: Name of the coordinate frame in which the arm expects the vector.
         axes: Number of coordinates to return.
-        count: Number of numbers in the message: 7 in a pose, 6 in a wrench.
+        count: Number of values in the message: 7 in a pose, 6 in a wrench.
         data: The message, encoded in CDR, the binary format of ROS 2.
 
     Returns:
@@ -626,7 +626,7 @@ def read_vector_target(
             is not finite.
     """
     message_frame, numbers = cdr.read_frame_vectors(data, count)
-    # An empty name stands for the default frame.
+    # An empty name means the default frame.
     if message_frame not in ("", frame):
         raise ValueError(
             f"is in the frame {message_frame[:80]!r}, but this site uses {frame!r}"
@@ -704,7 +704,7 @@ class _Bridge:
     def _subscribe_dominance(self, site: str, running: RunningSession) -> None:
         """Subscribes to the topic that sets the weights with which a site follows its peers.
 
-        The changes before the bridge was started are read first, because they determine the
+        Changes from before the start of the bridge are read first, because they determine the
         present weights, which the bridge publishes.
 
         Args:
@@ -795,7 +795,7 @@ class _Bridge:
         return False
 
     def _have_sites_left(self) -> bool:
-        """Returns True if sites were present and all have left, so that the bridge may end."""
+        """Returns True if sites were present and all have left. The bridge may then end."""
         return self._has_seen_site and not self._present
 
     def _publish_messages(self, rate_hz: float) -> bool:
@@ -836,9 +836,9 @@ class _Bridge:
         return has_new_epoch
 
     def _publish_diagnostics(self) -> None:
-        """Publishes the state of all sites on /diagnostics, where tools of ROS show it.
+        """Publishes the state of all sites on /diagnostics, which tools of ROS display.
 
-        Nothing is composed while no ROS program subscribes.
+        No message is composed while no ROS program subscribes.
         """
         if not self._diagnostics.has_subscribers:
             return
@@ -868,11 +868,10 @@ def _describe_target(
         frame: Name of the coordinate frame of the positions and forces in the messages.
 
     Returns:
-        topic: Name of the topic.
-        type: Name of the ROS type of its messages.
-        read: Function that converts an encoded message to a target: joint angles, a force or a
-            position. Raises ValueError if it cannot.
-        send: Function that sends the target to the site.
+        topic: Name of the topic. type: Name of the ROS type of its messages. read: Function
+        that converts an encoded message to a target: joint angles, a force or a position. It
+        raises ValueError if the message is not valid. send: Function that sends the target to
+        the site.
     """
     operator = scenario.sites[site].find_live_hand(is_open=True)
     assert operator is not None
@@ -915,8 +914,8 @@ def _list_joint_names(scenario: Scenario, site: str) -> list[tuple[str, ...]]:
 def _serve_orders(graph: Ros2Graph, running: RunningSession, sites: Sequence[str]) -> None:
     """Offers the orders to stop, enable and reset arms, and to end a session, as ROS services.
 
-    Their names are `/<session>/stop` for all sites, `/<session>/<site>/stop` for one site, and
-    the same for the other orders.
+    The names of the services are `/<session>/stop` for all sites, `/<session>/<site>/stop` for
+    one site, and analogous names for the other orders.
 
     Args:
         graph: Connection to the ROS programs.
@@ -929,8 +928,8 @@ def _serve_orders(graph: Ros2Graph, running: RunningSession, sites: Sequence[str
 
         Args:
             order: Method of `RunningSession` that sends the order. The service has its name.
-            *site: Name of the site, the process that controls one arm. All sites if it is
-                missing.
+            *site: Name of the site, the process that controls one arm. If it is missing, the
+                order is sent to all sites.
         """
         name_parts = [running.name, *site, order.__name__]
         name = "/".join(name_parts)
@@ -948,7 +947,7 @@ def _send_order(order: Callable[..., list[str]], *sites: str) -> bytes:
 
     Args:
         order: Method of `RunningSession` that sends the order.
-        *sites: Names of the sites. All sites if there is none.
+        *sites: Names of the sites. If there are no names, the order is sent to all sites.
 
     Returns:
         The encoded response, with the replies of the sites or the error.
@@ -1011,7 +1010,8 @@ def serve_ros2(
         stopped: Function that returns True to end the call.
         say: Function that prints a line for the user.
         timeout_s: Longest wait for the first site or its router, in s.
-        rviz: File for the configuration of RViz that shows the session. None for no file.
+        rviz: File for the configuration of RViz that shows the session. If `None`, no file is
+            written.
 
     Raises:
         UsageError: There is no router, the file exists, or the settings of a robot do not fit
@@ -1063,11 +1063,12 @@ def publish_session(
         stopped: Function that is called repeatedly. The connection ends early when it returns
             True.
         say: Function that prints a line for the user.
-        rviz: File for the configuration of RViz that shows the session. None for no file.
+        rviz: File for the configuration of RViz that shows the session. If `None`, no file is
+            written.
 
     Returns:
-        True if the session was replaced by another one of the same name, to which the caller
-        has to connect again. False if the session has ended or `stopped` returned True.
+        True if the session was replaced by another session of the same name, to which the
+        caller has to connect again. False if the session has ended or `stopped` returned True.
     """
     with ExitStack() as stack:
         robots: dict[str, RobotArm] = {}
@@ -1111,7 +1112,7 @@ def publish_session(
         say("; ".join([session_text, *input_clauses]))
         if rviz is not None:
             write_session_config(ends, scenario, rviz)
-            say(f"{rviz}: shows the arms: rviz2 -d {rviz}")
+            say(f"{rviz} shows the arms; open it with: rviz2 -d {rviz}")
         return bridge.run(rate_hz, stopped, say)
 
 
@@ -1138,7 +1139,7 @@ def _describe_inputs(ends: BridgeEnds, bridge: _Bridge, robots: Iterable[str]) -
 
     Args:
         ends: Connections to ROS and to the session.
-        bridge: The bridge of the session, which knows the topics with targets.
+        bridge: The bridge of the session, which contains the topics with targets.
         robots: Names of the sites whose arm is a ROS robot.
 
     Returns:
@@ -1169,8 +1170,8 @@ def _open_robot(
         site: Name of the site whose arm is the robot.
         robot: Settings of the robot.
         say: Function that prints a line for the user.
-        joints: Names that each joint may have, in the order of the scenario. Empty uses the
-            names in the settings.
+        joints: Names that each joint may have, in the order of the scenario. If empty, the
+            names in the settings are used.
 
     Yields:
         The robot.
@@ -1203,9 +1204,9 @@ def _open_robot(
 def refuse_other_robots(table: TopicTable, scenario: Scenario) -> None:
     """Checks that each robot belongs to a site with an external arm of as many joints.
 
-    An external arm is a real arm, or a simulation in another program. Only for its site the
-    settings of a robot have a meaning. Settings that equal the defaults are tolerated for the
-    other sites of the scenario, because they change nothing.
+    An external arm is a real arm, or a simulation in another program. The settings of a robot
+    have a meaning only for a site with such an arm. Settings that equal the defaults are
+    tolerated for other sites of the scenario, because they have no effect.
 
     Args:
         table: The user's settings of topics and robots.
@@ -1245,15 +1246,15 @@ def _await_site(ends: BridgeEnds, stopped: Callable[[], bool], *, running: bool)
     Args:
         ends: Connections to ROS and to the session.
         stopped: Function that returns True to end the wait.
-        running: True to wait until a site runs. False accepts a site that still waits for
-            others.
+        running: True to wait until a site runs. If False, a site that still waits for others is
+            accepted.
 
     Returns:
-        The identity of the site. None if `stopped` returned True.
+        The identity of the site. `None` if `stopped` returned True.
     """
     members = SessionMembers(ends.bus, ends.clock, ends.session)
     for info in members.find(stopped=stopped, timeout_s=None):
-        # Members without a scenario, such as the recorder, are no sites.
+        # Members without a scenario, such as the recorder, are not sites.
         is_site = bool(info.scenario)
         if is_site and (info.running or not running):
             return info

@@ -46,7 +46,7 @@ def ros2_command(
 
     Options:
         distro: ROS 2 distribution whose message format the bridge writes.
-        rate: Rate of each topic, Hz.
+        rate: Rate of each topic, in Hz.
         names: Naming scheme of the topics: crisp, crtk, or a TOML file that lists topics and
             robots.
         rviz: Write a configuration of RViz that shows the arms of the session.

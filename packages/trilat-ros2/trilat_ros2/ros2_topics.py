@@ -27,7 +27,7 @@ LATCHED = QualityOfService(latched=True, depth=1)
 
 
 class BridgeEnds(NamedTuple):
-    """The two networks that a bridge connects: that of ROS 2 and that of the session.
+    """The two networks that a bridge connects: the network of ROS 2 and that of the session.
 
     Attributes:
         graph: Connection to the ROS programs.
@@ -67,8 +67,8 @@ class SiteTopics:
     Attributes:
         frame: Name of the frame of the site's end effector.
         shares: Weights with which the site follows its peers (the other sites), over time.
-        newest: Record (result of one tick of the site) that was published last. None before the
-            first one.
+        newest: Record (result of one tick of the site) that was published last. `None` before
+            the first record.
     """
 
     def __init__(
@@ -92,7 +92,7 @@ class SiteTopics:
         self.newest: State | None = None
 
     def _has_listener(self, topic: str) -> bool:
-        """Returns True if a ROS program subscribes to a topic, so that composing pays off."""
+        """Returns True if a ROS program subscribes to a topic, so that messages are needed."""
         return self._publishers[topic].has_subscribers
 
     def publish(self, record: State, rate_hz: float) -> None:

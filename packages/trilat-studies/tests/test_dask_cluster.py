@@ -21,11 +21,7 @@ from tests.net.waiting import until
 from trilat_net.errors import UsageError
 from trilat_net.files import format_extra_install
 from trilat_net.work import dask_cluster
-from trilat_net.work.dask_cluster import (
-    WorkerRequirements,
-    describe_worker,
-    explain_unfit_worker,
-)
+from trilat_net.work.dask_cluster import WorkerRequirements, describe_worker
 from trilat_net.work.executor import open_worker_pool
 
 ROOT = Path(trilat_net.__file__).resolve().parents[1]
@@ -214,12 +210,12 @@ def test_differences_are_named_on_both_sides() -> None:
     """A worker with another version or without a law is described; another commit fits."""
     worker = describe_worker()
     requirements = WorkerRequirements(worker)
-    assert explain_unfit_worker(requirements, worker, []) == ""
-    assert explain_unfit_worker(requirements, {**worker, "commit": "other"}, []) == ""
+    assert requirements.explain_unfit_worker(worker, []) == ""
+    assert requirements.explain_unfit_worker({**worker, "commit": "other"}, []) == ""
     for name in ("trilat-net", "arithmetic", "Python", "numpy", "numba", "scipy"):
-        text = explain_unfit_worker(requirements, {**worker, name: "other"}, [])
+        text = requirements.explain_unfit_worker({**worker, name: "other"}, [])
         assert f"has {name} other, but the study needs {name} {worker[name]}" in text
-    assert "a.b:Law" in explain_unfit_worker(requirements, worker, ["a.b:Law"])
+    assert "a.b:Law" in requirements.explain_unfit_worker(worker, ["a.b:Law"])
 
 
 @pytest.mark.long

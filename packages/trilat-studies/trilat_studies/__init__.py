@@ -4,6 +4,6 @@ The package adds commands such as `trilat sweep`, and functions such as `trilat_
 is a distribution of its own, which registers them by the entry points of its pyproject.toml.
 
 Invariant:
-    - The result of a study depends on its plan alone. The number of worker processes, and the
+    - The result of a study depends only on its plan. The number of worker processes, and the
       order in which they finish, have no influence.
 """

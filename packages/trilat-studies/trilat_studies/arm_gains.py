@@ -1,8 +1,8 @@
 """Finds the largest gains with which equal arms can follow each other over a delay.
 
 The longer the delay, the smaller the gains with which the arms stay stable. `tune_arm` takes
-the model of an arm and a delay, and returns a stiffness K and dampings for each joint: d of the
-velocity, and for some control laws Kd of the velocity of the position error. One number k, in
+the model of an arm and a delay, and returns a stiffness K and dampings for each joint: d for
+the velocity and, for some control laws, Kd for the rate of the position error. One number k, in
 1/s^2, determines all of them:
 
     K = k m,    d + Kd = 2 zeta sqrt(k) m,
@@ -19,13 +19,13 @@ Two limits bound the gains, and the result keeps a margin to both:
   is too large, it reverses the velocity in every tick. This happens first in the direction in
   which the arm has the least inertia. Where this limit requires it, m is chosen smaller.
 
-For a single joint at a wall, this edge is known: J. J. Gil, A. Avello, A. Rubio and J. Florez,
+Sources for the edge of a single joint at a wall: J. J. Gil, A. Avello, A. Rubio and J. Florez,
 "Stability analysis of a 1 DOF haptic interface using the Routh-Hurwitz criterion", IEEE Trans.
 Control Systems Technology 12 (2004); over delays, T. Hulin, C. Preusche and G. Hirzinger,
 "Stability boundary for haptic rendering: influence of physical damping", IROS 2006.
 
 Invariant:
-    - A result is a function of its arguments.
+    - A result depends only on the arguments.
     - Friction, joint stops and torque limits are left out. Friction only helps, and limits do
       not act on small motions.
 """
@@ -84,13 +84,13 @@ _HALF_SLIDE_M = 0.5
 _SETTLES = 4.0
 """First duration of a run, in time constants of its slowest motion."""
 _SHORTEST_S = 2.0
-"""Least first duration of a run, in s."""
+"""Smallest first duration of a run, in s."""
 _LONGEST_S = 400.0
 """Largest first duration of a run, in s."""
 _EXTENSIONS = 3
-"""Number of durations of a run that are tried, each twice as long as the one before."""
+"""Number of durations of a run that are tried, each twice as long as the previous one."""
 _IS_STABLE = {EnvelopeTrend.GROWS: False, EnvelopeTrend.DECAYS: True}
-"""Whether a run is stable, by the trend of its speed. Other trends leave this undecided."""
+"""Stability of a run, by the trend of its speed. Other trends leave it undecided."""
 _NO_GAIN = 1e-6
 """Negligible gain of the loop before its gains are set."""
 _CURVE_POINTS = 9
@@ -98,9 +98,9 @@ _CURVE_POINTS = 9
 _EDGE_TOLERANCE = 1e-4
 """Tolerance of ln k at the edge."""
 _FITTING_STEP = 0.9
-"""Least factor by which m is reduced in one step."""
+"""Smallest factor by which m is multiplied in one step."""
 _NO_ROOT_PER_S = -1e3
-"""Real part that stands for a loop without roots, in 1/s."""
+"""Real part that represents a loop without roots, in 1/s."""
 _DELAY = re.compile(r"(\d+\.?\d*|\.\d+) ?(us|ms|s|)")
 """A number with an optional unit, as in "40ms"."""
 _UNIT_MS = {"us": 1e-3, "ms": 1.0, "": 1.0, "s": 1e3}
@@ -122,21 +122,21 @@ class ArmGains(Result):
         sites: Number of arms.
         rate_hz: Tick rate of the control loop, in Hz.
         delay: Description of the delay of the links, in words.
-        age_ms: Constant age of samples that stands for the delay, in ms.
+        age_ms: Constant age of samples that represents the delay, in ms.
         margin: Factor by which the stiffness lies below the edge.
         damping: Damping ratio of the gains.
         joints: For each joint, the inertia m, the gains with their unit, and the position error
             at which the effort limit of the joint is reached.
         edge: Values of k at the edge, in 1/s^2. There are three: of the sampled loop with the
-            delays in use, of the sampled loop with a constant delay, and in continuous time.
-            None means that there is no edge. Further entries are the k from which the damping
-            makes a motion swing from tick to tick; the frequency, motion and pose at the edge;
-            and whether the delay or the tick rate limits K.
-        runs: Simulated runs that check the gains. The entry `share` is None for the gains
-            themselves. For the other runs it is the value of k as a fraction of that at the
-            edge. Each run has two growth rates: one that was measured from the largest speed,
-            which is None if the motions were not small, and one that the characteristic roots
-            of the linearised loop predict.
+            delays in use, of the sampled loop with a constant delay, and in continuous time. A
+            value is `None` if there is no edge. Further entries are the smallest k at which the
+            damping makes a motion swing from tick to tick; the frequency, motion and pose at
+            the edge; and whether the delay or the tick rate limits K.
+        runs: Simulated runs that check the gains. The entry `share` is `None` for the run with
+            the gains themselves. For the other runs it is their k as a fraction of the k at the
+            edge. Each run has two growth rates. The first is measured from the largest speed,
+            and is `None` if the motions were not small. The second is predicted by the
+            characteristic roots of the linearised loop.
         agree: True if all runs behave as the roots predict, and the run with the gains decays.
         line: The gains as a line to paste above the tables of a scenario.
         curve: Pairs of a delay, in s, and k at the edge in the same pose. Empty unless
@@ -198,18 +198,19 @@ class ArmGains(Result):
         """Yields the lines about the limits of k, where the stiffness is K = k m.
 
         m is the inertia of a joint, and k has the unit 1/s^2. The limits, see the attribute
-        `edge`, are the values of k from which on
+        `edge`, are the smallest values of k at which
 
         - small motions grow: in the loop as it is, with a constant delay, and in continuous
           time ("none" if they never grow there). This is the edge of stability;
         - the damping, which grows with sqrt(k), reverses a velocity in every tick (control
           period).
 
-        The lines also tell which joints move at the edge, with which frequency, in which pose
+        The lines also state which joints move at the edge, with which frequency, in which pose
         the edge is lowest, and which of the two limits bounds the stiffness.
         """
         edge = self.edge
-        # Only the text about the moving states is needed: the value of the root is arbitrary.
+        # Only the text about the moving states is needed, so the value of the root is
+        # arbitrary.
         moving_states = tuple(edge["moves"])
         motion = CharacteristicRoot(s=0j, multiplicity=1, states=moving_states).description
         yield (
@@ -234,7 +235,7 @@ class ArmGains(Result):
 def _format_cell(value: Any) -> str:
     """Returns the text of a table cell, in which a number has four digits.
 
-    A text stays as it is, and an empty value becomes "-".
+    A text is returned unchanged, and an empty value becomes "-".
     """
     if isinstance(value, float):
         return f"{value:.4g}"
@@ -242,7 +243,7 @@ def _format_cell(value: Any) -> str:
 
 
 def _describe_run(run: Mapping[str, Any]) -> str:
-    """Returns a sentence on a simulation that confirms the limit of stability or the gains.
+    """Returns a sentence about a simulation that confirms the limit of stability or the gains.
 
     An example is "run of 20 s at 0.97 of the edge: decays -0.12 /s; by its roots -0.118 /s".
 
@@ -261,11 +262,11 @@ def _describe_run(run: Mapping[str, Any]) -> str:
 
 
 def _read_delay(delay: str | float) -> tuple[dict[str, Any], str]:
-    """Reads the delay for which gains are wanted.
+    """Reads the delay for which gains are computed.
 
     Args:
-        delay: A number with an optional unit, a table of delays, or a log. Of a log, the link
-            with the longest median delay is used.
+        delay: A number with an optional unit, a table of delays, or a log. If it is a log, the
+            link with the longest median delay is used.
 
     Returns:
         The table [link] of a scenario with this delay, and a description for the user.
@@ -379,7 +380,7 @@ def _build_loop(
 def _draw_poses(scenario: Scenario, count: int, seed: int) -> Array:
     """Draws random poses within the limits of the joints.
 
-    A joint without limits, or with wide ones, stays within half a turn or half a metre of the
+    A joint without limits, or with wide limits, stays within half a turn or half a metre of the
     position that is closest to 0.
 
     Args:
@@ -423,7 +424,7 @@ class _GainSearch:
         poses: Poses in which the loop is analysed, shape (count, n).
         margin: Factor by which the stiffness lies below the edge.
         damping: Damping ratio of the gains.
-        quantile: Quantile of varying ages of samples (received states) that stands for a
+        quantile: Quantile of varying ages of samples (received states) that is used as their
             constant age.
 
     Attributes:
@@ -446,7 +447,8 @@ class _GainSearch:
         self._scenario = scenario
         self._poses = poses
         self._margin = margin
-        # Damping ratio at the edge, where the damping is the same and K larger by the margin.
+        # Damping ratio at the edge, where the damping is the same and K is larger by the
+        # margin.
         self._damping = damping / math.sqrt(margin)
 
         self.conditions = OperatingConditions.derive(scenario)
@@ -508,7 +510,7 @@ class _GainSearch:
             ratio, participation = self._find_lightest()
 
     def _find_lightest(self) -> tuple[float, Array]:
-        """Finds the motion that is lightest in relation to the inertias m of its joints.
+        """Finds the motion with the smallest inertia relative to the inertias m of its joints.
 
         Returns:
             The largest eigenvalue of m M^-1 over the poses, where M is the inertia matrix; and
@@ -540,7 +542,7 @@ class _GainSearch:
         return self.conditions._replace(age_s=ages_s, varying=False)
 
     def build_law(self, k: float, stiffness_divisor: float = 1.0) -> Any:
-        """Returns the control law with the gains that belong to a gain parameter k.
+        """Returns the control law with the gains that a gain parameter k determines.
 
         A joint with the inertia m gets the following gains, where K is the stiffness, d the
         damping of the velocity, Kd the damping of the velocity error, and zeta the damping
@@ -580,8 +582,9 @@ class _GainSearch:
     ) -> CharacteristicRoot:
         """Returns the characteristic root of the linearised loop with the largest real part.
 
-        The loop is linearised about a rest in the given pose. The real part of the root is the
-        rate, in 1/s, at which small motions grow. A negative value means that they decay.
+        The loop is linearised about the state of rest in the given pose. The real part of the
+        root is the rate, in 1/s, at which small motions grow. A negative value means that they
+        decay.
 
         Args:
             law: Control law with its gains.
@@ -590,7 +593,8 @@ class _GainSearch:
             sampled: True to analyse the sampled loop, False to analyse it in continuous time.
 
         Returns:
-            The root. If the loop has no roots, a root with a large negative real part.
+            The root. If the loop has no roots, a root with a large negative real part is
+            returned.
         """
         sites = []
         for site in loop.sites:
@@ -616,7 +620,7 @@ class _GainSearch:
         """Finds the least k at which small motions grow in one of several poses.
 
         In each pose, k is raised from `start` until motions grow. Then the edge below that k is
-        located with Brent's method. A later pose is searched only if motions already grow there
+        located with Brent's method. A later pose is searched only if motions in this pose grow
         just below the least edge so far.
 
         Under varying delays, motions may grow, decay and grow again as k rises. Therefore the
@@ -648,8 +652,8 @@ class _GainSearch:
             def growth(log_k: float, pose: Array = pose) -> float:
                 """Returns the rate at which small motions about a pose grow, in 1/s.
 
-                It depends on the gain k. A negative rate means that the motions decay, so that
-                the control loop is stable.
+                The rate depends on the gain k. A negative rate means that the motions decay,
+                and the control loop is stable.
                 """
                 law = self.build_law(math.exp(log_k))
                 root = self.find_root(law, pose, loop, sampled=sampled)
@@ -659,7 +663,7 @@ class _GainSearch:
             if least_edge != math.inf:
                 # Only a pose whose edge is lower than the least edge so far matters.
                 candidates = [math.log(least_edge) - 10.0 * _EDGE_TOLERANCE]
-            # bracket the edge: first a value that grows, then one below it that does not
+            # bracket the edge: first find a k with growing motions, then a smaller k without
             high = next((log_k for log_k in candidates if growth(log_k) > 0.0), None)
             if high is None:
                 continue
@@ -769,7 +773,8 @@ class _GainSearch:
             law: Control law with its gains.
             share: The gains of `law` as a fraction of the largest stable gains: their parameter
                 k divided by the least k at which motions grow, where the stiffness is k times
-                the inertia. None for the tuned gains. The value is only copied into the result.
+                the inertia. `None` for the tuned gains. The value is only copied into the
+                result.
             pose: Pose of all arms, shape (n,), in rad or m, for n joints.
             push: Displacement of the first arm, shape (n,), in rad or m.
 
@@ -862,12 +867,12 @@ def tune_arm(
             columns t_s,delay_ms, or a log, as in "measured:run.mcap".
         law: Name of the control law: p_d, pd_d or saturated_pd.
         set: Overrides of the loop, as in `{"arm.armature_kg_m2": 0.1}`.
-        tip: Name of the end link. Empty stands for the only link without a child.
+        tip: Name of the end link. If empty, the only link without a child is the end link.
         sites: Number of arms: 2, or 3 that follow their two peers equally.
         rate_hz: Tick rate, in Hz.
         margin: Factor by which K lies below the edge, and the damping below its sampled-data
             limit.
-        damping: Damping ratio of the inertia m against a peer that stands still.
+        damping: Damping ratio of the inertia m when its peer stands still.
         quantile: Quantile of varying delays for which the edge of a constant delay is computed.
         poses: Number of random poses within the limits of the joints.
         seed: Seed of the poses.
@@ -948,7 +953,7 @@ def _tabulate_joints(
     """Returns the inertia and the control gains of each joint of an arm, with units.
 
     A row also has the position error at which the spring reaches the torque limit of the joint.
-    It is None for a joint without a limit. See `ArmGains.joints`.
+    This error is `None` for a joint without a limit. See `ArmGains.joints`.
 
     Args:
         scenario: Scenario with the arm.

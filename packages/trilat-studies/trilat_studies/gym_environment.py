@@ -66,8 +66,8 @@ def make_env(
     >>> observation["peer_q"].shape
     (1, 2)
 
-    Several environments advance side by side on one core, and each one gives the same bits as
-    alone:
+    Several environments advance side by side on one core. Each gives the same bits as if it
+    were alone:
 
     >>> envs = tn.make_env("two_sites", bent, user="m", duration_s=1, num_envs=8)
     >>> observations, infos = envs.reset(seed=1)  # the seeds 1 to 8
@@ -78,25 +78,26 @@ def make_env(
         scenario: Name of a shipped scenario, a path, a TOML text, its tables, or a scenario.
         set: Overrides, as in `{"link.delay_ms": 100}`.
         num_envs: Number of environments that advance together, as one environment of the class
-            `gymnasium.vector.VectorEnv`. None makes a single environment. If they cannot be
-            computed side by side, they are stepped one by one; the attribute `obstacle` has the
-            reason. Each of them has a copy of the task.
+            `gymnasium.vector.VectorEnv`. If `None`, a single environment is returned. If the
+            environments cannot be computed side by side, they are stepped one by one, and the
+            attribute `obstacle` states the reason. Each environment has a copy of the task.
         autoreset_mode: When the next episode of an environment begins: "NextStep" after an
             episode has ended, "SameStep" at its end, or "Disabled".
         **settings: The arguments that follow, by their names.
         user: Site whose arm the actions move.
-        mode: Meaning of an action, "tip", "joint" or "force", as for a live operator. Empty
-            keeps the mode of the scenario.
+        mode: Meaning of an action, "tip", "joint" or "force", as for a live operator. If empty,
+            the mode of the scenario is kept.
         rate_hz: Number of steps per second.
         delay_ms: Time from an observation until its action takes effect, in ms.
-        duration_s: Duration of an episode, in s. None keeps the duration of the scenario.
-        task: Task of the episodes. By default the site `leads` brings its end effector to a
-            random position.
+        duration_s: Duration of an episode, in s. If `None`, the duration of the scenario is
+            kept.
+        task: Task of the episodes. By default, the site `leads` must bring its end effector to
+            a random position.
         vary: Keys of the scenario that each episode draws at random. A tuple of two numbers is
             a pair of bounds, `(0, 300)`; a list has the possible values, `[0, 300]`.
         leads: Site that does the task.
         render_mode: With "rgb_array", `render` returns a picture of the arms and the goal. With
-            None, `render` returns None.
+            `None`, `render` returns `None`.
         flat: True if observations are one array of float32 instead of a dictionary, and actions
             are float32.
         normalize: True if actions and observations are numbers in [-1, 1]. An action of 1 is
@@ -105,8 +106,9 @@ def make_env(
 
     Raises:
         ScenarioError: The scenario or an override is not valid.
-        UsageError: There is no such site, the rate is not valid, or Gymnasium is missing.
-            Another argument cannot have its value; the message names both.
+        UsageError: There is no such site, the rate is not valid, or Gymnasium is missing. The
+            same error is raised if another argument has an invalid value, which the message
+            names.
     """
     env = TeleoperationEnv(scenario, set, **settings)
     if num_envs is None:

@@ -1,9 +1,9 @@
-"""Compares recorded runs: the differences of their experiments, their metrics, and remarks.
+"""Compares recorded runs: differences between their experiments, their metrics, and remarks.
 
 A log is the record of a run. Its scenario, the description of the experiment, is stored in it.
 
 Invariant:
-    - The comparison states numbers and ranks nothing.
+    - The comparison states measured values and does not rank the runs.
 """
 
 from collections.abc import Iterator, Sequence
@@ -47,18 +47,18 @@ _NEGLIGIBLE = {
     "N²m²s": 1.0,
     "J": 0.1,
 }
-"""By unit the magnitude below which a value is negligible for a person who moves an arm.
+"""Magnitude below which a value is negligible for a person who moves an arm, by unit.
 
-A force of 0.1 N and a distance of 1 mm can hardly be felt or seen. Without such a scale, the
-change from no torque to 0.06 N m would be as large as that from 0 to 10 N m.
+A force of 0.1 N and a distance of 1 mm can hardly be felt or seen. Without such a scale,
+a change from 0 to 0.06 N m would count as much as a change from 0 to 10 N m.
 """
 _UNDELAYED_KEYS = ("undelayed_max_rad", "undelayed_max_m")
-"""Keys of the largest distance from where the peers are at the same time."""
+"""Keys of the metrics of the largest distance from the peers' positions at the same time."""
 _SUBJECTS = {
     "max": "largest of {}s",
     "sum": "sum of {}s",
 }
-"""How the number of a run follows from those of its sites, links or walls, by `reduction`."""
+"""How a run's value is computed from those of its sites, links or walls, by `reduction`."""
 
 
 class _ComparisonRow(NamedTuple):
@@ -74,7 +74,7 @@ class _ComparisonRow(NamedTuple):
 
     @property
     def values(self) -> tuple[float | None, ...]:
-        """Value of one quantity in each of the compared logs. None if a log lacks it."""
+        """Value of one quantity in each of the compared logs. `None` if a log lacks it."""
         return tuple(entry.value for entry in self.entries)
 
 
@@ -128,7 +128,7 @@ def compare_metrics(logs: Sequence[Log], names: Sequence[str] = ()) -> _MetricCo
 def comparison_to_json(comparison: _MetricComparison) -> dict[str, Any]:
     """Returns a comparison of runs as plain values, ready for JSON.
 
-    A missing number is None, with the reason next to it.
+    A missing value is `None`, with the reason next to it.
 
     Args:
         comparison: The comparison.
@@ -150,13 +150,15 @@ def comparison_to_json(comparison: _MetricComparison) -> dict[str, Any]:
 
 @dataclass(frozen=True, repr=False)
 class LogComparison(Result):
-    """How several logs differ, in measured quantities and in settings. `compare` creates it.
+    """Differences between several logs in measured quantities and in settings.
+
+    `compare` creates this object.
 
     Attributes:
         logs: The logs.
         metrics: The metrics, with one row per quantity and one column per log.
-        differences: Differences of the scenarios. Empty if all scenarios are the same.
-        means: Mean of each row, if the logs differ in the seeds of their random numbers only.
+        differences: Differences between the scenarios. Empty if all scenarios are the same.
+        means: Mean of each row, if the logs differ only in the seeds of their random numbers.
             Empty otherwise.
         remarks: For each column, the judgement of the run and remarks on its end.
     """
@@ -183,8 +185,8 @@ class LogComparison(Result):
     def blocks(self) -> Iterator[Block]:
         """Yields the parts of the text that `trilat compare` prints.
 
-        The parts are the differences of the experiments, a table of the metrics, notes on how
-        each run ended, and reasons for missing values.
+        The parts are the differences between the experiments, a table of the metrics, notes on
+        how each run ended, and reasons for missing values.
         """
         yield from self._compose_differences()
         yield ""
@@ -203,8 +205,8 @@ class LogComparison(Result):
     def brief_blocks(self) -> Iterator[Block]:
         """Yields the short text that `trilat compare` prints without --all.
 
-        The parts are the differences of the experiments, the judgement of each run, a table of
-        the metrics that differ most, and a sentence that sums up.
+        The parts are the differences between the experiments, the judgement of each run, a
+        table of the metrics that differ most, and a summary in one sentence.
         """
         yield from self._compose_differences()
         yield ""
@@ -234,10 +236,10 @@ class LogComparison(Result):
             yield f"to see the runs together: trilat figure {first} {files}"
 
     def _compose_differences(self) -> Iterator[Block]:
-        """Yields how the experiments of the logs differ, as a table with a row per difference.
+        """Yields a table of the differences between the experiments, with a row per difference.
 
-        Logs of scenarios with different names get a sentence in addition. If nothing differs, a
-        sentence says so.
+        If the names of the scenarios differ, a sentence states this. If nothing differs, a
+        sentence replaces the table.
         """
         names = {log.scenario.name for log in self.logs}
         if len(names) > 1:
@@ -253,10 +255,10 @@ class LogComparison(Result):
             yield "the same experiment"
 
     def _describe_undelayed_errors(self) -> str:
-        """Returns a phrase with each arm's largest distance from where its peers really were.
+        """Returns a phrase with each arm's largest distance from its peers' true positions.
 
-        The ordinary errors compare an arm with what it has received of its peers (the other
-        arms), so that a longer delay hardly shows in them.
+        The ordinary errors compare an arm with the delayed states that it has received from its
+        peers (the other arms). A longer delay therefore hardly changes these errors.
         """
         texts = []
         for row in self.metrics.rows:
@@ -394,7 +396,7 @@ def compare(*logs: str | Path | Log) -> LogComparison:
 
 
 def _measure_difference(row: _ComparisonRow) -> float:
-    """Returns how far the values of a metric are apart, relative to their magnitude.
+    """Returns the spread of the values of a metric, relative to their magnitude.
 
     The negligible magnitude m of the unit is part of the scale:
 
@@ -404,8 +406,8 @@ def _measure_difference(row: _ComparisonRow) -> float:
         row: The metric in each run.
 
     Returns:
-        The relative difference. 0 if fewer than two values are known, or if all values are
-        negligible.
+        The relative difference. It is 0 if fewer than two values are known, or if all values
+        are negligible.
     """
     known_values = [value for value in row.values if value is not None]
     largest = max(map(abs, known_values), default=0.0)
@@ -420,8 +422,8 @@ def _select_most_different(
 ) -> list[_ComparisonRow]:
     """Returns the metrics that differ most between runs, in their order.
 
-    Errors of the computation, which are rounding of different size in every run, are left out.
-    Metrics whose values are all negligible come last.
+    Metrics that consist of rounding errors are left out, because these errors differ in every
+    run. Metrics whose values are all negligible come last.
 
     Args:
         rows: The metrics of the runs.
@@ -460,7 +462,7 @@ def _name_columns(files: Sequence[Path]) -> list[str]:
             names.append(name)
         if len(set(names)) == len(names):
             return names
-    # Some files are the same, or differ only in their suffix.
+    # Some paths are equal, or differ only in their suffix.
     return [f"{n}: {file}" for n, file in enumerate(files, 1)]
 
 
@@ -474,7 +476,7 @@ def _average_repeats(
         metrics: Their metrics.
 
     Returns:
-        The mean of each row, or None if it cannot be computed. The list is empty if the logs
+        The mean of each row, or `None` if it cannot be computed. The list is empty if the logs
         differ in more than their seeds.
     """
     first = logs[0].scenario
@@ -496,7 +498,7 @@ def _tabulate_quantities(
     Args:
         metrics: The metrics.
         columns: Names of the logs.
-        means: Mean of each row, for another column. Empty if there is no such column.
+        means: Mean of each row, for an additional column. Empty if there is no such column.
     """
     rows: list[list[str]] = []
     mean_by_row = dict(zip(metrics, means, strict=True)) if means else {}

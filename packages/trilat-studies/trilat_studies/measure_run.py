@@ -1,13 +1,14 @@
 """Measures a run, such as its largest error, and compares the results with the expected limits.
 
-A scenario, the file that describes an experiment, may contain a table [expect] of what a run
-must achieve. For example, `peak_error_max_rad` limits the largest error. This module computes
-the metrics that the table can limit, from a simulation or from the log of a run.
+A scenario, the file that describes an experiment, may contain a table [expect] with
+requirements on its runs. For example, `peak_error_max_rad` limits the largest error. This
+module computes the metrics that the table can limit, from a simulation or from the log of a
+run.
 
 Invariant:
     - Each metric has one definition. Both a simulation and a log pass their records, batch by
       batch in the order of time, to the same running statistics (`SiteStats`).
-    - A metric that a run cannot give is None, and never a guess.
+    - A metric that cannot be computed for a run is `None`, and never a guess.
     - Memory is bounded, however long the run is. Only extrema, sums, the last second of the
       records, and a summary of the motion are kept.
     - The division of a run into batches changes only the last bits of a mean.
@@ -64,10 +65,10 @@ _VECTORS = ("q", "qd", "q_des", "tau", "tau_x", "x")
 class RecordBatch(NamedTuple):
     """Results of consecutive ticks of one arm, as one array per quantity.
 
-    Metrics are computed from such batches, because statistics of arrays are much faster than
-    those of single records. K is the number of records, n the number of joints, m the number of
-    coordinates that the sites agree on, and P the number of peers, the other sites whose states
-    this site receives.
+    Metrics are computed from such batches, because statistics are computed much faster from
+    arrays than from single records. K is the number of records, n the number of joints, m the
+    number of coordinates that the sites agree on, and P the number of peers, the other sites
+    whose states this site receives.
 
     Attributes:
         t_ns: Nominal times, shape (K,), in ns.
@@ -90,7 +91,7 @@ class RecordBatch(NamedTuple):
     used: Ints
 
     def since(self, t_ns: int) -> "RecordBatch":
-        """Returns the records of control periods that are later than a given time.
+        """Returns the records of ticks (control periods) later than a given time.
 
         Args:
             t_ns: The time, in ns. A record at exactly this time is not returned.
@@ -136,7 +137,7 @@ class RecordBatch(NamedTuple):
 
         Args:
             first: First index.
-            stop: End of the range. None for all following records.
+            stop: End of the range. If `None`, all following records are returned.
         """
         columns = [column[first:stop] for column in self]
         return RecordBatch._make(columns)
@@ -162,7 +163,7 @@ def _build_batch(axes: Sequence[float], t_ns: Ints, used: Ints, *vectors: Array)
     reference. Otherwise it is the difference between the joint angles and their reference.
 
     Args:
-        axes: For each coordinate of the task, 1 if the site follows along it, and else 0.
+        axes: For each task coordinate, 1 if the site follows its peers along it, otherwise 0.
         t_ns: Nominal times, shape (K,), in ns.
         used: Samples in use, shape (K, P), as in `RecordBatch`.
         vectors: The arrays q, qd, q_des, tau, tau_x and x, shape (K, ...) each. The pose x of
@@ -188,14 +189,14 @@ def run_in_batches(
     """Runs a scenario in virtual time, and passes the records on batch by batch.
 
     Long runs thus need little memory. Virtual time means that a simulated clock replaces the
-    real one.
+    real clock.
 
     Args:
         scenario: Scenario to run: arms, control laws, links and duration.
         receivers: For each site, the function that receives its batches.
 
     Returns:
-        The time at which the first site left the limits of its arm, in s, or None if no site
+        The time at which the first site left the limits of its arm, in s, or `None` if no site
         did; and the number of samples that arrived too late to be used as planned.
     """
     pending: dict[str, list[TickRecord]] = {name: [] for name in receivers}
@@ -318,12 +319,12 @@ class _CompiledRun:
 
 
 class WholeRun(NamedTuple):
-    """A simulated run of which all records were kept in memory, for measures of the whole run.
+    """A simulated run with all of its records in memory, for metrics of the whole run.
 
     Attributes:
         records: Records of each site, by its name.
         end: Judgement of the end of the run, for example whether the arms came to rest.
-        run: The run itself, which knows its final state.
+        run: The run itself, which contains its final state.
     """
 
     records: dict[str, RecordBatch]
@@ -351,7 +352,7 @@ class WholeRun(NamedTuple):
     ) -> "Iterator[tuple[int, WholeRun, str]]":
         """Simulates several scenarios, as many as possible at once, and keeps their records.
 
-        Scenarios that differ in numbers only share the vector instructions of the processor.
+        Scenarios that differ only in numbers are computed together with vector instructions.
         Each run equals that of `simulate` bit for bit.
 
         Args:
@@ -359,8 +360,8 @@ class WholeRun(NamedTuple):
 
         Yields:
             The index of a scenario; its run, equal to that of `simulate`; and the property
-            because of which it was computed alone, or an empty text. The order is that of
-            groups of runs, of which one is in memory at a time.
+            because of which it was computed alone, or an empty text. The runs are in the order
+            of their groups, of which one at a time is in memory.
         """
         batches: list[dict[str, list[RecordBatch]]] = []
         compiled = []
@@ -397,7 +398,7 @@ def _finish_together(compiled: Sequence[_CompiledRun]) -> Iterator[tuple[int, st
     for group in group_runs([member.run for member in compiled], _RECORD_ROWS):
         members = [compiled[index] for index in group.members]
         while running := [member for member in members if not member.run.is_finished]:
-            # Runs of a group have the same duration, and are at the same time.
+            # Runs of a group have the same duration, and advance together.
             group.advance_to(running[0].run.find_batch_end())
             for member in running:
                 member.pass_records(member.run.pop_records())
@@ -441,7 +442,7 @@ class WindowStats:
     """Statistics of one arm in a part of the run, for which the scenario states limits.
 
     Such a part is called a window in the table [expect] of the scenario. The statistics are
-    updated batch by batch, so that no records need to be kept.
+    updated batch by batch, so the records need not be kept.
 
     Args:
         from_s: Start of the part of the run, in s.
@@ -475,7 +476,7 @@ class WindowStats:
         self._hits = 0
 
     def add(self, rows: RecordBatch) -> None:
-        """Updates the statistics of an interval of time by the next records of an arm.
+        """Updates the statistics of a time interval with the next records of an arm.
 
         Records outside of the interval are ignored.
 
@@ -505,7 +506,7 @@ class WindowStats:
             self._add_wall_force(total_force)
 
     def _raise_peak(self, key: str, values: Array) -> None:
-        """Raises the largest absolute value of a quantity, if new records exceed it.
+        """Updates the largest absolute value of a quantity with new records.
 
         Args:
             key: Name of the peak.
@@ -544,7 +545,7 @@ class WindowStats:
 
         A scenario can limit quantities in intervals of the run, which it calls windows of its
         table [expect]. Joint angles have a smallest and a largest value. All other quantities,
-        such as a mean or a peak, have a single value, which is both.
+        such as a mean or a peak, have a single value, which is used as both.
 
         Returns:
             The ranges, by the keys of the table [expect]. Empty if the records end before the
@@ -597,7 +598,7 @@ class SiteStats:
         site: Name of the site whose records are evaluated.
 
     Attributes:
-        windows: Statistics within each window of [expect]. None for windows of other sites.
+        windows: Statistics within each window of [expect]. `None` for windows of other sites.
         records: Number of records.
         peak_error_rad: Largest |e| of any joint, in rad.
         peak_torque_nm: Largest absolute control torque of any joint, in N m.
@@ -640,7 +641,7 @@ class SiteStats:
         self._tail: list[RecordBatch] = []
 
     def add(self, rows: RecordBatch) -> None:
-        """Updates the errors, torques, sample ages and other statistics by further records.
+        """Updates the errors, torques, sample ages and other statistics with further records.
 
         Args:
             rows: The next records of the arm. They must follow the records of the previous
@@ -674,7 +675,8 @@ class SiteStats:
         for window in filter(None, self.windows):
             window.add(rows)
 
-        # Only the last second is kept: a batch is dropped once the next one covers it alone.
+        # Only the last second is kept: a batch is dropped once the next batch covers this
+        # second.
         self._tail.append(rows)
         last_second_ns = rows.t_ns[-1] - _END_NS
         while len(self._tail) > 1 and self._tail[1].t_ns[0] < last_second_ns:
@@ -701,9 +703,9 @@ class SiteStats:
 
     @property
     def last_ns(self) -> int:
-        """Nominal time of the last record, in ns since the epoch. -1 before the first record.
+        """Nominal time of the last record, in ns since the epoch. It is -1 before any record.
 
-        The metrics of the last second, and the length of the run, count from it.
+        The last second and the duration of the run are computed from this time.
         """
         if not self._tail:
             return -1
@@ -742,7 +744,7 @@ class SiteStats:
     def end(self, end_ns: int) -> RecordBatch:
         """Returns the records of the last second of the run, for the metrics `end_...`.
 
-        A metric such as the error at rest is evaluated there.
+        A metric such as the error at rest is evaluated in the last second.
 
         Args:
             end_ns: Time of the run's last record, in ns. If the records of this arm end earlier
@@ -778,12 +780,12 @@ class SiteStats:
 class LinkAge(msgspec.Struct, frozen=True):
     """Age of the samples in use of one link, which leads from one site to another.
 
-    A sample is the state that a site sends in a tick. Its age is the time since then. Ticks
-    before the first sample do not count.
+    A sample is the state that a site sends in a tick. The age of the sample is the time since
+    that tick. Ticks before the first sample do not count.
 
     Attributes:
-        mean_ms: Mean age, in ms. None if the link never delivered a sample.
-        max_ms: Largest age, in ms. None if the link never delivered a sample.
+        mean_ms: Mean age, in ms. `None` if the link never delivered a sample.
+        max_ms: Largest age, in ms. `None` if the link never delivered a sample.
     """
 
     mean_ms: float | None
@@ -793,17 +795,16 @@ class LinkAge(msgspec.Struct, frozen=True):
 class RunMetrics(msgspec.Struct, frozen=True, kw_only=True):
     """Metrics of one run, which are compared with the expectations of its scenario.
 
-    The docstring of `Expect` defines each metric. A metric is None if the run cannot give it,
-    because it is too short or because the event did not happen. The metrics `end_...` concern
-    the last second of the run. A link "j->i" leads from site j to site i.
+    The docstring of `Expect` defines each metric. A metric is `None` if it cannot be computed,
+    because the run is too short or because an event did not happen. The metrics `end_...`
+    concern the last second of the run. A link "j->i" leads from site j to site i.
 
     Attributes:
         simulated_s: Duration of the run in its own time, in s.
         end: Judgement of the end of the run, for example whether the arms came to rest.
         ages: Ages of the samples in use (the states that a site received from a peer), by link
             "j->i".
-        late_samples: Number of samples that arrived too late to be used at the time that their
-            link planned.
+        late_samples: Number of samples that arrived after the time at which they were due.
         missing: Number of ticks (control periods) without a record, over all sites.
         windows: Ranges of the quantities within each window, a part of the run with limits of
             its own. Empty for a window that ends after the run.
@@ -827,6 +828,147 @@ class RunMetrics(msgspec.Struct, frozen=True, kw_only=True):
     windows: tuple[dict[str, Range], ...] = ()
     metrics: dict[str, Metric] = {}
 
+    @classmethod
+    def of_virtual_run(cls, scenario: Scenario) -> "RunMetrics":
+        """Runs a scenario in virtual time and returns the metrics of the run.
+
+        The records are discarded as soon as their statistics are known, so long runs need
+        little memory. All records are kept only if the scenario limits a metric of
+        `docs/reference/metrics.md`, because these metrics are computed from a complete log.
+
+        Args:
+            scenario: Scenario to run: arms, control laws, links and duration.
+        """
+        if scenario.expect.metrics:
+            return RunMetrics.of_log(simulate_scenario(scenario))
+        measured = _MeasuredRun(scenario)
+        if measured.compiled is None:
+            return measured.measure_ticks()
+        measured.compiled.finish()
+        return measured.measure_compiled(measured.compiled.run)
+
+    @classmethod
+    def of_virtual_runs(
+        cls,
+        scenarios: Sequence[Scenario],
+    ) -> "Iterator[tuple[int, RunMetrics, str]]":
+        """Runs several scenarios in virtual time, as many as possible at once.
+
+        Scenarios that differ only in numbers are computed together with vector instructions.
+        The metrics equal those of `of_virtual_run` bit for bit.
+
+        Args:
+            scenarios: The scenarios.
+
+        Yields:
+            The index of a scenario; the metrics of its run; and the property because of which
+            the run was computed alone, or an empty text.
+        """
+        indices = []
+        measured_runs = []
+        compiled_runs = []
+        for index, scenario in enumerate(scenarios):
+            measured = None if scenario.expect.metrics else _MeasuredRun(scenario)
+            if measured is None:
+                yield index, RunMetrics.of_virtual_run(scenario), NEEDS_LOG
+            elif measured.compiled is None:
+                yield index, measured.measure_ticks(), measured.obstacle
+            else:
+                indices.append(index)
+                measured_runs.append(measured)
+                compiled_runs.append(measured.compiled)
+        for position, obstacle in _finish_together(compiled_runs):
+            run = compiled_runs[position].run
+            yield indices[position], measured_runs[position].measure_compiled(run), obstacle
+
+    @classmethod
+    def of_log(cls, log: Log, expect: Expect | None = None) -> "RunMetrics":
+        """Computes errors, torques and other quantities of a recorded run from its log.
+
+        Args:
+            log: Log of the run.
+            expect: Expectations (limits of the metrics) that replace those of the log's
+                scenario. If `None`, the scenario's expectations are used.
+
+        Raises:
+            LogError: A record cannot be read.
+        """
+        scenario = log.scenario
+        if expect is not None:
+            scenario = msgspec.structs.replace(scenario, expect=expect)
+        ticks_at_end = {}
+        for event in log.events:
+            if event.kind == "end":
+                ticks_at_end[event.member] = event.ticks
+        diverged_at_s = log.diverged_s
+        site_stats = {name: SiteStats(scenario, name) for name in log.sites}
+        missing = 0
+        for name, stats in site_stats.items():
+            site_log = log[name]
+            used_by_peer = [site_log.used[peer] for peer in site_log.peers]
+            batch = RecordBatch(
+                t_ns=site_log.t_ns,
+                q=site_log.q,
+                qd=site_log.qd,
+                e=site_log.e,
+                tau=site_log.tau,
+                tau_x=site_log.tau_x,
+                used=np.array(used_by_peer).T,
+            )
+            stats.add(batch)
+            expected = scenario.ticks(name)
+            if diverged_at_s is not None:
+                # A run that diverged ends early, at the tick that its sites announced.
+                expected = ticks_at_end.get(name, 0)
+            missing += max(0, expected - len(site_log))
+
+        late_samples = 0
+        for sample in find_absent_samples(log):
+            if sample.arrived_tick is not None:
+                late_samples += 1
+        metrics = _compute_run_metrics(
+            scenario,
+            site_stats,
+            diverged_at_s=diverged_at_s,
+            late_samples=late_samples,
+            missing=missing,
+        )
+        expected_metrics = measure_run(log, scenario.expect.metrics)
+        return msgspec.structs.replace(metrics, metrics=expected_metrics)
+
+    def compare_with(self, expect: Expect) -> "list[ExpectationResult]":
+        """Compares the metrics of a run with the expectations that its scenario states.
+
+        If the run diverged, which means that an arm left its limits, the expectation `stable`
+        is always reported, even if the scenario does not state it.
+
+        Args:
+            expect: Expectations of the scenario, for example the largest permitted error.
+
+        Returns:
+            For each expectation, whether the run met it, and the measured value. The results
+            are in the order of the attributes of `Expect`.
+        """
+        outcomes = list(_evaluate_stability(expect, self))
+        for key in _LIMITS:
+            limit = getattr(expect, key)
+            if limit is not None:
+                measured = _read_metric(key, self)
+                outcomes.append(_compare_with_limit(key, measured, limit))
+
+        outcomes += _evaluate_poses(expect, self)
+        if expect.no_gaps:
+            gaps = ExpectationResult(
+                key="no_gaps",
+                held=self.missing == 0,
+                measured=f"{self.missing} missing",
+                limit="0 missing",
+            )
+            outcomes.append(gaps)
+        outcomes += _evaluate_windows(expect, self)
+        outcomes += _evaluate_metrics(expect, self)
+        return outcomes
+
 
 def _compute_run_metrics(
     scenario: Scenario,
@@ -841,13 +983,13 @@ def _compute_run_metrics(
     Args:
         scenario: Scenario to run: arms, control laws, links and duration.
         site_stats: Statistics of each site, in the order of the scenario.
-        diverged_at_s: Time at which the first site left the limits of its arm, in s. None if
+        diverged_at_s: Time at which the first site left the limits of its arm, in s. `None` if
             no site did.
         late_samples: Number of samples (states that a site sent) that arrived too late.
         missing: Number of ticks without a record.
 
     Returns:
-        The metrics of the run. A metric that the run cannot give is None.
+        The metrics of the run. A metric that cannot be computed is `None`.
     """
     with_records = {}
     buckets = []
@@ -887,7 +1029,7 @@ def _compute_run_metrics(
             name: Name of the statistic, an attribute of `SiteStats`.
 
         Returns:
-            The largest value. None if no site has recorded anything.
+            The largest value. `None` if no site has recorded anything.
         """
         values = [getattr(stats, name) for stats in with_records.values()]
         return max(values, default=None)
@@ -950,7 +1092,7 @@ def _find_synchronisation_s(site_stats: Sequence[SiteStats]) -> float | None:
         site_stats: Statistics of all sites, each of which has records.
 
     Returns:
-        The time. None if a site is not synchronised in its last record.
+        The time. `None` if a site is not synchronised in its last record.
     """
     if any(stats.unsynchronised_ns == stats.last_ns for stats in site_stats):
         return None
@@ -965,8 +1107,8 @@ def _merge_windows(windows: Sequence[WindowStats | None]) -> dict[str, Range]:
     quantities that can be compared between sites are kept, each with its largest value.
 
     Args:
-        windows: Statistics of each site within the window. None for a site to which the window
-            does not apply.
+        windows: Statistics of each site within the window. `None` for a site to which the
+            window does not apply.
 
     Returns:
         Ranges by the keys of a window of [expect].
@@ -989,7 +1131,7 @@ def _merge_windows(windows: Sequence[WindowStats | None]) -> dict[str, Range]:
 
 
 def _compute_end_spread_rad(ends: Sequence[RecordBatch]) -> float | None:
-    """Returns the largest difference of a joint's angle between sites in the last second.
+    """Returns the largest difference between sites in the angle of a joint in the last second.
 
     Sites may have different tick rates. Therefore each record of the first site is compared
     with the latest record of every other site at that time.
@@ -998,8 +1140,8 @@ def _compute_end_spread_rad(ends: Sequence[RecordBatch]) -> float | None:
         ends: Records of the last second, one batch per site.
 
     Returns:
-        The difference in rad. None if a site has no records in the last second, or if the arms
-        have different numbers of joints.
+        The difference in rad. `None` if a site has no records in the last second, or if the
+        arms have different numbers of joints.
     """
     if not all(len(end.t_ns) for end in ends):
         return None
@@ -1027,63 +1169,11 @@ NEEDS_LOG = "metrics that need a log"
 """Reason why a run cannot be computed together with others: its metrics need its whole log."""
 
 
-def measure_virtual_run(scenario: Scenario) -> RunMetrics:
-    """Runs a scenario in virtual time and returns the metrics of the run.
-
-    The records are discarded as soon as their statistics are known, so that long runs need
-    little memory. Only if the scenario limits a metric of `docs/reference/metrics.md`, which is
-    computed from a complete log, all records are kept.
-
-    Args:
-        scenario: Scenario to run: arms, control laws, links and duration.
-    """
-    if scenario.expect.metrics:
-        return measure_log(simulate_scenario(scenario))
-    measured = _MeasuredRun(scenario)
-    if measured.compiled is None:
-        return measured.measure_ticks()
-    measured.compiled.finish()
-    return measured.measure_compiled(measured.compiled.run)
-
-
-def measure_virtual_runs(
-    scenarios: Sequence[Scenario],
-) -> Iterator[tuple[int, RunMetrics, str]]:
-    """Runs several scenarios in virtual time, as many as possible at once.
-
-    Scenarios that differ in numbers only share the vector instructions of the processor. The
-    metrics equal those of `measure_virtual_run` bit for bit.
-
-    Args:
-        scenarios: The scenarios.
-
-    Yields:
-        The index of a scenario; the metrics of its run; and the property because of which the
-        run was computed alone, or an empty text.
-    """
-    indices = []
-    measured_runs = []
-    compiled_runs = []
-    for index, scenario in enumerate(scenarios):
-        measured = None if scenario.expect.metrics else _MeasuredRun(scenario)
-        if measured is None:
-            yield index, measure_virtual_run(scenario), NEEDS_LOG
-        elif measured.compiled is None:
-            yield index, measured.measure_ticks(), measured.obstacle
-        else:
-            indices.append(index)
-            measured_runs.append(measured)
-            compiled_runs.append(measured.compiled)
-    for position, obstacle in _finish_together(compiled_runs):
-        run = compiled_runs[position].run
-        yield indices[position], measured_runs[position].measure_compiled(run), obstacle
-
-
 class _EvenBatches:
-    """Passes records on in batches of `BATCH_RECORDS`, however they arrive.
+    """Passes records on in batches of `BATCH_RECORDS`, from batches of any size.
 
-    The last bits of a mean depend on the batches. Sites with different tick rates produce
-    batches of different lengths.
+    Equal batches are needed because the last bits of a mean depend on them, and sites with
+    different tick rates produce batches of different lengths.
 
     Args:
         receive: Function that receives the batches.
@@ -1125,8 +1215,8 @@ class _MeasuredRun:
         scenario: Scenario to run.
 
     Attributes:
-        compiled: The run in the compiled loop. None if the loop cannot simulate it.
-        obstacle: Reason if there is none. Otherwise empty.
+        compiled: The run in the compiled loop. `None` if the loop cannot simulate it.
+        obstacle: Reason why the compiled loop cannot simulate the run. Otherwise empty.
     """
 
     def __init__(self, scenario: Scenario) -> None:
@@ -1151,7 +1241,7 @@ class _MeasuredRun:
         return self._measure(diverged_at_s, late_samples)
 
     def measure_compiled(self, run: FusedRun) -> RunMetrics:
-        """Returns the metrics of the run, which has ended.
+        """Returns the metrics of a finished run.
 
         Args:
             run: The run.
@@ -1183,61 +1273,6 @@ class _MeasuredRun:
         )
 
 
-def measure_log(log: Log, expect: Expect | None = None) -> RunMetrics:
-    """Computes errors, torques and other quantities of a recorded run from its log.
-
-    Args:
-        log: Log of the run.
-        expect: Expectations (limits of the metrics) that replace those of the log's scenario.
-            None uses those of the scenario.
-
-    Raises:
-        LogError: A record cannot be read.
-    """
-    scenario = log.scenario
-    if expect is not None:
-        scenario = msgspec.structs.replace(scenario, expect=expect)
-    ticks_at_end = {}
-    for event in log.events:
-        if event.kind == "end":
-            ticks_at_end[event.member] = event.ticks
-    diverged_at_s = log.diverged_s
-    site_stats = {name: SiteStats(scenario, name) for name in log.sites}
-    missing = 0
-    for name, stats in site_stats.items():
-        site_log = log[name]
-        used_by_peer = [site_log.used[peer] for peer in site_log.peers]
-        batch = RecordBatch(
-            t_ns=site_log.t_ns,
-            q=site_log.q,
-            qd=site_log.qd,
-            e=site_log.e,
-            tau=site_log.tau,
-            tau_x=site_log.tau_x,
-            used=np.array(used_by_peer).T,
-        )
-        stats.add(batch)
-        expected = scenario.ticks(name)
-        if diverged_at_s is not None:
-            # A run that diverged ends early, in the tick that its sites announced.
-            expected = ticks_at_end.get(name, 0)
-        missing += max(0, expected - len(site_log))
-
-    late_samples = 0
-    for sample in find_absent_samples(log):
-        if sample.arrived_tick is not None:
-            late_samples += 1
-    metrics = _compute_run_metrics(
-        scenario,
-        site_stats,
-        diverged_at_s=diverged_at_s,
-        late_samples=late_samples,
-        missing=missing,
-    )
-    expected_metrics = measure_run(log, scenario.expect.metrics)
-    return msgspec.structs.replace(metrics, metrics=expected_metrics)
-
-
 class ExpectationResult(msgspec.Struct, frozen=True):
     """Result of comparing one metric of a run with the limit that the scenario states for it.
 
@@ -1248,10 +1283,10 @@ class ExpectationResult(msgspec.Struct, frozen=True):
         held: True if the run met the expectation.
         measured: Measured value as a string with its unit.
         limit: Limit as a string with its unit.
-        margin: Distance of the measured value to the limit as a fraction of the limit, negative
-            beyond the limit. None if the expectation is not about a number.
-        value: Measured number in the unit of the limit. None if the expectation is not about a
-            number.
+        margin: Distance of the measured value from the limit as a fraction of the limit,
+            negative beyond the limit. `None` if the expectation is not about a number.
+        value: Measured number in the unit of the limit. `None` if the expectation is not about
+            a number.
     """
 
     key: str
@@ -1262,46 +1297,12 @@ class ExpectationResult(msgspec.Struct, frozen=True):
     value: float | None = None
 
 
-def evaluate_expectations(expect: Expect, metrics: RunMetrics) -> list[ExpectationResult]:
-    """Compares the metrics of a run with the expectations that its scenario states.
-
-    If the run diverged, which means that an arm left its limits, the expectation `stable` is
-    always reported, even if the scenario does not state it.
-
-    Args:
-        expect: Expectations of the scenario, for example the largest permitted error.
-        metrics: Metrics of the run.
-
-    Returns:
-        For each expectation, whether the run met it, and the measured value. The results are in
-        the order of the attributes of `Expect`.
-    """
-    outcomes = list(_evaluate_stability(expect, metrics))
-    for key in _LIMITS:
-        limit = getattr(expect, key)
-        if limit is not None:
-            measured = _read_metric(key, metrics)
-            outcomes.append(_compare_with_limit(key, measured, limit))
-
-    outcomes += _evaluate_poses(expect, metrics)
-    if expect.no_gaps:
-        gaps = ExpectationResult(
-            key="no_gaps",
-            held=metrics.missing == 0,
-            measured=f"{metrics.missing} missing",
-            limit="0 missing",
-        )
-        outcomes.append(gaps)
-    outcomes += _evaluate_windows(expect, metrics)
-    outcomes += _evaluate_metrics(expect, metrics)
-    return outcomes
-
-
 def _evaluate_stability(expect: Expect, metrics: RunMetrics) -> Iterator[ExpectationResult]:
     """Yields whether the run is as stable as the key `stable` of the scenario expects.
 
-    A run that diverged is evaluated also if the scenario does not state the key. A run alone
-    proves no stability, so "settled" is the best judgement, and counts as stable.
+    A run that diverged is also evaluated if the scenario does not state the key. A single run
+    cannot prove stability. "settled" is therefore the best possible judgement, and counts as
+    stable.
 
     Args:
         expect: Table [expect] of the scenario.
@@ -1310,7 +1311,7 @@ def _evaluate_stability(expect: Expect, metrics: RunMetrics) -> Iterator[Expecta
     expects_stable = expect.stable is not False
     end = metrics.end
     if expect.stable is not None or end.diverged_at_s is not None:
-        # a run alone proves nothing: settled is the best judgement of its end
+        # A single run proves nothing: "settled" is the best judgement of its end.
         expected = Stability.SETTLED if expects_stable else Stability.NOT_STABLE
         measured = f"{end.stability}: {end.text}"
         limit = str(expects_stable).lower()
@@ -1325,12 +1326,12 @@ _LIMITS = tuple(key for key in Expect.__struct_fields__ if re.search("_(max|min|
 def _read_metric(key: str, metrics: RunMetrics) -> float | None:
     """Returns the metric that a key of [expect] limits.
 
-    The name of the metric follows from the key: "peak_error_max_rad" limits `peak_error_rad`,
-    and "synchronised_by_s" limits `synchronised_at_s`. Keys in ms limit the ages of samples
-    (received states), of which the worst link counts.
+    The key contains the name of the metric: "peak_error_max_rad" limits `peak_error_rad`, and
+    "synchronised_by_s" limits `synchronised_at_s`. Keys in ms limit the ages of samples
+    (received states), and the worst link counts.
 
     Returns:
-        The metric. None if the run does not have it, or if a link never delivered a sample.
+        The metric. `None` if the run does not have it, or if a link never delivered a sample.
     """
     is_age = key.endswith("_ms")
     if not is_age:
@@ -1356,7 +1357,7 @@ def _compare_with_limit(key: str, measured: float | None, limit: float) -> Expec
 
     Args:
         key: Key of [expect]. It contains "_min_" for a smallest value, and ends in the unit.
-        measured: The metric. None if the run does not have it, which fails the expectation.
+        measured: The metric. `None` if the run does not have it, which fails the expectation.
         limit: The limit, in the same unit.
     """
     is_minimum = "_min_" in key
@@ -1431,7 +1432,7 @@ def _evaluate_windows(expect: Expect, metrics: RunMetrics) -> Iterator[Expectati
 def _evaluate_metrics(expect: Expect, metrics: RunMetrics) -> Iterator[ExpectationResult]:
     """Yields the outcome of each metric that the table [expect] limits, such as "path_m".
 
-    A metric that the run cannot give fails its limit, with the reason in place of a number.
+    A metric that cannot be computed fails its limit, with the reason in place of a value.
 
     Args:
         expect: Table [expect] of the scenario.
@@ -1461,8 +1462,8 @@ def _compare_with_range(
 
     Args:
         name: Name of the expectation.
-        measured: Smallest and largest value of the quantity. None if the run does not have it,
-            which fails the expectation.
+        measured: Smallest and largest value of the quantity. `None` if the run does not have
+            it, which fails the expectation.
         limits: Lower and upper limit.
         unit: Unit of the quantity.
         missing_text: Text in place of a missing value.
@@ -1512,7 +1513,7 @@ def describe_program() -> tuple[str, dict[str, str]]:
 
 
 def refuse_live_only(scenario: Scenario) -> None:
-    """Refuses a scenario that only a live session can run.
+    """Rejects a scenario that only a live session can run.
 
     A live session has a real network, and may have real robots.
 
@@ -1520,8 +1521,8 @@ def refuse_live_only(scenario: Scenario) -> None:
         scenario: Description of the experiment.
 
     Raises:
-        ScenarioError: An arm is external, or a link has the model "measured": it injects no
-            delay: the real network decides. In virtual time there is no real network.
+        ScenarioError: An arm is external, or a link has the model "measured", with which the
+            real network determines the delay. In virtual time there is no real network.
     """
     scenario.refuse_external_arms()
     if scenario.measured:

@@ -1,8 +1,8 @@
 """Finds out whether the end effector of an arm can reach a position.
 
 The tasks of a training environment use this to draw goals that can be reached. For a planar arm
-with two links, the answer follows from the lengths of the links. For a chain of more joints, a
-pose within the joint limits is searched numerically.
+with two links, the lengths of the links determine the answer. For a chain of more joints, a
+pose within the joint limits is searched for numerically.
 
 Invariant:
     - A position that counts as reachable can be reached.
@@ -36,8 +36,8 @@ _LARGEST_STEP_RAD = 0.5
 def can_reach(arm: ArmModel, start_rad: Sequence[float] | Array, position_m: Array) -> bool:
     """Returns True if a pose was found in which the end effector of an arm is at a position.
 
-    For an arm with two links, the lengths of the links decide. For a chain of more joints, a
-    pose within the joint limits is searched, and the search may miss one.
+    For an arm with two links, the lengths of the links decide. For a chain of more joints, the
+    function searches for a pose within the joint limits, and may not find an existing pose.
 
     Args:
         arm: Model of the arm.
@@ -58,7 +58,7 @@ def can_reach(arm: ArmModel, start_rad: Sequence[float] | Array, position_m: Arr
 
 
 def _find_pose(arm: ArmModel, q: Array, position_m: Array) -> bool:
-    """Searches a pose within the joint limits whose end effector is at a position.
+    """Searches for a pose within the joint limits with the end effector at a given position.
 
     Each step moves the joints by damped least squares (Wampler 1986): with the Jacobian J and
     the distance e from the position, the step is J' (J J' + d I)^-1 e. The damping d keeps the

@@ -1,7 +1,7 @@
 """Composes the command with which a user can repeat one run of a study.
 
 A sweep or a trial reports, for example, "trilat sim paper --set link.delay_ms=200". The
-functions convert values to the texts KEY=VALUE of the option --set, and quote them for a shell.
+functions convert values to texts KEY=VALUE for the option --set, and quote them for a shell.
 """
 
 from collections.abc import Iterable, Iterator, Mapping
@@ -29,7 +29,7 @@ def set_options(overrides: Iterable[str]) -> list[str]:
         overrides: Texts KEY=VALUE, as in "link.delay_ms=100".
 
     Returns:
-        The arguments "--set" and KEY=VALUE, in turn.
+        The arguments "--set" and KEY=VALUE, alternately.
     """
     arguments = []
     for text in overrides:
@@ -40,7 +40,8 @@ def set_options(overrides: Iterable[str]) -> list[str]:
 def format_toml_value(value: Any) -> str:
     """Returns a value as TOML on one line, for commands and overrides.
 
-    A number is written as short as possible, if it still parses back to the same number.
+    A number is written with as few digits as possible, such that it parses back to the same
+    number.
 
     Args:
         value: A number, text, list or table.
@@ -73,7 +74,7 @@ def list_assignments(overrides: Mapping[str, Any], prefix: str = "") -> Iterator
     """Yields changed settings in nested tables as texts KEY=VALUE for the command line.
 
     Args:
-        overrides: Values by key, also as nested tables.
+        overrides: Values by key. A value may be a nested table.
         prefix: Keys of the enclosing tables, each followed by a dot.
     """
     for key, value in overrides.items():

@@ -1,8 +1,8 @@
-"""Decides which runs of a study are computed side by side, and reports those that were not.
+"""Decides which runs of a study are computed side by side, and reports the others.
 
-Runs that differ in numbers only share the vector instructions of the processor, see
-`trilat_net.core.group_runs`. A study passes a scenario of each kind of run to
-`prepare_kinds`, which compiles the code where the number of runs is worth it. After the runs,
+Runs that differ only in numbers are computed together with vector instructions, see
+`trilat_net.core.group_runs`. A study passes a scenario of each kind of run to `prepare_kinds`,
+which compiles the code if there are enough runs to be worth it. After the runs,
 `describe_runs_alone` names those that were computed one by one.
 """
 
@@ -17,15 +17,15 @@ from trilat_net.scenario import Scenario
 K = TypeVar("K", bound=Hashable)
 
 LANE_SITE_TICKS = 100_000_000
-"""Number of site ticks from which a study compiles the code for several runs side by side.
+"""Least number of site ticks for which a study compiles code that computes runs side by side.
 
-The compilation takes some ten seconds per kind of site. The code then saves about 0.4 us per
+The compilation takes about ten seconds per kind of site. The code then saves about 0.4 us per
 site tick.
 """
 
 
 class RunKind(NamedTuple):
-    """Runs of a study whose scenarios probably differ in numbers only, such as the seed.
+    """Runs of a study whose scenarios probably differ only in numbers, such as the seed.
 
     Attributes:
         scenario: Scenario of one of the runs.
@@ -45,16 +45,16 @@ class RunKind(NamedTuple):
 def prepare_kinds(kinds: Mapping[K, RunKind]) -> dict[K, str]:
     """Chooses the kinds of runs to compute side by side, and compiles the code for them.
 
-    The runs must be long enough for the compilation, unless the code exists. Runs that cannot
-    be computed side by side are chosen too, so that the study reports the reason, if they are
-    that long or if other runs of the study are computed side by side.
+    Unless the compiled code exists, the runs must be long enough to make the compilation
+    worthwhile. Runs that cannot be computed side by side are chosen too if they are this long,
+    or if other runs of the study are computed side by side. The study then reports the reason.
 
     Args:
         kinds: Kinds of runs, by any keys.
 
     Returns:
-        For each chosen kind the property because of which its runs are computed one by one
-        nevertheless, or an empty text.
+        For each chosen kind, the property because of which its runs are still computed one by
+        one, or an empty text.
     """
     several = {key: kind for key, kind in kinds.items() if kind.runs > 1}
     if not several:
@@ -82,14 +82,15 @@ def prepare_kinds(kinds: Mapping[K, RunKind]) -> dict[K, str]:
 
 
 def describe_runs_alone(reasons: Mapping[str, int], run_count: int) -> str:
-    """Returns a sentence on runs that were not computed side by side, and why.
+    """Returns a sentence that states which runs were not computed side by side, and why.
 
     Args:
         reasons: Reasons why runs were computed alone, with the number of these runs.
         run_count: Number of all runs of the study.
 
     Returns:
-        The numbers of these runs and of all runs, and the reasons. Empty if there are none.
+        A sentence with the numbers of these runs and of all runs, and the reasons. Empty if all
+        runs were computed side by side.
     """
     if not reasons:
         return ""
@@ -99,5 +100,5 @@ def describe_runs_alone(reasons: Mapping[str, int], run_count: int) -> str:
 
 
 def count_reasons(obstacles: Iterable[str]) -> Counter[str]:
-    """Counts the reasons why runs were computed alone. An empty text is no reason."""
+    """Counts the reasons why runs were computed alone. Empty texts are ignored."""
     return Counter(filter(None, obstacles))

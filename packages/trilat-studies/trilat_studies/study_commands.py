@@ -19,12 +19,15 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from trilat_net.app import flag, options, run_in_own_folder, show_progress, value
+from trilat_net.app import flag, options, show_progress, value
 from trilat_net.errors import UsageError, count_nouns, format_wall_time
 from trilat_net.net import SystemClock
 from trilat_net.presentation import terminal_output as terminal
 
 if TYPE_CHECKING:
+    from trilat_net.app import SessionResult
+    from trilat_net.scenario import Scenario
+
     from .bench import BenchResults
     from .bench.bench_run import BenchFolder
     from .trials import Trial, TrialReport, TrialResult
@@ -32,7 +35,7 @@ if TYPE_CHECKING:
 
 
 MAX_SEEDS = 100_000
-"""Largest number of seeds that --seeds may name."""
+"""Largest number of seeds in the option --seeds."""
 
 
 @options.command("jitter --seeds 1..20 --junit out.xml", page="docs/tutorials/lab.md")
@@ -79,8 +82,6 @@ def test_command(
     from trilat_net.files import write_whole
     from trilat_net.work import check_workers
 
-    from .trials import encode_junit_xml
-
     if live and on is not None:
         raise UsageError(
             "--on distributes runs in virtual time and cannot be combined with --live: leave "
@@ -88,14 +89,14 @@ def test_command(
         )
     check_workers(jobs, on)
     if junit is not None and (junit.is_dir() or not os.access(junit.parent, os.W_OK)):
-        raise UsageError(f"{junit}: cannot be written")
+        raise UsageError(f"{junit} cannot be written")
     trials = _list_trials(scenarios or [], parse_seeds(seeds), overrides or [], live=live)
     began_unix_ns = SystemClock().unix_ns()
     with terminal.lines_aside(as_json):
         report = _run_live(trials) if live else _run_virtual(trials, jobs, on)
     terminal.print_result(report, as_json=as_json)
     if junit is not None:
-        write_whole(junit, encode_junit_xml(report, began_unix_ns, platform.node()))
+        write_whole(junit, report.encode_junit_xml(began_unix_ns, platform.node()))
     if not report.held:
         raise typer.Exit(1)
 
@@ -104,13 +105,13 @@ def parse_seeds(text: str | None) -> list[int]:
     """Parses a list of random seeds, written as 1..20 or 1,5,9 or 1..3,8.
 
     Args:
-        text: The text. None if the user gave no seeds.
+        text: The text. `None` if the user gave no seeds.
 
     Returns:
         The seeds. Empty if there is no text.
 
     Raises:
-        UsageError: The text is not of that form, or names more than `MAX_SEEDS` seeds.
+        UsageError: The text does not have this form, or names more than `MAX_SEEDS` seeds.
     """
     if text is None:
         return []
@@ -141,9 +142,9 @@ def _list_trials(
     """Lists the trials of a test: each scenario with each seed.
 
     Args:
-        sources: Names or paths of the scenarios. Empty selects all shipped scenarios that have
-            expectations.
-        seeds: The seeds. Empty uses those of each scenario.
+        sources: Names or paths of the scenarios. If empty, all shipped scenarios that have
+            expectations are selected.
+        seeds: The seeds. If empty, each scenario's own seed is used.
         overrides: Overrides of all scenarios.
         live: True if the trials run live over a network.
     """
@@ -164,11 +165,12 @@ def _list_trials(
 def _run_virtual(trials: "list[Trial]", jobs: int | None, on: str | None) -> "TrialReport":
     """Runs trials in virtual time, and shows their progress.
 
-    In a terminal it is a bar, otherwise a line for each scenario whose trials have all ended.
+    In a terminal, the progress is a bar. Otherwise it is a line for each scenario whose trials
+    have all ended.
 
     Args:
         trials: The trials.
-        jobs: Number of processes. None uses one per core.
+        jobs: Number of processes. If `None`, there is one per core.
         on: Address of a Dask scheduler that executes the trials instead.
     """
     from .trials import run_trials
@@ -203,22 +205,47 @@ def _run_live(trials: "list[Trial]") -> "TrialReport":
     side.
 
     Args:
-        trials: The trials: a scenario with a seed each.
+        trials: The trials, each a scenario with a seed.
 
     Returns:
         The report, with the time that each trial took.
     """
-    from .trials import TrialReport, evaluate_live_log
+    from .trials import TrialReport
 
     clock = SystemClock()
     start_ns = clock.monotonic_ns()
     results = []
     for trial in trials:
         began_ns = clock.monotonic_ns()
-        outcome = run_in_own_folder(trial.scenario, str(trial), f"test-{trial}")
+        outcome = _run_in_own_folder(trial.scenario, str(trial), f"test-{trial}")
         wall_s = (clock.monotonic_ns() - began_ns) * 1e-9
-        results.append(evaluate_live_log(trial, outcome.log, outcome.problems, wall_s))
+        results.append(trial.evaluate_live_log(outcome.log, outcome.problems, wall_s))
     return TrialReport(results, (clock.monotonic_ns() - start_ns) * 1e-9)
+
+
+def _run_in_own_folder(scenario: "Scenario", label: str, folder_name: str) -> "SessionResult":
+    """Runs a scenario live, and stores its results in a new folder.
+
+    Results of several scenarios do not replace each other.
+
+    Args:
+        scenario: The scenario.
+        label: Name of the run in the printed line.
+        folder_name: Name of the folder, to which a number is added.
+
+    Raises:
+        typer.Exit: The session was interrupted.
+    """
+    from trilat_net.app import run_demo
+    from trilat_net.files import make_results_folder
+
+    folder = make_results_folder(None, folder_name, force=False)
+    terminal.print_text(f"{label}: {scenario.duration_s:g} s live, into {folder}")
+    outcome = run_demo(scenario, folder, terminal.out)
+    if outcome.interrupted:
+        terminal.err.print("interrupted")
+        raise typer.Exit(128 + outcome.interrupted)
+    return outcome
 
 
 def _run_tuning(
@@ -234,8 +261,8 @@ def _run_tuning(
 
     Args:
         plan: The laws and the procedure.
-        folder: Folder of the results. None uses the next free one.
-        jobs: Number of processes. None uses one per core.
+        folder: Folder of the results. If `None`, the next free folder is used.
+        jobs: Number of processes. If `None`, there is one per core.
         on: Address of a Dask scheduler that executes the runs instead.
         force: True to replace existing files.
         as_json: True to print the result as JSON.
@@ -362,7 +389,7 @@ def compare_command(
 )
 def tune_command(
     arm: Annotated[
-        Path, value("--arm", "URDF", "URDF file of the arm, or name of a shipped one.")
+        Path, value("--arm", "URDF", "URDF file of the arm, or name of a shipped URDF.")
     ],
     delay: Annotated[str, value("--delay", "40ms|measured:SESSION|CSV")],
     law: Annotated[
@@ -437,8 +464,8 @@ def tune_command(
 def _measure_delay(text: str, reach: options.Reach) -> str:
     """Returns a delay as `tune_arm` accepts it, and measures it if it names a running session.
 
-    The delay of a session is that of its slowest link. If the session measures no link, it is
-    half of the longest round trip from this machine, at the 99th percentile.
+    The delay of a session is the delay of its slowest link. If the session measures no link, it
+    is half of the longest round trip from this machine. Both are 99th percentiles.
 
     Args:
         text: A delay such as "40ms", a file, or "measured:SESSION".
@@ -464,7 +491,7 @@ def _measure_delay(text: str, reach: options.Reach) -> str:
         0.5 * member["rtt_us"]["p99"] for member in measurement.members if member["answers"]
     ]
 
-    # Half a round trip stands for the delay only if no delays of links were reported.
+    # Half a round trip is used as the delay only if no delays of links were reported.
     delays_us = [max(link["delay_us"], link["delay_max_us"]) for link in measurement.links]
     if delays_us:
         return f"{max(delays_us):.0f}us"
@@ -480,9 +507,9 @@ def _tune_bench(laws: list[str], study: str, jobs: int | None, on: str | None) -
     interrupted tuning.
 
     Args:
-        laws: Names of the laws. Empty selects all laws of the study.
+        laws: Names of the laws. If empty, all laws of the study are selected.
         study: Name of the study.
-        jobs: Number of processes. None uses one per core.
+        jobs: Number of processes. If `None`, there is one per core.
         on: Address of a Dask scheduler that executes the runs instead.
 
     Raises:
@@ -527,7 +554,7 @@ def _run_bench(
 
     Args:
         folder: Folder of the benchmark.
-        jobs: Number of processes. None uses one per core.
+        jobs: Number of processes. If `None`, there is one per core.
         on: Address of a Dask scheduler that executes the runs instead.
         confirm: Accepted for older commands, see `run_bench`.
     """

@@ -28,11 +28,12 @@ Axes = str | Sequence[str] | Mapping[str, Any]
 
 
 def _list_override_texts(overrides: Overrides, duration_s: float | None) -> list[str]:
-    """Returns overrides as texts KEY=VALUE, as the command line has them.
+    """Returns overrides as texts KEY=VALUE, as on the command line.
 
     Args:
         overrides: Overrides by key, or a text or texts KEY=VALUE.
-        duration_s: Duration of the run in s, which becomes the last override. None adds none.
+        duration_s: Duration of the run in s, which becomes the last override. If `None`, no
+            such override is added.
     """
     texts: list[Any]
     if isinstance(overrides, Mapping):
@@ -62,7 +63,7 @@ def sweep(
     jobs: int | None = None,
     on: "Workers" = None,
 ) -> "SweepResults":
-    """Runs a scenario over a grid of values of its keys, and judges the stability of each.
+    """Runs a scenario over a grid of values of its keys, and judges the stability of each run.
 
     The command is `trilat sweep`.
 
@@ -84,18 +85,18 @@ def sweep(
         laws: Names or classes of control laws, which are a further axis of the grid.
         duration_s: First duration of the runs of a cell, in s.
         longest_s: Longest duration of the runs of a cell whose stability is still open, in s.
-            By default eight times `duration_s`, or `duration_s` if `judge` is "twins".
+            Default: eight times `duration_s`, or `duration_s` if `judge` is "twins".
         judge: "verdict", "twins" or "linear". Twins are two runs that differ by a small
             disturbance. With "twins", the exponent with which the disturbance grows is measured
-            in each cell, in addition to its verdict. With "linear", no run is made: a cell has
-            the growth rate of its linear loop.
+            in each cell, in addition to its verdict. With "linear", nothing is simulated: a
+            cell has the growth rate of its linear loop.
         metrics: Keys of docs/reference/metrics.md that are measured in each run. They become
             columns of the rows.
         refine: Number of halvings along the stability edge. The sweep begins with every
-            2^refine-th value of the first two numeric axes. 0 runs all cells.
-        out: Folder of the results. A sweep in it is continued. By default the next free
-            runs/sweep-NAME-N.
-        jobs: Number of processes. None uses one per core.
+            2^refine-th value of the first two numeric axes. If 0, all cells are run.
+        out: Folder of the results. A sweep in this folder is continued. Default: the next free
+            folder runs/sweep-NAME-N.
+        jobs: Number of processes. If `None`, there is one per core.
         on: Address of a Dask scheduler, or an executor, that executes the runs instead.
 
     Returns:
@@ -135,7 +136,7 @@ def margin(
     jobs: int | None = None,
     on: "Workers" = None,
 ) -> "SweepMargins":
-    """Searches the edge of stability along a key; the command is `trilat sweep --margin`.
+    """Searches for the edge of stability along a key; the command is `trilat sweep --margin`.
 
     The edge is the value of the key at which runs change from stable to not stable.
 
@@ -147,14 +148,14 @@ def margin(
         scenario: The scenario, which describes the experiment: the name of a shipped scenario,
             a path, a TOML text, its tables, or a `Scenario`.
         along: The key and its range, as in "control.d=0.2:3".
-        over: Axes of a grid at whose points the edge is searched, as in `sweep`:
+        over: Axes of a grid. The edge is searched for at each point of the grid, as in `sweep`:
             `{"link.delay_ms": [100, 200]}`.
         set: Settings that replace those of the scenario in all runs.
         tolerance: Largest width of the interval that contains an edge, relative to its value.
         seeds: Number of seeds of random delays and losses, or the seeds.
         laws: Names or classes of control laws, which are a further axis of the grid.
         duration_s: First duration of a run, in s.
-        jobs: Number of processes. None uses one per core.
+        jobs: Number of processes. If `None`, there is one per core.
         on: Address of a Dask scheduler, or an executor, that executes the runs instead.
 
     Returns:
@@ -162,13 +163,13 @@ def margin(
 
     Raises:
         ScenarioError: The scenario or one of the values is not valid.
-        UsageError: The range is not of the form KEY=LOW:HIGH.
+        UsageError: The range does not have the form KEY=LOW:HIGH.
     """
     from .sweep import plan_sweep
-    from .sweep.margin_search import SweepMargins, parse_search_range, search_margins
+    from .sweep.margin_search import SearchRange, SweepMargins, search_margins
     from .sweep.sweep_plan import list_axes
 
-    search_range = parse_search_range(along, tolerance)
+    search_range = SearchRange.parse(along, tolerance)
     axes = [*list_axes(over), search_range.format_axis()]
     overrides = _list_override_texts(set, duration_s)
     plan = plan_sweep(scenario, overrides, over=axes, seeds=seeds, laws=laws)
@@ -201,16 +202,17 @@ def tune(
     Args:
         scenario: The scenario, which describes the experiment: the name of a shipped scenario,
             a path, a TOML text, its tables, or a `Scenario`.
-        laws: Names or classes of the laws. Empty selects all laws for any number of sites.
+        laws: Names or classes of the laws. If empty, all laws for any number of sites are
+            selected.
         set: Settings that replace those of the scenario, as in `{"link.delay_ms": 100}`.
         budget: Number of candidates per law.
         seed: Seed of the search, which draws the candidates.
         seeds: Number of seeds of the scenario over which each candidate is averaged.
-        objective: What the search minimises besides the effort of the arms: "error", the
-            tracking error, or "settling", the settling time.
+        objective: Quantity that the search minimises besides the effort of the arms: the
+            tracking error ("error") or the settling time ("settling").
         gravity_percent: Gravity that all laws assume, in % of the true gravity.
-        duration_s: Duration of a run, in s. By default that of the scenario.
-        jobs: Number of processes. None uses one per core.
+        duration_s: Duration of a run, in s. Default: the scenario's duration.
+        jobs: Number of processes. If `None`, there is one per core.
         on: Address of a Dask scheduler, or an executor, that executes the runs instead.
 
     Returns:
@@ -258,15 +260,16 @@ def bench(
 
     Args:
         study: Part of the suite: full, small or round-trips.
-        tasks: Names of the selected tasks. Empty selects all tasks of the study.
-        laws: Names of the selected laws. Empty selects all laws of the study.
+        tasks: Names of the selected tasks. If empty, all tasks of the study are selected.
+        laws: Names of the selected laws. If empty, all laws of the study are selected.
         links: Names of the selected links (network conditions), as in "rtt68-loss10" or "4g".
-            Empty selects all links of the study.
-        seeds: Number of seeds of random delays and losses. By default that of the study.
-        confirm: Has no effect any more: every run that is not stable is repeated over twice
-            its length, which confirms or refutes the verdict.
-        out: Folder of the results. A suite in it is continued. By default runs/bench-STUDY.
-        jobs: Number of processes. None uses one per core.
+            If empty, all links of the study are selected.
+        seeds: Number of seeds of random delays and losses. Default: the number of the study.
+        confirm: Has no effect. Every run that is not stable is repeated over twice its
+            duration, which confirms or refutes the verdict.
+        out: Folder of the results. A suite in this folder is continued. Default:
+            runs/bench-STUDY.
+        jobs: Number of processes. If `None`, there is one per core.
         on: Address of a Dask scheduler, or an executor, that executes the runs instead.
 
     Returns:

@@ -35,7 +35,7 @@ _option = partial(typer.Option, rich_help_panel="Maps and stability limits")
 
 
 def _check_modes(used_options: Sequence[str]) -> None:
-    """Refuses options that exclude each other.
+    """Rejects options that exclude each other.
 
     Args:
         used_options: The options that the user wrote on the command line.
@@ -75,17 +75,18 @@ def _draw_map(
     Args:
         results: The finished sweep.
         folder: Folder of the files.
-        width: Width of the map, in inches. None uses one column of a paper.
-        jobs: Number of processes. None uses one per core.
+        width: Width of the map, in inches. If `None`, it is one column of a paper.
+        jobs: Number of processes. If `None`, there is one per core.
         on: Address of a Dask scheduler that computes the map instead.
-        beside: Folder of another sweep, whose edge is drawn as well. None draws no other edge.
+        beside: Folder of another sweep, whose edge is drawn as well. If `None`, no other edge
+            is drawn.
     """
     from trilat_net.presentation import COLUMN_IN, FigureSize
 
     from .sweep import read_results
     from .sweep.fixed_gains import FAIR_COMPARISON
     from .sweep.map_page import write_map
-    from .sweep.stability_map import build_stability_map
+    from .sweep.stability_map import StabilityMap
 
     size = FigureSize.for_print(COLUMN_IN if width is None else width)
     width_option = [] if width is None else ["--width", f"{width:g}"]
@@ -96,7 +97,7 @@ def _draw_map(
     with show_progress(
         "linear analysis", terminal.print_text, "columns of the map"
     ) as progress:
-        stability_map = build_stability_map(
+        stability_map = StabilityMap.of_sweep(
             results, (command,), jobs, progress, on=on, simulated=simulated
         )
 
@@ -117,15 +118,15 @@ def _search_margins(
     on: str | None,
     as_json: bool,
 ) -> None:
-    """Searches edges along one key, prints them, and writes the result files.
+    """Searches for edges along one key, prints them, and writes the result files.
 
-    The edges that theory predicts are printed beside them.
+    The edges that theory predicts are printed next to the measured edges.
 
     Args:
         plan: The sweep. Its last axis has the two ends of the range.
-        search_range: The key and the range in which edges are searched.
-        folder: Folder of margin.json and margin.md. None uses the next free one.
-        jobs: Number of processes. None uses one per core.
+        search_range: The key, and the range in which to search for edges.
+        folder: Folder of margin.json and margin.md. If `None`, the next free folder is used.
+        jobs: Number of processes. If `None`, there is one per core.
         on: Address of a Dask scheduler that executes the runs instead.
         as_json: True to print the result as JSON.
     """
@@ -160,12 +161,13 @@ def _run_sweep(
 ) -> "FinishedSweep":
     """Runs a sweep, or the remaining runs of a sweep, and prints its summary.
 
-    A sweep that is too large is refused before its folder is created.
+    A sweep that is too large is rejected before its folder is created.
 
     Args:
-        new_plan: The sweep. None uses the sweep in the folder.
-        path: Folder of a sweep to continue, or of a new sweep. None uses the next free folder.
-        jobs: Number of processes. None uses one per core.
+        new_plan: The sweep. If `None`, the sweep in the folder is continued.
+        path: Folder of a sweep to continue, or of a new sweep. If `None`, the next free folder
+            is used.
+        jobs: Number of processes. If `None`, there is one per core.
         on: Address of a Dask scheduler that executes the runs instead.
         yes: True to run a sweep even if it is too large.
 
@@ -194,9 +196,9 @@ def _run_sweep(
         terminal.print_text(f"  {done_text} done already")
 
     workers = count_workers(jobs, on)
-    estimate = sweep_run.estimate_sweep(plan, finished_runs, workers)
+    estimate = sweep_run.DurationEstimate.of_sweep(plan, finished_runs, workers)
     if not yes:
-        sweep_run.refuse_oversized_sweep(plan, estimate, workers)
+        estimate.refuse_oversized_sweep(plan, workers)
 
     folder = existing_folder or sweep_run.prepare_sweep_folder(plan, path)
     if estimate.seconds:
@@ -221,9 +223,10 @@ def _run_in_folder(
 
     Args:
         folder: Folder of the sweep.
-        jobs: Number of processes. None uses one per core.
+        jobs: Number of processes. If `None`, there is one per core.
         on: Address of a Dask scheduler that executes the runs instead.
-        estimate: Estimate of the duration. The runs that it needed are not repeated.
+        estimate: Estimate of the duration. The runs that were made for the estimate are not
+            repeated.
     """
     from .sweep import run_sweep
 
@@ -242,7 +245,7 @@ def _run_in_folder(
 
 
 def _print_results(results: "SweepResults", remarks: list[str], path: Path) -> None:
-    """Prints the summary of a sweep, remarks, and commands that are useful next.
+    """Prints the summary of a sweep, remarks, and commands for the next steps.
 
     Args:
         results: The finished sweep.
@@ -331,7 +334,7 @@ def sweep_command(
             link.delay_ms=0:1600:50 or link.order=newest,in_order; repeatable.
         seeds: Number of seeds, or a list of seeds, for example 1..20; default: one.
         law: Control laws, as a further axis of the grid; default: the law of the scenario.
-        longest: Longest run of a cell whose stability is still undecided, s; default: eight
+        longest: Longest run of a cell whose stability is still undecided, in s; default: eight
             times the duration, or the duration with --judge twins.
         judge: Quantity in the map: stability classes (verdict), growth exponents of runs with
             a small push (twins), for which short runs suffice, or growth rates of the linear
@@ -353,12 +356,12 @@ def sweep_command(
         confirm: Former option that ran cells live. Its error names the replacement.
     """
     from .sweep import plan_sweep
-    from .sweep.margin_search import parse_search_range
+    from .sweep.margin_search import SearchRange
 
     used_options = options.list_used_options(context)
     if confirm is not None:
         raise UsageError(
-            "there is no --confirm any more: trilat sweep FOLDER --cell N prints the command "
+            "--confirm no longer exists: trilat sweep FOLDER --cell N prints the command "
             "of a cell, which runs live with trilat live in place of trilat sim"
         )
     _check_modes(used_options)
@@ -393,7 +396,7 @@ def sweep_command(
         axes = list(over or [])
         search_range = None
         if margin is not None:
-            search_range = parse_search_range(margin, tolerance)
+            search_range = SearchRange.parse(margin, tolerance)
             axes.append(search_range.format_axis())
         plan = plan_sweep(
             scenario,
@@ -431,7 +434,7 @@ def _show_results(
 
     Args:
         path: Folder of the sweep, or its table of results.
-        draw: Function that draws the map. None draws no map.
+        draw: Function that draws the map. If `None`, no map is drawn.
         as_json: True to print the results as JSON in addition.
     """
     from .sweep.sweep_results import describe_sweep_plan, read_results
@@ -463,7 +466,7 @@ _PLAN_OPTIONS = (
 
 
 def _refuse_plan_options(used_options: Sequence[str]) -> None:
-    """Refuses options that would change a sweep that exists already.
+    """Rejects options that would change a sweep that exists already.
 
     Args:
         used_options: The options that the user wrote on the command line.
@@ -485,7 +488,7 @@ def parse_seed_count(text: str | None) -> int | list[int]:
     are lists of seeds.
 
     Args:
-        text: The text. None if the user did not use the option.
+        text: The text. `None` if the user did not use the option.
 
     Returns:
         The number of seeds, or the list of the seeds. 1 if there is no text.
@@ -501,8 +504,8 @@ def parse_seed_count(text: str | None) -> int | list[int]:
 def _is_results(source: str) -> bool:
     """Returns True if an argument of the command is the folder or table of a sweep.
 
-    The name of a shipped scenario is never taken for one, even if there is a folder of the same
-    name.
+    The name of a shipped scenario is never taken for a folder, even if a folder of this name
+    exists.
 
     Args:
         source: The argument: a scenario, the folder of a sweep, or its table of results.

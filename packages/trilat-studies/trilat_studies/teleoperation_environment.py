@@ -1,15 +1,15 @@
 """A Gymnasium environment for training a policy that operates one arm over the network.
 
-The policy takes the place of one user of an experiment. In each step it observes what that user
-can observe: the state of the own arm, and the states of the other arms, which arrive with the
-delay of the network. Its action is a target for the arm, or a force on it. All arms are
-simulated, as fast as possible.
+The policy takes the place of one user of an experiment. In each step, it observes what that
+user can observe: the state of the user's own arm, and the states of the other arms, which
+arrive with the delay of the network. Its action is a target for the arm, or a force on it. All
+arms are simulated, as fast as possible.
 
 Invariant:
-    - An episode is a function of the scenario, the seed and the actions. If the episode is
-      saved as a log, this log can be verified bit for bit.
-    - A step is a fixed number of ticks of the control loop. An action that is refused makes no
-      step and changes nothing.
+    - An episode depends only on the scenario, the seed and the actions. If the episode is saved
+      as a log, this log can be verified bit for bit.
+    - A step is a fixed number of ticks of the control loop. An invalid action is rejected
+      without a step and without any change.
     - The observations, and the time at which an action takes effect, are the same as for a
       user-written operator (`OwnHand`). Therefore a trained policy can operate an arm in a live
       session without changes. Only orientations differ: they are observed as six numbers, which
@@ -62,30 +62,30 @@ except ImportError:
 ENV_ID = "trilat_net/Teleoperation-v0"
 """Name of the environment in the registry of Gymnasium."""
 FAR = 1e6
-"""Bound of observed numbers that have no tighter bound, in rad, rad/s, m, N m or s."""
+"""Bound on observed numbers that have no tighter bound, in rad, rad/s, m, N m or s."""
 NEVER_NEGATIVE = ("alpha", "grip", "age_s")
 """Parts of an observation whose numbers are at least 0."""
 WITH_ROUNDING = 1.000001
-"""Factor of a bound that a number can reach exactly."""
+"""Factor by which the space exceeds a bound that a number can reach exactly."""
 MOST_DRAWS = {False: 1000, True: 100}
 """Largest number of random positions that a task tries until one is within reach.
 
 It is smaller for arms with a chain of joints (True), because the pose for a position must be
-searched numerically.
+found by a numerical search.
 """
 
 
 class EpisodeError(UsageError, gymnasium.error.ResetNeeded):
-    """A method of the environment was called while no episode is in progress.
+    """A method of the environment was called while no episode was in progress.
 
-    The episode has not begun, or it has ended. `TeleoperationEnv.reset` begins one.
+    The episode has not begun, or it has ended. `TeleoperationEnv.reset` begins an episode.
     """
 
 
 class Scene(NamedTuple):
     """True state of an episode at a step, from which the task computes the reward.
 
-    It contains the current states of all arms, which the user sees only with a delay.
+    The object contains the current states of all arms, which the user sees only with a delay.
 
     Attributes:
         t_s: Time since the start of the run, in s.
@@ -109,7 +109,7 @@ class Scene(NamedTuple):
 
 
 class Judgement(NamedTuple):
-    """How a task judges one step: the reward, and whether the task is done or has failed.
+    """A task's judgement of one step: the reward, and whether the task is done or has failed.
 
     Attributes:
         reward: Reward of the step.
@@ -125,14 +125,14 @@ class Judgement(NamedTuple):
 class EpisodeTask(Protocol):
     """Interface of the task of an episode: it draws a goal and computes the rewards.
 
-    A user can write a class of this form for a reinforcement-learning environment, which calls
-    `begin` at the start of each episode, and `judge` after each step.
+    A user can write a class with these methods. The environment calls `begin` at the start of
+    each episode, and `judge` after each step.
     """
 
     goal: Array
     """Goal that the user observes. Its shape must never change."""
     bound: float
-    """Bound of the numbers of the goal. It must never change."""
+    """Bound on the numbers of the goal. It must never change."""
 
     def begin(self, random: np.random.Generator, scene: Scene) -> None:
         """Draws the goal of a new episode. The environment calls this once per episode.
@@ -167,7 +167,7 @@ class ReachTask:
         stay_s: Time for which the end effector must stay at the goal, in s.
 
     Attributes:
-        site, within_m, stay_s: As the arguments.
+        site, within_m, stay_s: The arguments of the same names.
         reached_s: Time since which the end effector has been at the goal, in s.
         last_s: Time of the last step, in s.
     """
@@ -198,7 +198,7 @@ class ReachTask:
             scene: State at the start of the episode.
 
         Raises:
-            UsageError: None of the drawn positions is within reach.
+            UsageError: No drawn position is within reach.
         """
         start_m = scene.end_effector_m[self.site]
         dimensions = len(start_m)
@@ -217,7 +217,7 @@ class ReachTask:
             positions = count_nouns(scene.draws, "position")
             raise UsageError(
                 f"the task has no goal: the end effector can reach none of {positions} "
-                f"within {self._radius_m:g} m around the start of {self.site}; "
+                f"within {self._radius_m:g} m of the start of {self.site}; "
                 "start from another pose (sites.NAME.q0_rad), or use your own task"
             )
         self.goal = position_m
@@ -243,7 +243,7 @@ class ReachTask:
         step_s = scene.t_s - self.last_s
         self.last_s = scene.t_s
         if distance_m > self.within_m:
-            self.reached_s = scene.t_s  # the time at the goal starts anew
+            self.reached_s = scene.t_s  # the time at the goal starts again
         stayed_s = scene.t_s - self.reached_s
         succeeded = stayed_s >= self.stay_s
         reward = -distance_m * step_s + float(succeeded)
@@ -285,17 +285,18 @@ class TeleoperationEnv(gymnasium.Env[dict[str, Array], Array]):
         observation_names: With `flat`, the name of each number of an observation, as in
             "q[0]". A number of a matrix has two indices, its row and its column.
         observation_scales: Typical size of each number of an observation: a dictionary of
-            arrays, or with `flat` one array. An observation divided by it is of the order of 1.
-            The sizes come from the reach of the arms and from the scenario's limits of speed
-            and torque.
+            arrays, or with `flat` one array. An observation divided by its scale is of the
+            order of 1. The sizes come from the reach of the arms and from the scenario's limits
+            of speed and torque.
         user: Site whose arm the actions move.
         leads: Site that does the task.
         ticks_per_step: Number of ticks of a step.
 
     Raises:
         ScenarioError: The scenario or an override is not valid.
-        UsageError: There is no such site, the rate is not valid, or Gymnasium is missing.
-            Another argument cannot have its value; the message names both.
+        UsageError: There is no such site, the rate is not valid, or Gymnasium is missing. The
+            same error is raised if another argument has an invalid value, which the message
+            names.
     """
 
     metadata: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 50}  # noqa: RUF012 - Gymnasium's
@@ -373,7 +374,7 @@ class TeleoperationEnv(gymnasium.Env[dict[str, Array], Array]):
         self._flat = flat
 
     def _build_dict_space(self, scene: Scene) -> spaces.Dict:
-        """Returns the space of observations in the form of a dictionary.
+        """Returns the space of observations as a dictionary of arrays.
 
         Args:
             scene: Any state of an episode. All observations have the shapes of its observation.
@@ -382,8 +383,8 @@ class TeleoperationEnv(gymnasium.Env[dict[str, Array], Array]):
         arm = self._base.arms[self.user]
         bounds = {"alpha": 1.0, "grip": 1.0, "goal": self.task.bound}
         if hand.mode != "joint" and arm.chain is None:
-            # No point of a planar arm is farther from its base than its length. The margin is
-            # for rounding.
+            # No point of a planar arm is farther from the base than the arm's length. The
+            # margin is for rounding.
             bounds["pose"] = WITH_ROUNDING * sum(arm.lengths_m)
             bounds["target"] = WITH_ROUNDING * self.action_limit
         boxes: dict[str, Any] = {}
@@ -397,7 +398,7 @@ class TeleoperationEnv(gymnasium.Env[dict[str, Array], Array]):
     def _scale_parts(self, scene: Scene) -> dict[str, Array]:
         """Returns the typical size of each number of an observation, by the parts' names.
 
-        An arm can pass its limit of speed in the last step of an episode, which it ends, and
+        An arm can exceed its speed limit in the last step of an episode, which this ends, and
         can turn any number of times. Therefore these sizes are not bounds of the space.
 
         Args:
@@ -414,7 +415,8 @@ class TeleoperationEnv(gymnasium.Env[dict[str, Array], Array]):
             speeds = np.array(limits.qd_limit_rad_s)
             torques = np.array(limits.tau_limit_nm)
             if base.arms[peer].shares_pose:
-                # Those of an end effector 1 m from the fastest and the strongest joint.
+                # These are the values of an end effector 1 m from the fastest and the strongest
+                # joint.
                 speeds = speeds.max()
                 torques = torques.max()
             scales["peer_qd"][index] = speeds
@@ -433,9 +435,15 @@ class TeleoperationEnv(gymnasium.Env[dict[str, Array], Array]):
         scales["target"][:] = self.action_limit
         hand = self.build_hand_site(base).describe()
         scales["pose"][:] = math.pi if hand.mode == "joint" else reach_m
-        is_position = np.shape(self.task.goal) == scene.end_effector_m[self.leads].shape
-        scales["goal"][:] = reach_m if is_position else self.task.bound
+        scales["goal"][:] = reach_m if self._is_goal_position(scene) else self.task.bound
         return scales
+
+    def _is_goal_position(self, scene: Scene) -> bool:
+        """Returns True if the goal of the task has as many numbers as a position.
+
+        Goals may also be numbers of another kind, such as joint angles.
+        """
+        return np.shape(self.task.goal) == scene.end_effector_m[self.leads].shape
 
     def _prepare(self, scenario: Scenario) -> Scenario:
         """Returns a scenario in which only the policy operates the user's arm.
@@ -463,10 +471,10 @@ class TeleoperationEnv(gymnasium.Env[dict[str, Array], Array]):
         return replace(scenario, sites=sites, drawn=drawn)
 
     def _check_varied_keys(self) -> None:
-        """Refuses keys or values of `vary` that are not valid, before the first episode.
+        """Rejects invalid keys or values of `vary` before the first episode.
 
         Raises:
-            ScenarioError: There is no such key, or it cannot have the value.
+            ScenarioError: There is no such key, or the value is not valid for it.
             UsageError: A key has no values.
         """
         for key, values in self._vary.items():
@@ -512,7 +520,7 @@ class TeleoperationEnv(gymnasium.Env[dict[str, Array], Array]):
         spec = self._base.sites[self.user]
         if arm.chain is None:
             return float(sum(arm.lengths_m))
-        # The reach of a chain is not known in closed form. This bound is generous.
+        # The reach of a chain is not known in closed form. This value is a safe upper bound.
         start_m = arm.end_effector(spec.q0_rad)
         start_distance_m = float(np.linalg.norm(start_m))
         return 1.5 * start_distance_m + 1.0
@@ -522,8 +530,8 @@ class TeleoperationEnv(gymnasium.Env[dict[str, Array], Array]):
 
         The run is not started. Each step of the environment appends the action of the policy to
         `self._actions`, and lets the run execute the ticks (control periods) of the step. A
-        simulated operator, `self._player`, holds the arm of the user's site. It shares the list
-        and moves the arm by the last action.
+        simulated operator, `self._player`, holds the arm of the user's site. The operator
+        shares the list, and moves the arm according to the last action.
 
         Args:
             scenario: Scenario of the episode.
@@ -547,8 +555,8 @@ class TeleoperationEnv(gymnasium.Env[dict[str, Array], Array]):
         """Describes the present state of the episode, for the task and for observations.
 
         The joint angles, end effectors and bodies are the true state of the simulation. The
-        view is what the user's operator, the policy, sees: it contains the states of other
-        sites with their delay.
+        view belongs to the user's operator, the policy: it contains the states of other sites
+        with their delay.
 
         Returns:
             The state. The limit `draws` of attempts to draw a position depends on the arm of
@@ -560,7 +568,7 @@ class TeleoperationEnv(gymnasium.Env[dict[str, Array], Array]):
         positions_m = {}
         for name, row in zip(names, self._run.q, strict=True):
             arm = arms[name]
-            angles_rad = row[: arm.counts.joints]  # rows are as long as that of the longest arm
+            angles_rad = row[: arm.counts.joints]  # rows are as long as the longest arm needs
             q_rad[name] = angles_rad
             position_m = arm.end_effector(angles_rad.tolist())
             positions_m[name] = np.array(position_m)
@@ -603,16 +611,17 @@ class TeleoperationEnv(gymnasium.Env[dict[str, Array], Array]):
         return can_reach(arm, start_rad, position_m)
 
     def _format_observation(self, scene: Scene) -> Any:
-        """Returns what the user observes of a state, in the form of the observation space."""
+        """Returns the user's observation of a state, in the format of the observation space."""
         return self.format_parts(self._observe(scene))
 
     def format_parts(self, parts: dict[str, Array], count: int | None = None) -> Any:
         """Returns observations as the agent receives them: a dictionary, or one array (`flat`).
 
         Args:
-            parts: The parts of an observation by name, or those of several observations, which
-                then have one more axis, the first one. The dictionary is changed.
-            count: Number of observations. None for one observation.
+            parts: The parts of an observation, by name. The parts of several observations have
+                an additional first axis. The dictionary is changed.
+            count: Number of observations. `None` if there is a single observation without this
+                axis.
         """
         if self._normalize:
             for name, values in parts.items():
@@ -626,7 +635,7 @@ class TeleoperationEnv(gymnasium.Env[dict[str, Array], Array]):
         return numbers.astype(np.float32)
 
     def _observe(self, scene: Scene) -> dict[str, Array]:
-        """Collects what an agent can observe of a state, as arrays by name.
+        """Collects an agent's observation of a state, as arrays by name.
 
         Parts that begin with "peer_", and `alpha` and `age_s`, have one row per peer (other
         arm).
@@ -665,10 +674,10 @@ class TeleoperationEnv(gymnasium.Env[dict[str, Array], Array]):
     def _describe_step(self, scene: Scene, *, succeeded: bool) -> dict[str, Any]:
         """Returns the information dictionary of a step.
 
-        The first two keys are those of gym-hil, a library in which a human teacher can take
-        over from the policy. Here the teacher is the other user whom the site that does the
-        task follows most. The teacher intervenes while that site follows the teacher more than
-        the policy.
+        The first two keys have the same names as in gym-hil, a library in which a human teacher
+        can take over from the policy. Among the other users, the teacher is the one with the
+        largest dominance factor at the site that does the task. The teacher intervenes while
+        this factor is larger than that of the policy.
 
         Args:
             scene: State after the step.
@@ -703,7 +712,8 @@ class TeleoperationEnv(gymnasium.Env[dict[str, Array], Array]):
         """Begins a new episode, and draws its random goal and settings.
 
         Args:
-            seed: Seed of the random numbers. None continues the sequence of earlier episodes.
+            seed: Seed of the random numbers. If `None`, the random sequence of earlier episodes
+                continues.
             options: Overrides for this episode only, as in {"link.delay_ms": 200}.
 
         Returns:
@@ -809,8 +819,8 @@ class TeleoperationEnv(gymnasium.Env[dict[str, Array], Array]):
     def note_steps(self, actions: Sequence[Array], clipped_actions: int, *, ends: bool) -> None:
         """Records the actions of an episode that a vector environment has simulated.
 
-        The environment can then save or draw the episode as if it had made the steps itself.
-        The state of `run` must be that after these steps.
+        The environment can then save or draw the episode as if it had simulated the steps
+        itself. The state of `run` must be the state after these steps.
 
         Args:
             actions: Actions of all steps of the episode, checked.
@@ -826,7 +836,7 @@ class TeleoperationEnv(gymnasium.Env[dict[str, Array], Array]):
         """Returns an action as an array, with each value clipped to its bounds.
 
         Raises:
-            UsageError: The action has another number of values, or a value is not finite.
+            UsageError: The number of values is wrong, or a value is not finite.
         """
         try:
             values = np.array(action, dtype=np.float64)
@@ -883,7 +893,7 @@ class TeleoperationEnv(gymnasium.Env[dict[str, Array], Array]):
         """Draws a picture of the arms and the goal in their present state.
 
         Returns:
-            A picture of shape (height, width, 3). None if the environment has no render mode.
+            A picture of shape (height, width, 3). `None` if the environment has no render mode.
 
         Raises:
             EpisodeError: No episode has begun.
@@ -893,15 +903,12 @@ class TeleoperationEnv(gymnasium.Env[dict[str, Array], Array]):
         if not (self._runs or self._actions):
             raise EpisodeError("there is no episode to draw: call reset first")
         # imported here, because the import of Matplotlib takes a second
-        from trilat_net.presentation import EpisodePicture, is_position
+        from trilat_net.presentation import EpisodePicture
 
         if self._picture is None:
             self._picture = EpisodePicture(self.scenario, self.leads)
         scene = self._build_scene()
-        goal = None
-        end_effector_m = scene.end_effector_m[self.leads]
-        if is_position(self.task.goal, end_effector_m):
-            goal = self.task.goal
+        goal = self.task.goal if self._is_goal_position(scene) else None
         title = f"t = {scene.t_s:.2f} s"
         return self._picture.draw(scene.q, scene.bodies, goal, title)
 
@@ -972,16 +979,16 @@ def _name_numbers(parts: spaces.Dict) -> list[str]:
 def _check_arguments(
     *, mode: str, rate_hz: int, delay_ms: float, task: EpisodeTask | None
 ) -> None:
-    """Refuses arguments of an environment that are not valid, before anything is simulated.
+    """Rejects invalid arguments of an environment before anything is simulated.
 
     Args:
         mode: Meaning of an action.
         rate_hz: Number of steps per second.
         delay_ms: Time from an observation until its action takes effect, in ms.
-        task: Task of the episodes. None for the default.
+        task: Task of the episodes. `None` for the default task.
 
     Raises:
-        UsageError: An argument is not valid. The message names its value and the valid ones.
+        UsageError: An argument is not valid. The message names its value and the valid values.
     """
     modes = get_args(get_type_hints(LiveHand)["mode"])
     if mode not in ("", *modes):

@@ -1,8 +1,8 @@
 """Tests whether a scenario behaves as expected, with several random seeds.
 
-A scenario is the TOML file that describes an experiment. Its table [expect] states what a run
-must achieve, such as a largest error. A trial is a run of the scenario with one seed, whose
-measured values are compared with this table. The command is `trilat test`.
+A scenario is the TOML file that describes an experiment. Its table [expect] states requirements
+on a run, such as the largest permitted error. A trial is a run of the scenario with one seed,
+whose measured values are compared with this table. The command is `trilat test`.
 
 From pytest, one test per seed:
 
@@ -19,7 +19,7 @@ All seeds in one test, on all cores: `trilat_net.check("jitter", seeds=range(1, 
 
 Invariant:
     - One command repeats a trial, and the result of the trial contains that command.
-    - The evaluation of an expectation depends on the measured value and the limit alone. Its
+    - The evaluation of an expectation depends only on the measured value and the limit. Its
       result contains both, and the margin, whether or not the expectation is met.
     - Results are in the order of the trials, no matter which process ran them.
     - A trial that repeatedly kills its worker process affects no other trial.
@@ -39,7 +39,7 @@ from msgspec.structs import asdict
 from trilat_net.analysis import find_quantity
 from trilat_net.core import is_core_cached
 from trilat_net.errors import LawFailed, LogError, ScenarioError, TrilatError, count_nouns
-from trilat_net.execution import check_virtual, execute_virtual, verify
+from trilat_net.execution import check_virtual, execute_virtual, verify_log
 from trilat_net.log import open_log
 from trilat_net.net import SystemClock
 from trilat_net.own_code import list_imported_code
@@ -48,14 +48,7 @@ from trilat_net.results import Result
 from trilat_net.scenario import ExperimentText, Scenario, load_scenario, reseed_scenario
 from trilat_net.work import MAX_LOSSES, MeanInterval, WorkerPool, Workers, open_worker_pool
 
-from .measure_run import (
-    ExpectationResult,
-    RunMetrics,
-    evaluate_expectations,
-    measure_log,
-    measure_virtual_run,
-    measure_virtual_runs,
-)
+from .measure_run import ExpectationResult, RunMetrics
 from .run_commands import format_command, list_assignments, set_options
 from .side_by_side import RunKind, count_reasons, describe_runs_alone, prepare_kinds
 
@@ -70,10 +63,10 @@ class TrialResult(NamedTuple):
         outcomes: Outcome of each expectation.
         simulated_s: Duration of the run in its own time, in s.
         wall_s: Duration in real time, in s.
-        error: Reason why the run has no result. Empty if it has one.
+        error: Reason why the run has no result. Empty if it has a result.
         log: Log of a live trial, if it exists.
         alone: Property because of which the run was computed alone, among trials that are
-            computed side by side. Empty if there is none.
+            computed side by side. Empty if it was not computed alone.
     """
 
     trial: "Trial"
@@ -91,7 +84,7 @@ class TrialResult(NamedTuple):
 
     @property
     def failures(self) -> list[str]:
-        """Sentences about what went wrong. Empty if the run met all expectations.
+        """Sentences about the failures of the run. Empty if the run met all expectations.
 
         A sentence states an unmet expectation, or why the run has no result.
         """
@@ -150,7 +143,7 @@ class Trial(NamedTuple):
         Returns:
             The result of the trial.
         """
-        outcomes = evaluate_expectations(self.scenario.expect, metrics)
+        outcomes = metrics.compare_with(self.scenario.expect)
         return TrialResult(self, outcomes, metrics.simulated_s, wall_s)
 
     def run(self) -> TrialResult:
@@ -161,7 +154,7 @@ class Trial(NamedTuple):
         clock = SystemClock()
         start_ns = clock.monotonic_ns()
         try:
-            metrics = measure_virtual_run(self.scenario)
+            metrics = RunMetrics.of_virtual_run(self.scenario)
         except LawFailed as failed:
             wall_s = (clock.monotonic_ns() - start_ns) * 1e-9
             return TrialResult(self, wall_s=wall_s, error=str(failed))
@@ -182,6 +175,51 @@ class Trial(NamedTuple):
             raise AssertionError("\n  ".join([f"{self}: {reasons}", self.again, self.look]))
         return result
 
+    def evaluate_live_log(
+        self, log_file: Path, problems: Sequence[str], wall_s: float
+    ) -> TrialResult:
+        """Compares the run of a live session with the expectations of its scenario.
+
+        Two expectations are added to those of the scenario: that the session ended normally,
+        and that all records are bit for bit the same when they are computed again.
+
+        Args:
+            log_file: Log of the session, which may be missing.
+            problems: Problems of the session, as sentences. Empty if the session ended
+                normally.
+            wall_s: Duration of the session in real time, in s.
+
+        Returns:
+            The result. If the log cannot be read, it contains the reason instead of outcomes.
+        """
+        existing_log = log_file if log_file.exists() else None
+        try:
+            log = open_log(log_file)
+            if not any(len(log[name]) for name in log.sites):
+                raise LogError(f"{log_file}: no records")
+            result = self.evaluate(RunMetrics.of_log(log, self.scenario.expect), wall_s)
+            verdict = verify_log(log)
+        except LogError as error:
+            text = "; ".join([*problems, str(error)])
+            return TrialResult(self, wall_s=wall_s, error=text, log=existing_log)
+
+        session = ExpectationResult(
+            key="session",
+            held=not problems,
+            measured="; ".join(problems) or "ended in order",
+            limit="ends in order",
+        )
+        coverage = "" if verdict.coverage.share == 1.0 else f"; judged {verdict.coverage}"
+        execution = ExpectationResult(
+            key="executed again",
+            held=verdict.passed,
+            measured=f"{verdict.identical} identical{coverage}",
+            limit=count_nouns(verdict.records, "record"),
+        )
+        return result._replace(
+            outcomes=[*result.outcomes, session, execution], log=existing_log
+        )
+
 
 def trials(
     source: str | Path | Mapping[str, Any] | Scenario,
@@ -200,7 +238,7 @@ def trials(
 
     Args:
         source: Name of a shipped scenario, a path, a TOML text, its tables, or a scenario.
-        seeds: Seeds of the random numbers. Empty stands for the scenario's own seed.
+        seeds: Seeds of the random numbers. If empty, the scenario's own seed is used.
         set: Overrides, as in `{"link.delay_ms": 400}` or `["link.delay_ms=400"]`.
         live: True if the trials will run over a network.
 
@@ -231,7 +269,7 @@ def trials(
 
 
 def _check_expectations_reachable(scenario: Scenario, source: str) -> None:
-    """Refuses expectations that no run of a scenario can meet.
+    """Rejects expectations that no run of a scenario can meet.
 
     Args:
         scenario: The scenario.
@@ -271,53 +309,9 @@ def _check_expectations_reachable(scenario: Scenario, source: str) -> None:
             raise ScenarioError(problem, path=f"expect.windows[{n}].to_s", source=source)
 
 
-def evaluate_live_log(
-    trial: Trial, log_file: Path, problems: Sequence[str], wall_s: float
-) -> TrialResult:
-    """Compares the run of a live session with the expectations of its scenario.
-
-    Two expectations are added to those of the scenario: that the session ended in order, and
-    that all records are the same bit for bit when they are computed again.
-
-    Args:
-        trial: The trial, with its scenario.
-        log_file: Log of the session, which may be missing.
-        problems: Problems of the session, as sentences. Empty if the session ended in order.
-        wall_s: Duration of the session in real time, in s.
-
-    Returns:
-        The result. If the log cannot be read, it contains the reason instead of outcomes.
-    """
-    existing_log = log_file if log_file.exists() else None
-    try:
-        log = open_log(log_file)
-        if not any(len(log[name]) for name in log.sites):
-            raise LogError(f"{log_file}: no records")
-        result = trial.evaluate(measure_log(log, trial.scenario.expect), wall_s)
-        verdict = verify(log)
-    except LogError as error:
-        text = "; ".join([*problems, str(error)])
-        return TrialResult(trial, wall_s=wall_s, error=text, log=existing_log)
-
-    session = ExpectationResult(
-        key="session",
-        held=not problems,
-        measured="; ".join(problems) or "ended in order",
-        limit="ends in order",
-    )
-    coverage = "" if verdict.coverage.share == 1.0 else f"; judged {verdict.coverage}"
-    execution = ExpectationResult(
-        key="executed again",
-        held=verdict.passed,
-        measured=f"{verdict.identical} identical{coverage}",
-        limit=count_nouns(verdict.records, "record"),
-    )
-    return result._replace(outcomes=[*result.outcomes, session, execution], log=existing_log)
-
-
 MAX_FAILURES_SHOWN = 5
-"""Failed runs of a scenario that are printed in full. Of further runs only the seeds are
-printed.
+"""Largest number of failed runs of a scenario that are printed in full. For further runs, only
+the seeds are printed.
 """
 
 TRIAL_COLUMNS = ("", "scenario", "expected", "limit", "worst", "margin", "held")
@@ -335,7 +329,7 @@ class _ExpectationRow(NamedTuple):
         worst: Outcome of the run that came closest to its limit, or exceeded it most.
         held: Number of runs that met the expectation.
         runs: Number of all runs.
-        mean: Mean of the measured values, with its interval. None if it cannot be computed.
+        mean: Mean of the measured values, with its interval. `None` if it cannot be computed.
     """
 
     scenario: str
@@ -395,7 +389,7 @@ class TrialReport(Result):
                 for outcome in result.outcomes:
                     outcomes_by_key.setdefault(outcome.key, []).append(outcome)
             for key, outcomes in outcomes_by_key.items():
-                # An unmet expectation is worse than any other. After that the margin decides.
+                # An unmet expectation is worse than a met one. Otherwise, the margin decides.
                 worst = min(outcomes, key=lambda outcome: (outcome.held, outcome.margin or 0.0))
                 row = _ExpectationRow(
                     scenario=name,
@@ -420,7 +414,7 @@ class TrialReport(Result):
         return rows
 
     def failures(self) -> list[str]:
-        """Returns lines about the failed runs, each with the commands that repeat and show it.
+        """Returns lines about the failed runs, with commands that repeat and show each run.
 
         At most `MAX_FAILURES_SHOWN` runs of a scenario are explained. Empty if no run failed.
         """
@@ -474,7 +468,7 @@ class TrialReport(Result):
         """Returns the table of expectations as aligned lines, of which the first is the header.
 
         The table has a row per expectation. A column with the means over the runs is added if
-        there are any.
+        there are means.
         """
         rows = self.rows()
         cells = [row.cells() for row in rows]
@@ -528,7 +522,7 @@ class TrialReport(Result):
     def to_rows(self) -> list[dict[str, Any]]:
         """Returns a table of plain values, one row for each expectation of each run.
 
-        A data frame of these rows shows how close runs came to their limits.
+        A data frame of these rows shows how close the runs came to their limits.
         """
         return [
             {
@@ -539,6 +533,41 @@ class TrialReport(Result):
             for result in self.results
             for outcome in result.outcomes
         ]
+
+    def encode_junit_xml(self, began_unix_ns: int, host: str) -> bytes:
+        """Encodes the results of trials as a JUnit XML document, which build servers display.
+
+        The document follows Jenkins' `junit-10.xsd`. It has a suite per scenario and a case per
+        run. A case has one `failure` with all unmet expectations, or an `error` if the run has
+        no result.
+
+        Args:
+            began_unix_ns: Start of the trials in Unix time, in ns.
+            host: Name of this machine.
+
+        Returns:
+            The document.
+        """
+        root = Xml.Element(
+            "testsuites", _build_count_attributes(self.results), name="trilat test"
+        )
+        began = datetime.fromtimestamp(began_unix_ns // 10**9, UTC)
+        for name, results in self.scenarios.items():
+            suite = Xml.SubElement(
+                root,
+                "testsuite",
+                _build_count_attributes(results),
+                name=_replace_forbidden(name),
+                skipped="0",
+                timestamp=f"{began:%Y-%m-%dT%H:%M:%S}",
+                hostname=_replace_forbidden(host),
+            )
+            _add_properties(suite, results)
+            for result in results:
+                _add_case(suite, result)
+        Xml.indent(root)
+        document: bytes = Xml.tostring(root, encoding="utf-8", xml_declaration=True)
+        return document + b"\n"
 
 
 LANE_RUNS = 32
@@ -599,7 +628,7 @@ def _run_side_by_side(
         run_alone: Function that runs one trial.
 
     Yields:
-        The results in the order of the trials. They are those of `run_alone`.
+        The results in the order of the trials, equal to those of `run_alone`.
     """
     clock = SystemClock()
     start_ns = clock.monotonic_ns()
@@ -607,7 +636,7 @@ def _run_side_by_side(
     scenarios = [items[n].trial.scenario for n in chosen]
     measured: dict[int, tuple[RunMetrics, str]] = {}
     try:
-        for index, metrics, obstacle in measure_virtual_runs(scenarios):
+        for index, metrics, obstacle in RunMetrics.of_virtual_runs(scenarios):
             measured[chosen[index]] = metrics, obstacle
     except _RUN_ERRORS:
         # One by one, only the trial whose run fails has no result.
@@ -635,10 +664,10 @@ def run_trials(
 
     Args:
         batch: The trials.
-        jobs: Number of worker processes. None uses all cores.
+        jobs: Number of worker processes. If `None`, all cores are used.
         done: Function that is called with each result as it arrives.
-        on: Address of a Dask scheduler, or an executor, whose workers run the trials. None uses
-            processes of this machine.
+        on: Address of a Dask scheduler, or an executor, whose workers run the trials. If
+            `None`, they run in processes on this machine.
 
     Returns:
         The results, in the order of the trials.
@@ -719,10 +748,10 @@ def check(
 
     Args:
         source: Name of a shipped scenario, a path, or a scenario.
-        seeds: Seeds of the random numbers. Empty stands for the scenario's own seed.
+        seeds: Seeds of the random numbers. If empty, the scenario's own seed is used.
         set: Overrides, as in `{"link.delay_ms": 400}`.
-        jobs: Number of worker processes. None uses all cores.
-        on: Workers to use instead of processes of this machine: the address of a Dask
+        jobs: Number of worker processes. If `None`, all cores are used.
+        on: Workers to use instead of processes on this machine: the address of a Dask
             scheduler, as in "tcp://10.0.0.5:8786", or an executor.
 
     Returns:
@@ -752,7 +781,7 @@ def format_margin(margin: float | None) -> str:
     Margins below 10 % have one decimal place.
 
     Args:
-        margin: Distance to a limit as a fraction of the limit. None becomes an empty text.
+        margin: Distance to a limit as a fraction of the limit. `None` becomes an empty text.
     """
     if margin is None:
         return ""
@@ -763,7 +792,7 @@ def format_margin(margin: float | None) -> str:
 def _list_repeat_commands(result: TrialResult) -> list[str]:
     """Returns two lines with the commands that repeat a failed run and show its motion.
 
-    A live run has a log already, so that a report of this log shows the motion.
+    A live run already has a log, so a report of this log shows the motion.
     """
     look = f"trilat report {result.log}" if result.log else result.trial.look
     return [f"again: {result.trial.again}", f"look:  {look}"]
@@ -773,45 +802,8 @@ def _list_repeat_commands(result: TrialResult) -> list[str]:
 _NOT_XML = re.compile(r"[^\t\n\r\x20-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
 
 
-def encode_junit_xml(report: TrialReport, began_unix_ns: int, host: str) -> bytes:
-    """Encodes the results of trials as a JUnit XML document, which build servers display.
-
-    The document follows Jenkins' `junit-10.xsd`. It has a suite per scenario and a case per
-    run. A case has one `failure` with all unmet expectations, or an `error` if the run has no
-    result.
-
-    Args:
-        report: The results.
-        began_unix_ns: Start of the trials in Unix time, in ns.
-        host: Name of this machine.
-
-    Returns:
-        The document.
-    """
-    root = Xml.Element(
-        "testsuites", _build_count_attributes(report.results), name="trilat test"
-    )
-    began = datetime.fromtimestamp(began_unix_ns // 10**9, UTC)
-    for name, results in report.scenarios.items():
-        suite = Xml.SubElement(
-            root,
-            "testsuite",
-            _build_count_attributes(results),
-            name=_replace_forbidden(name),
-            skipped="0",
-            timestamp=f"{began:%Y-%m-%dT%H:%M:%S}",
-            hostname=_replace_forbidden(host),
-        )
-        _add_properties(suite, results)
-        for result in results:
-            _add_case(suite, result)
-    Xml.indent(root)
-    document: bytes = Xml.tostring(root, encoding="utf-8", xml_declaration=True)
-    return document + b"\n"
-
-
 def _add_properties(suite: Xml.Element, results: Sequence[TrialResult]) -> None:
-    """Adds to a suite what all runs of its scenario have in common, as JUnit properties.
+    """Adds the common properties of all runs of a scenario to its JUnit suite.
 
     Examples are the driver (live or virtual), the overrides and the duration.
 
@@ -849,7 +841,7 @@ def _build_count_attributes(results: Sequence[TrialResult]) -> dict[str, str]:
 
 
 def _add_case(suite: Xml.Element, result: TrialResult) -> None:
-    """Adds a run to its JUnit suite as a test case, with the problem of the run if it has one.
+    """Adds a run to its JUnit suite as a test case, with the run's problem if there is one.
 
     A run without a result is an error. Unmet expectations together are one failure, whose text
     has the commands that repeat the run.
@@ -892,7 +884,7 @@ def _describe_outcome(outcome: ExpectationResult) -> str:
 def _replace_forbidden(text: str) -> str:
     """Returns a text in which the characters that XML forbids are replaced by U+FFFD.
 
-    An error message of a user's code may contain any character, and a build server would refuse
+    An error message of a user's code may contain any character, and a build server would reject
     the whole report.
     """
     return _NOT_XML.sub("\N{REPLACEMENT CHARACTER}", text)

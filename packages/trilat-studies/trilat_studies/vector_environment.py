@@ -1,19 +1,20 @@
 """Advances several Gymnasium environments together, on the SIMD vector unit of one core.
 
 Training a policy needs millions of steps. Processors compute the same operation on several
-numbers at once. Therefore environments that differ in numbers only are simulated side by side:
-each has its lane, which is its position in the vector registers. NumPy computes the
-observations and rewards of all environments together.
+numbers at once. Therefore, environments that differ only in numbers are simulated side by side.
+Each has a lane, which is its position in the vector registers. NumPy computes the observations
+and rewards of all environments together.
 
 Each sub-environment is a `TeleoperationEnv`, which begins its episodes and can draw and save
 them.
 
 Invariant:
-    - Observations, rewards and information are those of the sub-environments one by one, as
-      `gymnasium.vector.SyncVectorEnv` returns them, bit for bit.
+    - Observations, rewards and information equal, bit for bit, those that
+      `gymnasium.vector.SyncVectorEnv` returns when the sub-environments are stepped one by one.
     - A sub-environment whose present episode cannot share the vector instructions is stepped by
-      itself. If no sub-environment can, the attribute `obstacle` has the reason.
-    - If an action is refused, no sub-environment makes a step.
+      itself. If this applies to all sub-environments, the attribute `obstacle` states the
+      reason.
+    - If an action is rejected, no sub-environment advances.
 """
 
 import copy
@@ -51,8 +52,8 @@ class TeleoperationVectorEnv(SyncVectorEnv[Any, Any]):
     Args:
         env: The first sub-environment. The others are copies of it.
         num_envs: Number of sub-environments.
-        autoreset_mode: When an episode that has ended is followed by the next one: "NextStep",
-            "SameStep" or "Disabled", as in Gymnasium.
+        autoreset_mode: When the next episode follows an ended one: "NextStep", "SameStep" or
+            "Disabled", as in Gymnasium.
 
     Attributes:
         obstacle: Property because of which sub-environments are stepped one by one. Empty if
@@ -69,7 +70,7 @@ class TeleoperationVectorEnv(SyncVectorEnv[Any, Any]):
         autoreset_mode: str = "NextStep",
     ) -> None:
         if isinstance(num_envs, bool) or not isinstance(num_envs, int) or num_envs < 1:
-            raise UsageError(f"num_envs must be a whole number from 1 on, not {num_envs!r}")
+            raise UsageError(f"num_envs must be a whole number of at least 1, not {num_envs!r}")
         modes = [mode.value for mode in AutoresetMode]
         if autoreset_mode not in modes:
             names = ", ".join(map(repr, modes))
@@ -98,12 +99,12 @@ class TeleoperationVectorEnv(SyncVectorEnv[Any, Any]):
     def reset(
         self, *, seed: Any = None, options: dict[str, Any] | None = None
     ) -> tuple[Any, dict[str, Any]]:
-        """Begins new episodes, of all environments or of those in `options["reset_mask"]`.
+        """Begins new episodes in all environments, or in those of `options["reset_mask"]`.
 
         Args:
             seed: Seed of the random numbers of the first environment, to which each further
-                environment adds 1; or a list with one seed per environment. None continues the
-                sequences of earlier episodes.
+                environment adds 1; or a list with one seed per environment. If `None`, the
+                random sequences of earlier episodes continue.
             options: Overrides for these episodes only, as in `TeleoperationEnv.reset`, and the
                 mask, an array of booleans.
 
@@ -111,7 +112,7 @@ class TeleoperationVectorEnv(SyncVectorEnv[Any, Any]):
             The observations and the information dictionary.
         """
         if self._parts and options and "reset_mask" in options:
-            # The observations of environments that go on.
+            # The observations of environments whose episodes continue.
             self._env_obs = [
                 _select_observation(self._observations, i) for i in range(self.num_envs)
             ]
@@ -124,9 +125,10 @@ class TeleoperationVectorEnv(SyncVectorEnv[Any, Any]):
             actions: The actions, one per environment.
 
         Returns:
-            The observations; the rewards; for each environment True if its task was done or
-            failed, or if an arm left its limits; for each True if the episode ended by its
-            duration; and the information dictionary of Gymnasium's vector environments.
+            The observations; the rewards; for each environment, True if its task was done or
+            failed, or if an arm left its limits; for each environment, True if the episode
+            ended because of its duration; and the information dictionary of Gymnasium's vector
+            environments.
 
         Raises:
             UsageError: An action is not valid. No environment advances.
@@ -218,8 +220,8 @@ class TeleoperationVectorEnv(SyncVectorEnv[Any, Any]):
         """Inserts observations of single environments into those of all environments.
 
         Args:
-            batched: Observations of all environments, which are changed in place. None for the
-                observations of the previous step.
+            batched: Observations of all environments, which are changed in place. If `None`,
+                the observations of the previous step are used.
             single: The observations to insert, by index of the environment.
 
         Returns:
@@ -246,8 +248,9 @@ class TeleoperationVectorEnv(SyncVectorEnv[Any, Any]):
             infos: Information of all environments.
 
         Returns:
-            The observations, in which those of new episodes replace the last ones.
-            The information, with "final_obs" and "final_info" of the ended episodes.
+            The observations, in which the observations of new episodes replace those of ended
+            episodes; and the information, with "final_obs" and "final_info" of the ended
+            episodes.
         """
         observations = {}
         for index in np.flatnonzero(self._autoreset_envs).tolist():
@@ -257,15 +260,16 @@ class TeleoperationVectorEnv(SyncVectorEnv[Any, Any]):
             }
             infos = self._add_info(infos, final, index)
             observations[index], info = self._members[index].reset()
-            # The first information of the next episode replaces the last one of this episode.
+            # The first information of the next episode replaces the last information of this
+            # episode.
             infos = self._add_info(infos, info, index)
         return self._join(batch, observations), infos
 
     def call(self, name: str, *args: Any, **kwargs: Any) -> tuple[Any, ...]:
         """Calls the method `name` of each environment, or reads the attribute of that name.
 
-        The states of the episodes are written into the environments before, because an
-        environment does not take part in the joint simulation itself.
+        The states of the episodes are first written into the environments, because the joint
+        simulation does not update them.
         """
         self._write_back()
         return super().call(name, *args, **kwargs)
@@ -312,8 +316,9 @@ class _Results:
         Args:
             infos: The dictionary, or a dictionary in it.
             key: Key of the entry.
-            indices: Environments of the values, an index of arrays.
-            values: The values, one per environment; a dictionary has several entries.
+            indices: Environments to which the values belong, as a NumPy index.
+            values: The values, one per environment, or a dictionary with such values for
+                several entries.
         """
         has_entry = infos.setdefault(f"_{key}", np.zeros(self.count, np.bool_))
         has_entry[indices] = True
@@ -357,12 +362,13 @@ class _Results:
 class _LaneEnvs:
     """Environments that are simulated together, each in one lane of the vector registers.
 
-    An episode enters its lane before its first step, if its scenario has the same structure as
-    that of the other lanes. Otherwise the environment makes its steps by itself.
+    An episode is assigned to its lane before its first step, if its scenario has the same
+    structure as the scenarios of the other lanes. Otherwise the environment is stepped by
+    itself.
 
     Args:
         envs: The environments, at most `LaneEpisodes.most_runs`.
-        first: Index of the first one in the vector environment.
+        first: Index of the first of these environments in the vector environment.
     """
 
     def __init__(self, envs: Sequence[TeleoperationEnv], first: int) -> None:
@@ -389,7 +395,7 @@ class _LaneEnvs:
         )
 
         count = len(envs)
-        # Runs and tasks of the episodes in the lanes, None for an empty lane.
+        # Runs and tasks of the episodes in the lanes, `None` for an empty lane.
         self._runs: list[Any] = [None] * count
         self._tasks: list[Any] = [None] * count
         self._is_loaded = np.zeros(count, np.bool_)
@@ -460,7 +466,7 @@ class _LaneEnvs:
     def _load_task(self, lane: int, env: TeleoperationEnv) -> None:
         """Copies the task of an episode, so that `step` can judge many tasks together.
 
-        Only tasks of the class `ReachTask` are judged together. Other tasks are asked one by
+        Only tasks of the class `ReachTask` are judged together. Other tasks are judged one by
         one.
 
         Args:
@@ -584,8 +590,8 @@ class _LaneEnvs:
             i: Index of the site.
             q: Joint angles in each lane, shape (lanes, 2), in rad.
         """
-        # The functions and the order of `ArmModel.end_effector`, for equal bits: NumPy's sine
-        # differs in the last bits.
+        # Same functions and order of operations as in `ArmModel.end_effector`, to give equal
+        # bits: NumPy's sine differs in the last bits.
         upper_arm = q[:, 0].tolist()
         forearm = (q[:, 0] + q[:, 1]).tolist()
         lengths_m = self._lengths_m[i]
@@ -597,10 +603,10 @@ class _LaneEnvs:
         return position_m
 
     def _describe(self, state: "_State", succeeded: Flags) -> dict[str, Any]:
-        """Returns the information of a step for all lanes, as `TeleoperationEnv` does for one.
+        """Returns the information of a step for all lanes, as in `TeleoperationEnv`.
 
-        A teacher is a user other than the policy. The teacher whom the site of the task follows
-        most intervenes while this site follows the teacher more than the policy.
+        A teacher is a user other than the policy. If the site of the task follows a teacher
+        more than the policy, the teacher intervenes.
 
         Args:
             state: State after the step.
@@ -720,7 +726,7 @@ class _State:
         return np.ascontiguousarray(self._lanes.read_links(name, i).transpose(1, 0, 2))
 
     def _find_view(self) -> dict[str, Array]:
-        """Returns what the user's operator sees in each lane, by the names of `HandView`.
+        """Returns the view of the user's operator in each lane, by the names of `HandView`.
 
         The arrays have one row per lane. They are computed once per step.
         """
@@ -890,7 +896,7 @@ def _take(values: Any, where: NDArray[np.int64], is_all: bool) -> Any:
 
 
 def _return(env: TeleoperationEnv) -> TeleoperationEnv:
-    """Returns its argument. With `partial` it is a function that makes an environment."""
+    """Returns its argument. With `partial`, it becomes a factory of environments."""
     return env
 
 
@@ -915,7 +921,7 @@ def _explain_steps(env: TeleoperationEnv, *, compiles: bool = True) -> str:
         compiles: True to find out whether the laws can be compiled in lanes.
 
     Returns:
-        The reason. Empty if there is none.
+        The reason. Empty if the episode can be simulated with others.
     """
     if env.plants:
         return "programs that move an arm"
@@ -931,7 +937,7 @@ def _explain_steps(env: TeleoperationEnv, *, compiles: bool = True) -> str:
 
 
 def _select(infos: Mapping[str, Any], index: int) -> dict[str, Any]:
-    """Returns the additional information about one environment from that of all of them.
+    """Returns the information about one environment from the information of all environments.
 
     Args:
         infos: Information of all environments.
@@ -939,7 +945,7 @@ def _select(infos: Mapping[str, Any], index: int) -> dict[str, Any]:
     """
     info: dict[str, Any] = {}
     for key, values in infos.items():
-        # An ended episode has no entries of the episode before it.
+        # An ended episode has no entries from the episode before it.
         is_internal = key.startswith(("_", "final_"))
         if is_internal or not infos[f"_{key}"][index]:
             continue
@@ -962,7 +968,7 @@ def _copy_observations(batch: Any) -> Any:
 
 
 def _select_observation(batch: Any, i: int) -> Any:
-    """Returns the observation of one environment out of those of all environments."""
+    """Returns the observation of one environment from the observations of all environments."""
     if isinstance(batch, np.ndarray):
         return batch[i]
     return {name: values[i] for name, values in batch.items()}

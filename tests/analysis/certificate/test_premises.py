@@ -59,7 +59,7 @@ def test_free_motion_satisfies_all_premises() -> None:
     checked = check_shipped()
     assert [p.name for p in checked.values() if p.holds is not True] == []
     assert checked["delays"].text == "constant on every link: 100 ms"
-    assert checked["hands"].text == "nobody pushes"
+    assert checked["hands"].text == "no operator or wall pushes"
 
 
 @pytest.mark.parametrize(
@@ -217,7 +217,7 @@ def test_a_hand_that_holds_on_fails_a_premise() -> None:
     assert still_holding.holds is False  # until 11 s
     lets_go = check_shipped("paper", duration_s=12.5, rate_hz=100)["hands"]
     assert lets_go.holds
-    assert "nobody pushes after 10.99" in lets_go.text
+    assert "no pushes after 10.99" in lets_go.text
     briefly = check_shipped("paper", duration_s=11.5, rate_hz=100)["hands"]
     assert briefly.holds is False
     assert "0.5 s of free motion at the end are less than 1 s" in briefly.text

@@ -24,7 +24,7 @@ from tests.log.builders import (
 from tests.log.surgery import take_apart
 from tests.scenario.builders import make_overrides
 from trilat_net.analysis.certificate.certificate_result import Certificate
-from trilat_net.analysis.certificate.stability_certificate import certify
+from trilat_net.analysis.certificate.stability_certificate import certify_log
 from trilat_net.analysis.certificate.verdict_facts import StabilityFinding
 from trilat_net.analysis.decision_facts import LoopRoots
 from trilat_net.analysis.run_end import EndBehaviour, Stability
@@ -41,7 +41,7 @@ def simulate_free(**overrides: object) -> Log:
 
 
 def test_free_motion_is_covered() -> None:
-    free_certificate = certify(simulate_free())
+    free_certificate = certify_log(simulate_free())
     assert free_certificate.verdict.finding is StabilityFinding.COVERED
     assert free_certificate.verdict.text.startswith(
         "covered by the theorem: V did not rise: 29.78 J at 0 s, 12"
@@ -55,7 +55,7 @@ def test_hands_are_named_and_excused() -> None:
     certificate = make_run("paper", {"duration_s": 12.5, "rate_hz": 100}).certificate
     assert certificate.verdict.finding is StabilityFinding.COVERED
     assert (
-        "covered by the theorem: V rose by no more than the hands gave: 24 J"
+        "covered by the theorem: V rose by no more than the hands supplied: 24 J"
         in certificate.verdict.text
     )
 
@@ -87,7 +87,7 @@ def test_a_rise_names_time_amount_and_cause() -> None:
 
 
 def test_kd_of_different_shape_makes_v_rise() -> None:
-    certificate = certify(
+    certificate = certify_log(
         simulate_free(sites__m1__control__Kd=[0.1, 30.0], sites__m2__control__Kd=[30.0, 0.1])
     )
     assert certificate.verdict.finding is StabilityFinding.ROSE
@@ -97,7 +97,7 @@ def test_kd_of_different_shape_makes_v_rise() -> None:
 
 def test_sampling_feeds_a_slow_digital_loop() -> None:
     """T = 0 at 80 Hz: `digital` keeps swinging, because torques are held over a tick."""
-    certificate = certify(
+    certificate = certify_log(
         simulate_free(rate_hz=80, scheme="digital", link__delay_ms=0.0, duration_s=20.0)
     )
     assert certificate.verdict.finding is StabilityFinding.ROSE
@@ -107,7 +107,7 @@ def test_sampling_feeds_a_slow_digital_loop() -> None:
 
 
 def certify_changed(change: Callable[[State], State]) -> Certificate:
-    return certify(rewrite_log(simulate_free(rate_hz=500, duration_s=2.0), change=change))
+    return certify_log(rewrite_log(simulate_free(rate_hz=500, duration_s=2.0), change=change))
 
 
 @pytest.mark.parametrize("field", ["q", "qd", "q_des", "theta_hat"])
@@ -120,13 +120,13 @@ def test_a_changed_record_breaks_its_sites_balance(field: str) -> None:
     certificate = certify_changed(change)
     assert certificate.verdict.finding is StabilityFinding.BROKEN
     assert not certificate.passed
-    assert "were not made by the equations that the log claims" in certificate.verdict.text
+    assert "do not follow from the equations in the log" in certificate.verdict.text
 
 
 def test_changed_records_break_balances_under_varying_delay() -> None:
     log = make_run("free", {**JITTER, "duration_s": 2.0, "rate_hz": 500}).log
     late = lambda s: s.site == "m2" and s.tick >= 500  # noqa: E731
-    certificate = certify(
+    certificate = certify_log(
         rewrite_log(
             log, change=lambda s: replace_fields(s, q=[x + 0.01 for x in s.q]) if late(s) else s
         )
@@ -136,7 +136,7 @@ def test_changed_records_break_balances_under_varying_delay() -> None:
 
 def test_erased_hands_break_the_balance() -> None:
     log = make_run("paper", {"duration_s": 11.5, "rate_hz": 100}).log
-    certificate = certify(
+    certificate = certify_log(
         rewrite_log(log, change=lambda s: msgspec.structs.replace(s, tau_x=[0.0, 0.0]))
     )
     assert certificate.verdict.finding is StabilityFinding.BROKEN
@@ -168,10 +168,10 @@ d = { c = 1.0 }
 
 
 def test_two_closed_groups_are_refused_and_named() -> None:
-    certificate_found = certify(trilat_net.simulate(parse_scenario(FOUR)))
+    certificate_found = certify_log(trilat_net.simulate(parse_scenario(FOUR)))
     assert certificate_found.verdict.finding is StabilityFinding.NOT_JUDGED
     assert (
-        "{a, b} and {c, d} follow nobody outside: beta is not unique"
+        "{a, b} and {c, d} follow no site outside their group: beta is not unique"
         in certificate_found.verdict.text
     )
     assert certificate_found.groups == (("a", "b"), ("c", "d"))
@@ -181,8 +181,8 @@ def test_two_closed_groups_are_refused_and_named() -> None:
 def test_groups_made_by_a_change_are_refused() -> None:
     joined = FOUR.replace("c = { d = 1.0 }", "c = { d = 0.5, a = 0.5 }")
     step = '[[timeline]]\nat_s = 1.0\ndominance = "c"\nto = { d = 1.0 }\nramp_s = 0.5\n'
-    assert certify(trilat_net.simulate(parse_scenario(joined))).balance is not None
-    certificate = certify(trilat_net.simulate(parse_scenario(joined + step)))
+    assert certify_log(trilat_net.simulate(parse_scenario(joined))).balance is not None
+    certificate = certify_log(trilat_net.simulate(parse_scenario(joined + step)))
     assert certificate.verdict.finding is StabilityFinding.NOT_JUDGED
 
 
@@ -283,7 +283,7 @@ RUN = {"duration_s": 60.0, "rate_hz": 50, "link.delay_ms": 200.0}
 
 
 def certify_bytes(data: bytes, **options: float) -> Certificate:
-    return certify(open_bytes(data), **options)
+    return certify_log(open_bytes(data), **options)
 
 
 def test_a_whole_log_is_stable_with_reasons() -> None:
@@ -359,12 +359,12 @@ def test_torques_foreign_to_the_law_break_the_balance(law: str) -> None:
     for change in (scaled, lambda r: r if r["site"] == "s" else {**r, "tau": [0.0, 0.0]}):
         certificate = certify_bytes(edit_log_bytes(data, record=change))
         assert certificate.verdict.finding is StabilityFinding.BROKEN
-        assert "the torque of m1 is not that of Eq. (13)" in certificate.verdict.text
+        assert "the torque of m1 differs from Eq. (13)" in certificate.verdict.text
         assert not certificate.accepts(("open",))
 
 
 def test_sites_that_did_not_react_stay_open() -> None:
     claims = {"driver": "rerun", "rerun_executed": "s"}
     certificate = certify_bytes(edit_log_bytes(make_log_bytes("free", RUN), session=claims))
-    assert any("m1 and m2, as recorded, did not react" in why for why in certificate.reasons)
+    assert any("m1 and m2 replayed recorded motion" in why for why in certificate.reasons)
     assert certificate.stability is Stability.OPEN

@@ -2,7 +2,7 @@
 
 import pytest
 
-from trilat_net.app.play.session_reader import parse_selection
+from trilat_net.app.play.session_reader import PlaySelection
 from trilat_net.errors import UsageError
 
 SITES = ("m1", "m2", "s")
@@ -17,7 +17,7 @@ TOPICS = [
 
 
 def select_channels(include: tuple[str, ...] = (), exclude: tuple[str, ...] = ()) -> list[str]:
-    selection = parse_selection(include, exclude, None, None, None, "publish")
+    selection = PlaySelection.parse(include, exclude, None, None, None, "publish")
     return [topic for topic in TOPICS if selection.accepts(topic, SITES)]
 
 
@@ -37,13 +37,13 @@ def test_exclusion_overrides_inclusion() -> None:
 
 
 def test_durations_count_from_start_or_tick_0() -> None:
-    window = parse_selection((), (), 2.0, None, 0.5, "log")
+    window = PlaySelection.parse((), (), 2.0, None, 0.5, "log")
     assert (window.start_ns, window.stop_ns, window.time) == (
         2_000_000_000,
         2_500_000_000,
         "log",
     )
-    window = parse_selection((), (), None, None, 0.5, "publish")
+    window = PlaySelection.parse((), (), None, None, 0.5, "publish")
     assert (window.start_ns, window.stop_ns) == (None, 500_000_000)
 
 
@@ -62,4 +62,4 @@ def test_invalid_windows_are_refused(
     start_s: float | None, stop_s: float | None, duration_s: float | None, problem: str
 ) -> None:
     with pytest.raises(UsageError, match=problem):
-        parse_selection((), (), start_s, stop_s, duration_s, "publish")
+        PlaySelection.parse((), (), start_s, stop_s, duration_s, "publish")

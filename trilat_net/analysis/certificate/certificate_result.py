@@ -1,11 +1,11 @@
 """Defines the result of judging a run from its log: `Certificate`, with every reason.
 
-`stability_certificate.certify` creates it, and `judge.certify_run` adds the repetitions of the
-run and the characteristic roots. `stability_decision` decides from its evidence.
+`stability_certificate.certify_log` creates it, and `judge.certify_run` adds the repetitions of
+the run and the characteristic roots. `stability_decision` decides from its evidence.
 
 Invariant:
     - Keys of the JSON output end in their unit, and unknown values are null.
-    - The package `presentation` writes every sentence, when somebody asks for it.
+    - The package `presentation` writes every sentence on request.
 """
 
 from collections.abc import Collection, Mapping
@@ -36,30 +36,34 @@ _REFUTING_FINDINGS = (ObservedFinding.NEGATIVE, ObservedFinding.BROKEN)
 class Certificate(Result):
     """Judgement whether a recorded run was stable, with every reason. `certify` creates it.
 
-    It combines several kinds of evidence: the energy function V of the stability proof, the end
-    of the motion, the roots of the linearised loop, and repeated runs with a small push.
+    A certificate combines several kinds of evidence: the energy function V of the stability
+    proof, the end of the motion, the roots of the linearised loop, and repeated runs with a
+    small push.
 
     Attributes:
         premises: The conditions of the stability theorem, each checked.
-        verdict: What the energy function V shows.
+        verdict: Result of examining the energy function V.
         end: The end of the run, judged from the errors e and the velocities qd alone.
-        evidence: On how many records the certificate rests, and whether the log was changed.
-        balance: Energy balance of all sites. None if V does not exist, or if the weights beta
+        evidence: The number of records on which the certificate rests, and whether the log was
+            changed.
+        balance: Energy balance of all sites. `None` if V does not exist, or if the weights beta
             of the sites in V are not unique.
         paper_balance: Energy balance with the weights of the paper, which are 1 for every site.
-            None if these are the right weights, or if there is no balance.
-        groups: Closed groups of sites, which follow nobody outside their group. Empty unless
-            there are several; beta is then not unique.
+            `None` if these are the right weights, or if there is no balance.
+        groups: Closed groups of sites, which follow no site outside their group. Empty unless
+            there are several groups, in which case beta is not unique.
         energies: Energies of every site, by name. Empty if V does not exist.
-        roots: Roots of the loop at the pose where the run ended. None if not computed.
-        observed: Check of the energies that control laws declare. None if no law declares any.
-        twins: Growth of small pushes in repeated runs. None if not computed.
+        roots: Roots of the loop at the pose where the run ended. `None` if not computed.
+        observed: Check of the energies that control laws declare. `None` if no law declares
+            any.
+        twins: Growth of small pushes in repeated runs. `None` if not computed.
         law_proofs: Phrases that name the stability conditions of control laws that hold at
             every site and prove that small motions die away. Empty if there are none.
         law_conditions: Sentences on the stability conditions of the control laws of the run.
-        has_lasting_delays: True if delays that are constant in the run stay so after it.
-        circumstances: What readers of the judgement should know, such as a motor at its torque
-            limit. Empty if it was not examined.
+        has_lasting_delays: True if delays that are constant in the run remain constant after
+            the run.
+        circumstances: Circumstances that readers of the judgement should know, such as a motor
+            at its torque limit. Empty if they were not examined.
     """
 
     premises: list[Premise]
@@ -82,7 +86,7 @@ class Certificate(Result):
     def has_functional(self) -> bool:
         """True if the energy function V of the stability proof exists for this run's laws.
 
-        Texts and pages leave out V and its terms otherwise.
+        If V does not exist, texts and pages leave out V and its terms.
         """
         laws = [premise.holds for premise in self.premises if premise.name == "law"]
         return laws != [False]
@@ -92,7 +96,8 @@ class Certificate(Result):
         """The largest rise that the total energy would have if all arms had the same weight.
 
         The paper on which the control law is based uses such equal weights in the energy
-        function of its stability proof. None if this energy does not rise, or was not computed.
+        function of its stability proof. `None` if this energy does not rise, or was not
+        computed.
         """
         if self.paper_balance is None:
             return None
@@ -100,12 +105,13 @@ class Certificate(Result):
 
     @property
     def bounded_by_v(self) -> bool:
-        """True if the energy V of the stability proof limits the motion of every arm.
+        """True if the energy V of the stability proof bounds the motion of every arm.
 
         V must not have risen, and every arm must have a positive weight in V. An arm has the
-        weight zero if the arms that it follows do not follow it. It is limited as well if only
-        the condition on the dominance factors, the weights with which arms follow each other,
-        fails, and these factors are constant. It then converges after the arms that it follows.
+        weight zero if the arms that it follows do not follow it. The motion of such an arm is
+        still bounded if the dominance factors (the weights with which arms follow each other)
+        are constant, and if the condition on these factors is the only condition that fails.
+        The arm then converges after the arms that it follows.
         """
         did_not_rise = (StabilityFinding.COVERED, StabilityFinding.DID_NOT_RISE)
         if self.balance is None or self.verdict.finding not in did_not_rise:
@@ -123,9 +129,9 @@ class Certificate(Result):
         changed log is never accepted.
 
         Args:
-            accepted: Further judgements to accept: "settled" for a run that slowed down and
-                whose pushes all died away, "bounded" for a bounded oscillation, "open" for a
-                run that cannot be decided.
+            accepted: Further judgements to accept: "settled" for a run that slowed down and in
+                whose repetitions all pushes died away, "bounded" for a bounded oscillation,
+                "open" for a run that cannot be decided.
         """
         if self.verdict.finding is StabilityFinding.BROKEN:
             return False
@@ -144,9 +150,9 @@ class Certificate(Result):
     def decision(self) -> StabilityDecision:
         """The decision whether the run is stable, with its evidence and the reasons against it.
 
-        It combines the motion at the end, the repetitions with small pushes, the characteristic
-        roots, the proofs and the doubts, by the rules of `stability_decision`. It is computed
-        at first use.
+        The decision combines the motion at the end, the repetitions with small pushes, the
+        characteristic roots, the proofs and the doubts, by the rules of `stability_decision`.
+        The property is computed at first use.
         """
         findings = RunFindings(
             end=self.end,
@@ -199,10 +205,11 @@ class Certificate(Result):
 
     @property
     def reasons(self) -> tuple[str, ...]:
-        """Sentences on everything that speaks against calling the run stable.
+        """Sentences on all findings that prevent the judgement "stable".
 
-        They concern the end of the run, the energy V, the roots at the end pose, the energies
-        that control laws declare, and the completeness of the log. Empty for a stable run.
+        The sentences concern the end of the run, the energy V, the roots at the end pose, the
+        energies that control laws declare, and the completeness of the log. Empty for a stable
+        run.
         """
         return self.decision.reasons
 
@@ -226,8 +233,8 @@ class Certificate(Result):
     def passed(self) -> bool:
         """True if the run is judged stable, in the strict sense.
 
-        A run that merely settled, so that its motion became slow, has not passed. `accepts` is
-        less strict.
+        A run that merely settled, which means that its motion became slow, has not passed.
+        `accepts` is less strict.
         """
         return self.accepts(())
 
@@ -242,8 +249,8 @@ class Certificate(Result):
     def to_dict(self) -> JsonObject:
         """Converts the certificate to plain values, as `trilat certify --json` prints them.
 
-        docs/reference/json.md explains the most important keys. The entry "functional" is None
-        if the energy function V cannot be computed.
+        docs/reference/json.md explains the most important keys. The entry "functional" is
+        `None` if the energy function V cannot be computed.
         """
         verdict = self.verdict
         end = self.end
@@ -287,7 +294,7 @@ class Certificate(Result):
 
 
 def _functional_to_json(certificate: Certificate, balance: EnergyBalance) -> JsonObject:
-    """Converts the results about the energy function V to plain values for JSON output.
+    """Converts the results on the energy function V to plain values for JSON output.
 
     Args:
         certificate: The certificate.
@@ -328,7 +335,7 @@ def _functional_to_json(certificate: Certificate, balance: EnergyBalance) -> Jso
 
 
 def _rise_to_json(rise: FunctionalRise | None) -> JsonObject | None:
-    """Returns a rise of V as plain values, with the keys of the JSON output."""
+    """Converts a rise of V to plain values with the keys of the JSON output."""
     if rise is None:
         return None
     return {
@@ -340,7 +347,7 @@ def _rise_to_json(rise: FunctionalRise | None) -> JsonObject | None:
 
 
 def _last_values(columns: dict[str, Array]) -> dict[str, float]:
-    """Returns the value at the end of the run of each curve, by the name of the curve."""
+    """Returns the value of each curve at the end of the run, by the name of the curve."""
     return {name: float(values[-1]) for name, values in columns.items()}
 
 

@@ -8,8 +8,8 @@ the stability proof, which `energy_terms` defines. For each arm:
 
 The dissipation is the energy that the controller has removed, and the transfer is the energy
 that the arm has given to the arms that follow it. The work is the energy that operators and
-environments have supplied. The transfers cancel in the weighted sum over all arms, so that the
-total energy function V satisfies
+environments have supplied. The transfers cancel in the weighted sum over all arms. The total
+energy function V therefore satisfies
 
     V - V(0) + dissipation - work = 0
 
@@ -69,8 +69,8 @@ class SiteEnergy:
         motion: Motion of the site, from which its energies are computed.
         parts: The values of V_i, split into its parts.
         dissipation: Dissipated energy in each period, by kind, such as damping.
-        transfer: Energy in each period that the site gives to its followers, less the energy
-            that it gets from the sites that it follows.
+        transfer: Energy in each period that the site gives to its followers, minus the energy
+            that it receives from the sites that it follows.
         work: Work on the site in each period, by source, such as the operator.
         sampling: Work in each period that arises because the continuous control law is executed
             only once per tick.
@@ -161,9 +161,9 @@ class SiteEnergy:
     def begin_s(self) -> float:
         """Time of the first tick at which the energy V_i of the site can be computed, in s.
 
-        V_i depends on the motion of the other sites since they sent the states that are in use,
-        which the first records do not contain. If this motion is not known at any tick, the
-        time is infinite.
+        V_i depends on the motion of the other sites since they sent the states that are in use.
+        The first records do not contain this motion. If the motion is not known at any tick,
+        the time is infinite.
         """
         known = []
         for peer_motion in self.followed.values():
@@ -181,8 +181,8 @@ class SiteEnergy:
         """Estimated numerical error of the arm's energies, in J.
 
         A change of energy that is smaller than this error proves nothing. Energies are
-        integrated from records at the ticks (periods of the control loop), so that motion
-        between the ticks causes errors.
+        integrated from records at the ticks (periods of the control loop), and motion between
+        the ticks causes errors.
 
         The error of the trapezoid rule is estimated from the curvature of the total power. The
         error of torques that are constant between ticks is estimated from the changes of these
@@ -211,11 +211,11 @@ class SiteEnergy:
         return rule_error + self._estimate_coupled_error()
 
     def _estimate_coupled_error(self) -> float:
-        """Returns an estimate of the energy that the trapezoid rule misjudges, in J.
+        """Estimates the error of the energies that the trapezoid rule integrates, in J.
 
-        Within a period, both the filtered error r and the torques change. The product of both
-        changes is not contained in the mean of the powers at its ends. The estimate is an upper
-        bound for the error of the balance.
+        Within a period, both the filtered error r and the torques change. The mean of the
+        powers at the ends of the period does not include the product of both changes. The
+        estimate is an upper bound for the error of the balance.
         """
         records = self.motion.records
         ends = self.motion.ends
@@ -232,11 +232,11 @@ class SiteEnergy:
 
 
 def _accumulate(amounts: Array, judged: Bools | None = None) -> Array:
-    """Sums amounts, such as energies per control period, up to each time, shape (K,), from 0.
+    """Returns the cumulative sum of amounts, such as energies per period, shape (K,), from 0.
 
     Args:
         amounts: Amount in each period, shape (K - 1,).
-        judged: True for each period that counts. None if all periods count.
+        judged: True for each period that is included. `None` to include all periods.
     """
     if judged is not None:
         amounts = np.where(judged, amounts, 0.0)
@@ -334,7 +334,7 @@ def derive_site_energies(
 def find_common_times(energies: Mapping[str, SiteEnergy]) -> Array:
     """Returns the times at which the energies V_i of all arms are known, in s.
 
-    They are ticks (control periods) of the arm with the highest rate, shape (T,).
+    The times are ticks (control periods) of the arm with the highest tick rate, shape (T,).
 
     Args:
         energies: Energies of the sites, by name.
@@ -394,9 +394,10 @@ class EnergyBalance:
     def residual(self) -> Array:
         """The part of the change of V that no known energy explains, shape (T,), in J.
 
-        It is V - V(0) + dissipation - work, summed over the judged periods, which are those
-        that rest on records alone. It includes the work of sampling, and should otherwise be
-        close to 0. A large residual shows that the records contradict each other.
+        The residual is V - V(0) + dissipation - work, summed over the judged periods, which are
+        those that rest on records alone. Apart from the work of sampling, which it includes,
+        the residual should be close to 0. A large residual shows that the records contradict
+        each other.
         """
         dissipation = _sum(self.dissipation)
         work = _sum(self.work)
@@ -420,9 +421,9 @@ class EnergyBalance:
     def unsupplied(self) -> Array:
         """The energy V without the work of operators and environments, shape (T,), in J.
 
-        It starts at V(0). From then on, only changes in judged periods count, and the work of
-        operators, environments and the stops of joints is subtracted. If the conditions of the
-        stability theorem hold, it never rises.
+        The result starts at V(0). From then on, only changes in judged periods count, and the
+        work of operators, environments and the stops of joints is subtracted. If the conditions
+        of the stability theorem hold, it never rises.
         """
         rise = self._accumulate_judged(self.V - self.external_work)
         unsupplied: Array = self.V[0] + rise
@@ -463,8 +464,9 @@ class EnergyBalance:
     def scale(self) -> float:
         """The size of the energies in the balance, in J, with which its errors are compared.
 
-        It is the largest magnitude that the total energy V, or the work of any source, reaches
-        during the run. An error of 1 mJ is negligible for a scale of 100 J, but not for 1 mJ.
+        The scale is the largest magnitude that the total energy V, or the work of any source,
+        reaches during the run. An error of 1 mJ is negligible for a scale of 100 J, but not for
+        a scale of 1 mJ.
         """
         largest = []
         for energy in [self.V, *self.work.values()]:
@@ -479,14 +481,14 @@ class EnergyBalance:
     def find_largest_rise(self, tolerance: float) -> FunctionalRise | None:
         """Finds the largest rise of the energy function V above an earlier minimum.
 
-        The work of operators and environments is subtracted before, because V may rise by it.
-        The sources of the remaining energy are also found.
+        The work of operators and environments is subtracted first, because V may rise by this
+        amount. The sources of the remaining energy are also found.
 
         Args:
             tolerance: Size that the rise must exceed, in J.
 
         Returns:
-            The rise. None if it does not exceed the tolerance.
+            The rise. `None` if it does not exceed the tolerance.
         """
         V = self.unsupplied
         rise = rise_above_minimum(V)
@@ -521,11 +523,11 @@ class EnergyBalance:
         )
 
     def find_unsupplied_growth(self, tolerance: float) -> list[UnsuppliedGrowth]:
-        """Finds growths of the energy V that nobody supplied, although the run looks stable.
+        """Finds rises of the energy V that no source supplied, although the run looks stable.
 
         V is the energy function of the stability proof, from which the work of operators and
         environments is subtracted here. Two rules are checked. First, V must not end above its
-        beginning. Second, only the second half of the run is regarded: the rise from the
+        beginning. Second, only the second half of the run is considered: the rise from the
         minimum to the end must be at most half of the fall from the beginning of this half to
         the minimum.
 
@@ -558,15 +560,15 @@ def compute_energy_balance(
 ) -> EnergyBalance:
     """Adds up the energies of several sites to the energy balance of the group.
 
-    The sites are weighted so that the energies which they transfer to each other cancel in the
+    The sites are weighted such that the energies that they transfer to each other cancel in the
     sum.
 
     Args:
         energies: Energies of the sites in scenario order. No site may follow a site outside the
             group.
         paper_weights: True to give all sites the same weight, as in the paper on which the
-            control law is based. The transferred energies may then not cancel. In that case the
-            balance does not close.
+            control law is based. The transferred energies may then fail to cancel, in which
+            case the balance does not close.
     """
     times = find_common_times(energies)
     weights_by_grid = {}
@@ -607,13 +609,14 @@ def compute_energy_balance(
     all_judged = bool(judged.all())
 
     def select(kind: str) -> dict[str, Array]:
-        """Returns the energies of one kind, such as dissipation, summed over judged periods.
+        """Returns the accumulated energies of one kind, such as dissipation.
 
         Args:
             kind: The kind, such as "dissipation" or "work".
 
         Returns:
-            The energies in J by name, such as "damping". Each starts with 0.
+            The energies over the judged periods, in J, by name, such as "damping". Each starts
+            with 0.
         """
         selected = {}
         for (group, name), energy in sums.items():
@@ -692,7 +695,7 @@ def _weigh_site(
 def _resample(times: Array, t_s: Array, values: Array) -> Array:
     """Interpolates a curve linearly at other times, to add curves of arms with different rates.
 
-    At times that the curve has, its values stay unchanged.
+    At the times of the given values, these values are returned unchanged.
 
     Args:
         times: Times of the result, shape (T,), in s.
@@ -738,11 +741,11 @@ def _trace_weights(
 
         Args:
             t_s: Times, shape (T,), in s.
-            ahead_s: Time by which the factors are taken later than `t_s`, in s.
+            ahead_s: Time, in s, that is added to `t_s` before the factors are evaluated.
 
         Returns:
-            The weights, shape (T, N) for N sites. All are 1 if the paper's weights are asked
-            for.
+            The weights, shape (T, N) for N sites. All are 1 if the paper's weights are
+            requested.
         """
         count = len(t_s)
         if paper_weights:
@@ -845,8 +848,8 @@ def find_dominance_matrices(energies: Mapping[str, SiteEnergy]) -> Array:
 def rise_above_minimum(values: Array) -> Array:
     """Returns how far a quantity is above its smallest earlier value, at each time.
 
-    For example, the values 3, 1, 2, 0 give 0, 0, 1, 0. An energy that first falls and then
-    rises must not hide the rise behind the fall.
+    For example, the values 3, 1, 2, 0 give 0, 0, 1, 0. In this way, an earlier fall of an
+    energy does not hide a later rise.
 
     Args:
         values: Values of the quantity over time, shape (T,).

@@ -54,7 +54,7 @@ RATE_TOLERANCE = 1e-12
 It is a share of the largest torque.
 """
 JUMP_TOLERANCE = 1e-12
-"""Changes of e, in rad, or of its derivative, in rad/s, count as jumps if they are larger."""
+"""Changes of e (rad) or of its derivative (rad/s) that exceed this value count as jumps."""
 _GAIN_NAMES = (
     "Lambda",
     "Kp",
@@ -266,10 +266,10 @@ class SiteMotion:
 
     @cached_property
     def following(self) -> Following:
-        """Functions that convert errors between the arms to errors of this arm's joints.
+        """Converter from errors between the arms to motion and torque of this arm's joints.
 
-        Arms that follow each other with their end effectors need other functions than arms that
-        follow joint by joint.
+        Arms that follow each other with their end effectors need a different conversion than
+        arms that follow joint by joint.
         """
         records = self.records
         c = self.constants
@@ -350,8 +350,8 @@ class SiteMotion:
         """Returns the torque that the control law would demand for given errors.
 
         Pose and parameter estimates are taken from the records. The errors may differ from the
-        recorded ones. This shows, for example, the torque just before a new sample of a peer
-        was used.
+        recorded ones. For example, this gives the torque just before a new sample of a peer was
+        used.
 
         Args:
             rows: Rows of the records whose pose and estimates are used, shape (K,).
@@ -383,11 +383,11 @@ class SiteMotion:
 
     @property
     def rests(self) -> Bools:
-        """Marks the records in which the site brings its arm to rest, or did so, shape (K,).
+        """Marks the records in which the site brings its arm to rest, or did so shortly before.
 
         The site then adds a braking torque, for example because a peer is silent. The recorded
         torque may therefore differ from the torque of the control law, and must not be compared
-        with it.
+        with it. The shape is (K,).
         """
         records = self.records
         if records.rests.size:
@@ -449,9 +449,9 @@ class SiteMotion:
 
         The reference is the motion that the site follows: the delayed motions of its peers,
         weighted with the dominance factors. Within a period the delays are taken as constant,
-        so that the reference moves smoothly. At the end of the period it jumps to its next
-        recorded value. If samples of a peer stop arriving, the rule for silent peers determines
-        the reference instead. Then its recorded velocity is integrated by the trapezoid rule.
+        and the reference moves smoothly. At the end of the period it jumps to its next recorded
+        value. If samples of a peer stop arriving, the rule for silent peers determines the
+        reference instead. Then its recorded velocity is integrated by the trapezoid rule.
         """
         records = self.records
         dominance = self.dominance
@@ -591,7 +591,7 @@ def _dot_rows(x: Array, y: Array) -> Array:
 
 
 def _energy_in_transit(constants: SiteConstants, peer_motion: DelayedPeer) -> Array:
-    """Returns the energy of motion that a peer made but that has not reached the site, in J.
+    """Returns the energy of the peer's motion that has not yet reached the site, in J.
 
     It is 1/2 int qd_j' Kd qd_j ds, from the time at which the sample in use was sent until now,
     at each of K records.
@@ -625,8 +625,9 @@ class Increment(NamedTuple):
     def total(self) -> Array:
         """Change of the energy in each tick period, in J, as the sum of the three parts.
 
-        The parts are the contribution of the power at its start, that at its end, and the jump
-        there. K ticks bound K - 1 periods, so that the shape is (K - 1,).
+        The parts are the contribution of the power at the start of the period, the contribution
+        at its end, and the jump at the end. K ticks bound K - 1 periods, so the shape is (K -
+        1,).
         """
         return self.left + self.right + self.jump
 
@@ -646,7 +647,7 @@ def _trapezoid(
         site: Motion of the site, which gives the length of a period.
         left: Power at the start of every period, shape (K - 1,), in W.
         right: Power at the end of every period, before the jump, in W.
-        jump: Energy of the jump after each period, in J. None for no energy.
+        jump: Energy of the jump after each period, in J. `None` for no energy.
     """
     half_s = 0.5 * site.records.h_s
     if jump is None:
@@ -660,7 +661,7 @@ def _integrate_power(site: SiteMotion, power: Array, jump: Array | None = None) 
     Args:
         site: Motion of the site, with K records.
         power: The power, shape (K,), in W.
-        jump: Energy of the jump after each period, shape (K - 1,), in J. None for no energy.
+        jump: Energy of the jump after each period, shape (K - 1,), in J. `None` for no energy.
     """
     left = power[:-1]
     right = power[1:]
@@ -726,12 +727,12 @@ def compute_dissipation(site: SiteMotion) -> dict[str, Increment]:
         right = right + half_alpha_right * squared_right
 
     def damping_power(r: Array) -> Array:
-        """Returns the power that the damping of the control law takes, in W."""
+        """Returns the power that the damping of the control law dissipates, in W."""
         torque = c.Kp * r + c.robust_torque(r)
         return _dot_rows(r, torque)
 
     def friction_power(r: Array, qd: Array) -> Array:
-        """Returns the power that friction takes beyond what the law compensates, in W."""
+        """Returns the power that uncompensated friction dissipates, in W."""
         friction = c.arm.friction(qd)
         torque = friction - c.arm.friction(qd - r)
         return _dot_rows(r, torque)
@@ -756,17 +757,17 @@ def compute_dissipation(site: SiteMotion) -> dict[str, Increment]:
 
 
 def compute_transfer(site: SiteMotion, axes: Array) -> Increment:
-    """Computes the energy that a site gives to the sites which follow it, minus what it gets.
+    """Computes the net energy that a site gives to the sites that follow it.
 
-    In each tick period it is the integral of 1/2 qd_i'Kd qd_i - 1/2 sum_j alpha_ij qd_j'Kd
-    qd_j. Here qd_i is the velocity of the site and qd_j of its peer j, Kd is the damping gain,
-    and alpha_ij is the dominance factor: the weight with which site i follows peer j. In the
-    weighted sum over all sites these energies cancel.
+    It is the given energy minus the received energy: in each tick period the integral of 1/2
+    qd_i'Kd qd_i - 1/2 sum_j alpha_ij qd_j'Kd qd_j. Here qd_i is the velocity of the site and
+    qd_j of its peer j, Kd is the damping gain, and alpha_ij is the dominance factor: the weight
+    with which site i follows peer j. In the weighted sum over all sites these energies cancel.
 
     Args:
         site: Motion of the site.
-        axes: 1 for each of the m coordinates that counts, and 0 for each other one, shape (m,).
-            The shape () applies to all coordinates.
+        axes: 1 for each of the m coordinates to include, and 0 for each other coordinate, shape
+            (m,). The shape () applies to all coordinates.
     """
     dominance = site.dominance
     Kd_of_axes = axes * site.constants.Kd
@@ -846,9 +847,9 @@ def torque_work(site: SiteMotion, now: Array, held: Array) -> Increment:
 def link_work(site: SiteMotion, j: int) -> Increment:
     """Returns the work of the link from peer j: the change of V_i when a sample's age jumps.
 
-    At the end of a period the sample in use, which was sent at s and has moved on to s + h, is
-    replaced by the next one, which was sent at s'. With r and e half-way through the jump, and
-    de the jump of e by this link, the work is exactly
+    At the end of a period the sample in use is replaced. The time of the old sample, sent at s,
+    has advanced to s + h, and the new sample was sent at s'. With r and e half-way through the
+    jump, and de the jump of e by this link, the work is exactly
 
         (Lambda M r + Lambda Kd e)' de - 1/2 alpha_ij int qd_j' Kd qd_j ds from s + h to s'.
 
@@ -1002,7 +1003,7 @@ def _unknown_friction_work(site: SiteMotion) -> Increment:
     uncompensated_share = 1.0 - c.friction
 
     def power(r: Array, qd: Array) -> Array:
-        """Returns the power of the friction that the law does not know, shape (rows,), in W."""
+        """Returns the power of the uncompensated friction, shape (rows,), in W."""
         friction = c.arm.friction(qd - r)
         return -_dot_rows(r * uncompensated_share, friction)
 
@@ -1087,7 +1088,7 @@ def measure_torque_error(site: SiteMotion) -> Array:
     """Computes how much the recorded torques differ from those that the control law demands.
 
     The law is evaluated again from the recorded motion. A large error means that the log was
-    changed, or that the arm ran another law than the scenario states.
+    changed, or that the arm ran a different law than the scenario states.
 
     Args:
         site: Motion of the site, with K records.
@@ -1169,7 +1170,7 @@ def compute_sampling_work(site: SiteMotion) -> Increment:
     - Parameter estimates: their recorded step, compared with the trapezoid rule for the
       adaptive law.
 
-    This work is no part of the energy balance. It explains part of the balance's residual.
+    This work is not part of the energy balance. It explains part of the balance's residual.
 
     Args:
         site: Motion of the site.
@@ -1182,7 +1183,7 @@ def compute_sampling_work(site: SiteMotion) -> Increment:
     applied_torque = held_torque[:-1]
     tau_right, Yr_right = _evaluate_before_jump(site)
 
-    # torque: what acted minus the linear course that the trapezoid rule assumes
+    # torque: the acting torque minus the linear change that the trapezoid rule assumes
     tau_left = records.tau[:-1]
     mean_tau = 0.5 * (tau_left + tau_right)
     torque_error = applied_torque - mean_tau

@@ -39,11 +39,15 @@ from .premise_quantities import (
 )
 
 LEAST_ENERGY_J = -1e-9
-"""Rounding error of an energy that is zero, in J. It is negative, as lower bounds use it."""
+"""Rounding error of an energy that is zero, in J. It is negative because it serves as a lower
+bound.
+"""
 ROUNDING_SHARE = 1e-12
-"""Further rounding error, as a share of the largest energy."""
+"""Additional rounding error, as a share of the largest energy."""
 SAMPLING_SHARE = 1e-2
-"""Energy that an arm may get beyond what its law books, as a share of the largest energy."""
+"""Largest energy that an arm may receive without its law accounting for it, as a share of the
+largest energy.
+"""
 
 
 class ObservedFinding(Enum):
@@ -61,7 +65,7 @@ class ObservedFinding(Enum):
 
     @property
     def meaning(self) -> str:
-        """What the finding means for a run, for the user. Empty if it needs no explanation.
+        """Explanation for the user of what the finding means for a run. Empty if it needs none.
 
         The package `presentation` writes it, in the same words wherever it is explained.
         """
@@ -74,18 +78,18 @@ _EnergyKind = Literal["line", "known", "store", "taken", "given"]
 class _EnergyCurve(NamedTuple):
     """One kind of energy over time that a control law declares, such as a stored energy.
 
-    Some laws also keep account of the energy that is on its way to another arm.
+    Some laws also keep account of the energy in transit to another arm.
 
     Attributes:
-        kind: "line" for the energy on the way from a peer to the site, "known" for the part of
-            it that the site knows, "store" for energy that the law stores, "taken" for energy
-            that the law dissipated, "given" for energy that the arm gave to the law.
+        kind: "line" for the energy in transit from a peer to the site, "known" for the part of
+            this energy that the site knows, "store" for energy that the law stores, "taken" for
+            energy that the law dissipated, "given" for energy that the arm gave to the law.
         site: Name of the site.
         peer: Name of the site at the other end of a line. Empty for other kinds.
         t_s: Times of the site's ticks, shape (K,), in s.
         energy_j: The energy, summed over its parts, shape (K,), in J.
-        least_j: The smallest of the parts, shape (K,), in J. For "taken" it is the energy less
-            its largest earlier value, as a dissipated energy must not fall.
+        least_j: The smallest of the parts, shape (K,), in J. For "taken" it is the energy minus
+            its largest earlier value, because a dissipated energy must not fall.
     """
 
     kind: _EnergyKind
@@ -99,15 +103,15 @@ class _EnergyCurve(NamedTuple):
     def name(self) -> str:
         """Short name of the energy for reports.
 
-        With sites m and s, the energy on the way from m to s is named "line m->s". The part of
-        this energy that is known to s is named "known at s of m". The energy
-        stored at s is named "store of s".
+        With sites m and s, the energy in transit from m to s is named "line m->s". The part of
+        this energy that is known to s is named "known at s of m". The energy stored at s is
+        named "store of s".
         """
         return _name_energy(self.kind, self.site, self.peer)
 
 
 class _LeastEnergy(NamedTuple):
-    """Smallest value over time of an energy that must never be negative.
+    """Minimum over time of an energy that must never be negative.
 
     An example is the level of an energy tank, from which a control law takes the energy that it
     adds.
@@ -132,7 +136,7 @@ class _LeastEnergy(NamedTuple):
         return _name_energy(self.kind, self.site, self.peer)
 
     def to_json(self) -> JsonObject:
-        """Returns the minimum as values for JSON."""
+        """Converts the minimum to plain values for JSON."""
         return {"name": self.name, "amount_j": self.amount_j, "at_s": self.at_s}
 
 
@@ -150,22 +154,22 @@ class ObservedEnergy(NamedTuple):
     """Judgement of a run by the energies that its control laws declare, such as an energy tank.
 
     `ObservedEnergy.of_log` computes the declared energies, and compares them with recorded
-    torques and motion. A law that never gives back more energy than it took supports the
-    stability of the run.
+    torques and motion. If a law never gives back more energy than it took, this is evidence
+    that the run is stable.
 
     Attributes:
         finding: Whether the energies stay above zero, or why this is not judged.
         premises: The conditions under which the energies count as evidence, each checked.
-        least: Minimum over time of every energy.
+        least: Minimum of every energy over time.
         largest_j: Largest of all energies, in J.
         residual_j: Largest difference between the energy that a law dissipated and the sum of
             the other energies that it declares, in J.
-        sampling_j: Largest energy that an arm received and its law did not count, in J. It
-            arises between ticks.
+        sampling_j: Largest energy that an arm received and its law did not account for, in J.
+            Such energy arises because the torque is constant between ticks.
         curves: Every energy over time, and the energies that the arms gave to their laws.
         undeclared_sites: Sites whose laws declare no energies, although others do. The energies
             are then not judged.
-        incomplete_sites: Sites of which records are missing, so that the energies are not
+        incomplete_sites: Sites with missing records, because of which the energies are not
             judged.
     """
 
@@ -187,8 +191,8 @@ class ObservedEnergy(NamedTuple):
     def to_json(self) -> JsonObject:
         """Returns the verdict, its premises and the least energies as values for JSON.
 
-        The energies over time are left out, because they have a value per tick and serve for
-        figures.
+        The energies over time are left out, because they have a value per tick and are meant
+        for figures.
         """
         return {
             "finding": self.finding.name.lower(),
@@ -214,7 +218,7 @@ class ObservedEnergy(NamedTuple):
                 their code.
 
         Returns:
-            The verdict. None if no law declares energies.
+            The verdict. `None` if no law declares energies.
 
         Raises:
             LogError: A record cannot be read.
@@ -243,7 +247,7 @@ class ObservedEnergy(NamedTuple):
 
 
 class _SiteBooks(NamedTuple):
-    """Energies that a control law declares, next to those that follow from the records.
+    """Energies that a control law declares, together with those that follow from the records.
 
     Arrays have the shape (K,) and are in J. They start at the first tick (control period).
 
@@ -253,7 +257,7 @@ class _SiteBooks(NamedTuple):
         port: Energy that the arm gave to the law, according to the law.
         taken: Energy that the law dissipated.
         residual: Part of the dissipated energy that the other declared energies do not explain.
-        leak: Energy that the arm got beyond what the law counts.
+        leak: Energy that the arm received and the law does not account for.
     """
 
     t_s: Array
@@ -311,7 +315,7 @@ def _read_books(log: Log, site: str, law: Any) -> _SiteBooks:
 
     arm_gave = -sum_work(held_torque, records.q)
     if site_setup.theta_known:
-        # holding the arm against gravity is no work of the law
+        # the torque that holds the arm against gravity is not counted as work of the law
         potential = build_arm_rows(log.scenario, site).potential_energy(records.q)
         arm_gave += declared.gravity * (potential - potential[0])
     arm_gave *= declared.weight
@@ -361,7 +365,7 @@ def _read_law_records(
         log: The log of the run.
         site: Name of the site.
         law: The law.
-        count: Number of records, from the first one on.
+        count: Number of records, beginning with the first.
     """
     site_log = log[site]
     sent = {key: values[:count] for key, values in site_log.sent.items()}
@@ -391,7 +395,7 @@ def _read_law_memory(
         log: The log of the run.
         site: Name of the site, the process that controls the arm.
         law: The law. Its attribute `remembers` lists the names of these values.
-        count: Number of records to read, from the first one on.
+        count: Number of records to read, beginning with the first.
 
     Returns:
         For each name, the values in these records.
@@ -399,7 +403,7 @@ def _read_law_memory(
     site_log = log[site]
     rule = log.scenario.sites[site].on_stale.rule
     life_length = site_log.layout.count_life_memory(len(site_log.peers), degrades=rule.degrades)
-    # the law's memory follows the memory of the session's life, or of the reference
+    # the law's memory comes after the memory of the session state or of the reference
     first = site_log.layout.shared + 1
     if rule.action is StaleAction.GLIDE:
         first = life_length
@@ -422,15 +426,15 @@ def _read_peer_records(
 ) -> PeerRecords:
     """Returns the recorded values that a control law exchanged with one other arm.
 
-    They are the values that the law received from this arm, and those that it sent to this arm
-    alone. A key such as `wave[s]` is a value for arm s alone.
+    These are the values that the law received from this arm, and the values that it sent to
+    this arm alone. A key such as `wave[s]` is a value for arm s alone.
 
     Args:
         log: The log of the run.
         site: Name of the site of the law.
         peer: Name of the peer.
         sent: Values that the law sent.
-        count: Number of records, from the first one on.
+        count: Number of records, beginning with the first.
     """
     tick = log[site].used[peer][:count]
     has_sample = tick[:, np.newaxis] >= 0
@@ -455,8 +459,8 @@ def _read_peer_records(
 def _find_curves(log: Log, accounts: Mapping[str, _SiteBooks]) -> Iterator[_EnergyCurve]:
     """Yields the energies over time that a passive control law never lets fall below zero.
 
-    They are the energy on the way between two arms (line), the part of it that the receiver
-    knows, stored energy, and the energy that a law dissipated.
+    These energies are the energy in transit between two arms (line), the part of it that the
+    receiver knows, the stored energy, and the energy that a law dissipated.
 
     Args:
         log: The log of the run.
@@ -499,10 +503,10 @@ def _find_curves(log: Log, accounts: Mapping[str, _SiteBooks]) -> Iterator[_Ener
 
 
 def _judge_books(log: Log, accounts: Mapping[str, _SiteBooks]) -> ObservedEnergy:
-    """Judges the energies that control laws declare: contradictory, below zero, or passive.
+    """Judges whether the energies that laws declare are contradictory, negative or passive.
 
-    A control law may state how much energy it stores and dissipates. It is passive if it never
-    gives back more energy than it received, which is a sign of stability.
+    A control law may state how much energy it stores and dissipates. A law is passive if it
+    never gives back more energy than it received, which is a sign of stability.
 
     Args:
         log: The log of the run.
@@ -559,7 +563,7 @@ def _judge_books(log: Log, accounts: Mapping[str, _SiteBooks]) -> ObservedEnergy
 def _largest_residual_j(account: _SiteBooks) -> float:
     """Returns the largest error in the energies that a control law declares, in J.
 
-    The energies must add up: the dissipated energy equals the sum of the others.
+    The energies must add up: the dissipated energy must equal the sum of the others.
     """
     return float(np.abs(account.residual).max())
 
@@ -568,8 +572,8 @@ def _check_books(log: Log, accounts: Mapping[str, _SiteBooks], scale_j: float) -
     """Checks the conditions under which the declared energies count as evidence.
 
     - books: the energies that each law declares add up;
-    - torque: each law books the torque that the arm received, even if it was cut off;
-    - sampling: arms get little energy between the ticks beyond what their laws book.
+    - torque: each law uses the torque that the arm received, even if the torque was cut off;
+    - sampling: arms receive little energy between the ticks that their laws do not account for.
 
     Args:
         log: The log of the run.

@@ -1,10 +1,10 @@
-"""Defines the numbers and names that show whether a condition of the stability theorem holds.
+"""Defines the data that show whether a condition of the stability theorem holds.
 
 A condition of the theorem is called a premise. For example, the premise "the delays are
-constant" is judged by `DelayQuantities`, which has the delays of the network links. `premises`
-and `observed_energy` compute these classes from the log of a run. The package `presentation`
-writes the sentences about them, so that a sentence can be changed without touching the
-analysis.
+constant" is judged by `DelayQuantities`, which contains the delays of the network links.
+`premises` and `observed_energy` compute these classes from the log of a run. The package
+`presentation` writes the sentences about them, so that a sentence can be changed without
+touching the analysis.
 
 Invariant:
     - An empty collection means that nothing of this kind was found in the run.
@@ -85,7 +85,7 @@ class ParameterQuantities(NamedTuple):
     The stability theorem requires that the model of the law contains every load of the arm.
 
     Attributes:
-        faults: Name of the site and reason, for each fault. Empty if the condition holds.
+        faults: Name of the site and reason for each fault. Empty if the condition holds.
     """
 
     faults: tuple[tuple[str, ParameterFault], ...]
@@ -95,11 +95,11 @@ class GainQuantities(NamedTuple):
     """Evidence for the condition that the damping gain Kd of all sites is equal up to a factor.
 
     For example, Kd may be twice as large at one site, because the weights of the sites in V
-    balance the factor. They cannot balance other differences.
+    compensate for the factor. The weights cannot compensate for other differences.
 
     Attributes:
         Kd: Gain of each site per joint, in N m s/rad. In task space per coordinate, in N s/m.
-        scales: Factor of each site. None if the gains differ by more than a factor.
+        scales: Factor of each site. `None` if the gains are not multiples of each other.
         is_positive: True if no gain is zero.
     """
 
@@ -112,7 +112,7 @@ class WallQuantities(NamedTuple):
     """Evidence on whether simulated walls generate no energy, as the theorem requires.
 
     A wall whose force is computed once per tick (control period) generates energy. The damping
-    of the arm may remove more than that.
+    of the arm may remove this energy.
 
     Attributes:
         walls: The walls that were touched, with their energies and dampings.
@@ -125,7 +125,8 @@ class WallQuantities(NamedTuple):
         """Walls that generate at least as much energy as the touching arm's damping removes.
 
         A simulated wall computes its force once per tick and thereby generates energy. If the
-        arm does not remove it, the contact may vibrate. Empty if there is no such wall.
+        damping of the arm does not remove this energy, the contact may vibrate. Empty if there
+        is no such wall.
         """
         return tuple(
             wall for wall in self.walls if wall.arm_damping_n_s_m <= wall.required_damping_n_s_m
@@ -135,16 +136,16 @@ class WallQuantities(NamedTuple):
 class DominanceQuantities(NamedTuple):
     """Evidence on whether the dominance factors are constant and determine weights for V.
 
-    A dominance factor is the weight with which an arm follows another one. The stability
+    A dominance factor is the weight with which an arm follows another arm. The stability
     theorem requires both. V is its energy function.
 
     Attributes:
         changing: Sites whose dominance factors change.
         losses: Spans of time in which sites continued without a peer.
-        groups: Closed groups of sites, which follow nobody outside their group. Empty if the
+        groups: Closed groups of sites, which follow no site outside their group. Empty if the
             factors change.
         weightless: Sites with the weight zero in V.
-        beta: Weight of each site in V. None if there are no unique weights.
+        beta: Weight of each site in V. `None` if there are no unique weights.
     """
 
     changing: tuple[str, ...] = ()
@@ -293,8 +294,8 @@ class AxisQuantities(NamedTuple):
 class SingularPoseQuantities(NamedTuple):
     """Evidence on whether any arm came near a singular pose, such as a stretched arm.
 
-    The end effector cannot move in every direction there, however fast the joints turn. The
-    stability theorem does not cover such poses.
+    In such a pose the end effector cannot move in every direction, however fast the joints
+    turn. The stability theorem does not cover such poses.
 
     Attributes:
         near_s: Time from which the arm of a site was near a singular pose, in s, by site.
@@ -307,7 +308,7 @@ class SingularPoseQuantities(NamedTuple):
 
 
 class Supply(NamedTuple):
-    """Energy that users and walls supplied to the arms, and how long nobody pushed at the end.
+    """Energy that users and walls supplied to the arms, and the time without pushes at the end.
 
     The stability theorem assumes that they do not supply energy without limit.
 
@@ -315,10 +316,10 @@ class Supply(NamedTuple):
         sources: Names of the sources.
         energy_j: Largest energy that they supplied beyond what they had absorbed, in J.
         is_passive: True if this energy is a rounding error.
-        in_task_space: True if a site follows in task space. Then r is qd - v.
-        released_s: Time after which nobody pushes, in s.
-        free_s: Duration of the motion from then on, in s.
-        least_free_s: Duration to which the theorem applies at least, in s.
+        in_task_space: True if a site follows in task space. In that case r is qd - v.
+        released_s: Time after which no operator or wall pushes, in s.
+        free_s: Duration of the motion after this time, in s.
+        least_free_s: Shortest such duration to which the theorem applies, in s.
     """
 
     sources: tuple[str, ...]
@@ -333,13 +334,13 @@ class Supply(NamedTuple):
 class OperatorQuantities(NamedTuple):
     """Evidence for the premise that operators and environments are passive.
 
-    A passive operator never returns more energy than it received. V may otherwise rise.
+    A passive operator never returns more energy than it received. Otherwise V may rise.
 
     Attributes:
-        unmeasured: Sites with external arms, if no record tells who pushes them.
+        unmeasured: Sites with external arms whose external torque is not recorded.
         weightless: Sites that are pushed although their weight in V is zero.
-        supply: Energy that operators and environments supplied. None if nobody pushes, or if V
-            does not show the energy.
+        supply: Energy that operators and environments supplied. `None` without pushes, or if
+            V does not show the energy.
     """
 
     unmeasured: tuple[str, ...] = ()
@@ -355,7 +356,7 @@ class RecordQuantities(NamedTuple):
     Attributes:
         unjudged_s: Spans (start, end) in which records are missing although all sites were
             present, in s.
-        is_whole: True if no records are missing in the absence of sites either.
+        is_whole: True if no records are missing at all, not even during absences of sites.
     """
 
     unjudged_s: tuple[tuple[float, float], ...]
@@ -384,9 +385,9 @@ class PresentStretch(NamedTuple):
     Attributes:
         from_s: Start, in s.
         to_s: End, in s.
-        follow_from_s: Time from which all sites follow their peers, in s. None if they never
+        follow_from_s: Time from which all sites follow their peers, in s. `None` if they never
             do.
-        varying: Links (peer, site) whose delay varies from then on.
+        varying: Links (peer, site) whose delay varies after this time.
     """
 
     from_s: float
@@ -399,11 +400,11 @@ class PresenceQuantities(NamedTuple):
     """Evidence on whether the processes of all arms are present during the whole run.
 
     A process may leave a session and return. The stability theorem then applies to each
-    interval between.
+    interval between two absences.
 
     Attributes:
         absent: Spans of time during which sites were absent.
-        stretches: The times between, during which all sites were present.
+        stretches: The intervals between absences, during which all sites were present.
     """
 
     absent: tuple[AbsentSpan, ...]
@@ -428,14 +429,14 @@ class BooksQuantities(NamedTuple):
 
 
 class BookedTorqueQuantities(NamedTuple):
-    """Evidence for the condition that control laws count the torque that the arms received.
+    """Evidence for the condition that control laws use the torque that the arms received.
 
-    If a torque was cut off at the limit of a motor, a law that counts the demanded torque
+    If a torque was cut off at the limit of a motor, a law that uses the demanded torque
     declares wrong energies.
 
     Attributes:
         cut: Sites whose torque was cut off at the limit of their actuators.
-        unbooked: Those of them whose law counts another torque than the arm received.
+        unbooked: Sites among `cut` whose law uses a different torque than the arm received.
     """
 
     cut: tuple[str, ...]
@@ -443,10 +444,11 @@ class BookedTorqueQuantities(NamedTuple):
 
 
 class SamplingQuantities(NamedTuple):
-    """Evidence for the condition that arms receive little energy that their laws do not count.
+    """Evidence for the condition that laws account for nearly all energy that arms receive.
 
     Between two control periods the torque is constant while the arm moves on. The law, which
-    sees the arm once per period only, does not count the energy that this supplies.
+    sees the arm only once per period, does not account for the energy that the torque supplies
+    meanwhile.
 
     Attributes:
         site: Site that received most of this energy.
@@ -486,9 +488,9 @@ class Premise(NamedTuple):
     says nothing about the run.
 
     Attributes:
-        name: Key of the premise, as in "delays".
-        holds: True if the run meets the condition, False if not, None if the log does not show
-            it.
+        name: Key of the premise, such as "delays".
+        holds: True if the run meets the condition, False if not, `None` if the log does not
+            decide it.
         quantities: What the log shows about the condition.
     """
 

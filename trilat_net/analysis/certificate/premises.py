@@ -1,11 +1,11 @@
 """Checks whether a recorded run meets the conditions of the stability theorem.
 
 The theorem says that an energy function V of all arms never rises, unless an operator supplies
-energy. Its proof is in docs/theory/theorem.md. It has conditions, called premises:
+energy. Its proof is in docs/theory/theorem.md. The theorem has conditions, called premises:
 
 - The network delays are constant.
 - The dominance factors, the weights with which the arms follow each other, are constant. Every
-  arm follows every other arm, at least through further arms.
+  arm follows every other arm, directly or through further arms.
 - The damping gain Kd is the same at every arm, up to a factor per arm.
 - Every arm uses the adaptive law, which estimates the parameters theta of the arm.
 - No operator moves an arm, or the operators are passive with respect to the filtered error r.
@@ -92,7 +92,7 @@ The rise is excused only up to the residual of the energy balance.
 MIN_FREE_S = 1.0
 """Shortest motion without operators at the end of a run to which the theorem applies, in s."""
 MIN_FREE_AGES = 5.0
-"""Least length of that motion as a multiple of the largest age of a sample in use."""
+"""Shortest such motion as a multiple of the largest age of a sample in use."""
 LEAST_ABSENCE_S = 0.1
 """Shortest absence of a site that counts, in s.
 
@@ -115,9 +115,9 @@ class FunctionalFacts(NamedTuple):
         log: The log of the run.
         energies: Energies of every site, by name.
         balance: Energy balance of all sites together.
-        groups: Closed groups of sites, which follow nobody outside their group, at the first
-            time at which there are several. The weights beta of the sites in V are not unique
-            then. Empty if they are always unique.
+        groups: Closed groups of sites, which follow no site outside their group, at the first
+            time at which there are several groups. The weights beta of the sites in V are then
+            not unique. Empty if the weights are always unique.
         absent: Spans during which a site was absent.
         unjudged: Spans, as (start, end) in s, in which records are missing although all sites
             were present.
@@ -142,8 +142,9 @@ class _RunFacts(NamedTuple):
         log: The log of the run.
         constants: Gains and limits of every site, the process that runs one arm, by name. Empty
             if V does not exist for some site.
-        functional: V over time, and what changed it. None if V cannot be computed.
-        unknown: The reason why V cannot be computed. None if it can.
+        functional: V over time, and the energies that changed it. `None` if V cannot be
+            computed.
+        unknown: The reason why V cannot be computed. `None` if V can be computed.
     """
 
     log: Log
@@ -153,11 +154,11 @@ class _RunFacts(NamedTuple):
 
 
 def gather_facts(log: Log) -> _RunFacts:
-    """Computes from a log what is needed to check the conditions of the stability theorem.
+    """Computes from a log the quantities for checking the conditions of the stability theorem.
 
     The theorem uses an energy function of all arms. This function does not exist for every
-    control law. It cannot be computed if the records of the arms have too few times in common.
-    The result then contains the reason.
+    control law. The function cannot be computed if the records of the arms have too few times
+    in common. The result then contains the reason.
 
     Args:
         log: The log of the run.
@@ -316,7 +317,7 @@ def _check_walls(log: Log) -> Premise | None:
     damping exceeds K h / 2 + B.
 
     Returns:
-        The premise. None if the scenario contains no such wall.
+        The premise. `None` if the scenario contains no such wall.
     """
     if not any(map(list_sampled_walls, log.scenario.sites.values())):
         return None
@@ -327,9 +328,9 @@ def _check_walls(log: Log) -> Premise | None:
 def _check_dominance(run: FunctionalFacts) -> Premise:
     """Checks the dominance factors, with which the sites follow each other.
 
-    They must be constant, and their matrix alpha must be irreducible: every site follows every
-    other site, directly or through further sites. Otherwise some site has the weight zero in V,
-    or the weights are not unique.
+    The factors must be constant, and their matrix alpha must be irreducible: every site follows
+    every other site, directly or through further sites. Otherwise some site has the weight zero
+    in V, or the weights are not unique.
     """
     names = run.log.scenario.names
     energies = run.energies
@@ -358,8 +359,8 @@ def _check_dominance(run: FunctionalFacts) -> Premise:
 def _check_delays(run: FunctionalFacts) -> Premise:
     """Checks that the delay of every link is constant.
 
-    The delay is the age of the peer's sample that a site uses in a tick. It is not decided if
-    no sample of any peer came into use.
+    The delay is the age of the peer's sample that a site uses in a tick. The condition is not
+    decided if no sample of any peer came into use.
     """
     varying = []
     constant_s = []
@@ -396,7 +397,7 @@ def _check_following(run: FunctionalFacts) -> Premise:
     """Checks that every site follows its peers during the whole run.
 
     A site does not follow its peers while it holds its position, brakes, returns or has
-    stopped. It does not follow them either while the velocity of its reference is limited.
+    stopped. Nor does it follow them while the velocity of its reference is limited.
     """
     log = run.log
     interruptions = []
@@ -439,7 +440,7 @@ def _check_stops(run: FunctionalFacts) -> Premise | None:
     error r = qd + Lambda e of the proof.
 
     Returns:
-        The premise. None if no joint has stops.
+        The premise. `None` if no joint has stops.
     """
     arms = run.log.scenario.arms.values()
     stop_stiffnesses: list[float] = []
@@ -468,7 +469,7 @@ def _check_axes(run: FunctionalFacts) -> Premise | None:
     axis. An axis along which the followed site did not move has no effect.
 
     Returns:
-        The premise. None if all sites work in joint space.
+        The premise. `None` if all sites work in joint space.
     """
     motions = {
         site: energy.motion
@@ -498,7 +499,7 @@ def _check_singular_poses(run: FunctionalFacts) -> Premise | None:
     pose the pseudo-inverse is damped to stay finite, and the product differs from I.
 
     Returns:
-        The premise. None if all sites work in joint space.
+        The premise. `None` if all sites work in joint space.
     """
     near_s = {}
     least_values = {}
@@ -522,7 +523,7 @@ def _check_operators(run: FunctionalFacts) -> Premise:
 
     An operator is the person or program that moves an arm, and r is the filtered error of the
     proof. Operators are passive if they supply no more energy than they absorbed before. If
-    they do supply energy, the premise still holds for a run that ends with enough motion
+    operators do supply energy, the premise still holds for a run that ends with enough motion
     without operators: the theorem then applies to that motion.
     """
     energies = run.energies
@@ -569,7 +570,7 @@ def _check_records(run: FunctionalFacts) -> Premise:
     """Checks that the log has all records of all arms while their processes were present.
 
     Missing records leave the condition undecided, because the energy function V of the
-    stability proof is unknown there.
+    stability proof is unknown at these times.
     """
     quantities = RecordQuantities(
         unjudged_s=tuple(run.unjudged),
@@ -613,7 +614,7 @@ def _check_presence(run: FunctionalFacts) -> Premise | None:
     stretch of time between the absences. Therefore the evidence describes each stretch.
 
     Returns:
-        The premise, which fails. None if all sites are present all the time.
+        The premise, which fails. `None` if all sites are present all the time.
     """
     if not run.absent:
         return None
@@ -650,7 +651,7 @@ FUNCTIONAL_CHECKS = (
 
 
 def _find_joints(run: FunctionalFacts, site: str, is_affected: Bools) -> tuple[str, ...]:
-    """Returns the names of the joints that an effect, such as a torque limit, concerned.
+    """Returns the names of the joints that are affected, for example by a torque limit.
 
     Args:
         run: Facts of the run.
@@ -670,7 +671,7 @@ def _find_joints(run: FunctionalFacts, site: str, is_affected: Bools) -> tuple[s
 def _examine_stretch(
     energies: Mapping[str, SiteEnergy], from_s: float, to_s: float
 ) -> PresentStretch:
-    """Finds from when on all arms followed each other in an interval, and which delays varied.
+    """Finds when all arms began to follow each other in an interval, and which delays varied.
 
     The stability theorem applies if all arms follow with constant delays. During the interval,
     no process was absent.
@@ -716,7 +717,7 @@ def find_unjudged_spans(balance: EnergyBalance) -> list[tuple[float, float]]:
     Returns:
         The (start, end) of each span, in s. Empty if V can be judged all the time.
     """
-    # Judged periods before and after the run give each span a start and an end.
+    # Imaginary judged periods before and after the run give each span a start and an end.
     padded = np.concatenate([[True], balance.judged, [True]])
     edges = np.flatnonzero(np.diff(padded.astype(np.int8)))
     times = balance.t_s[edges]
@@ -726,15 +727,15 @@ def find_unjudged_spans(balance: EnergyBalance) -> list[tuple[float, float]]:
 
 
 def collect_evidence(run: _RunFacts, min_coverage: float) -> Evidence:
-    """Collects how complete the records of a run are, and whether its log was changed.
+    """Collects evidence on how complete a run's records are and whether its log was changed.
 
-    A run of which too little is known is not called stable, see `Evidence.reasons`.
+    A run with too few records is not called stable, see `Evidence.reasons`.
 
     Args:
         run: Facts of the run, computed by `gather_facts`.
-        min_coverage: Least fraction of ticks that must be recorded, and of tick periods in
-            which the energy of the stability proof must be known, for a certificate. Between 0
-            and 1.
+        min_coverage: Least fraction of ticks that must be recorded, and least fraction of tick
+            periods in which the energy of the stability proof must be known, for a certificate.
+            Between 0 and 1.
     """
     log = run.log
     facts = run.functional
@@ -742,7 +743,7 @@ def collect_evidence(run: _RunFacts, min_coverage: float) -> Evidence:
     if facts is not None and not facts.groups:
         t_s = facts.balance.t_s
         judged = facts.balance.judged
-        # Spans that are unjudged because a site was absent do not count against the share.
+        # Spans that are unjudged because a site was absent do not reduce the share.
         unjudged_in_absence = set(find_unjudged_spans(facts.balance)) - set(facts.unjudged)
         all_present = np.ones(len(judged), dtype=np.bool_)
         for from_s, to_s in unjudged_in_absence:

@@ -6,7 +6,7 @@ V from the whole log. `RunningEnergy` uses the same functions, but receives one 
 at a time. It keeps only the newest records of each arm, in a `RecordWindow`.
 
 Invariant:
-    - V equals the result of `trilat certify` at the same times, up to rounding. For this the
+    - V equals the result of `trilat certify` at the same times, up to rounding. Therefore the
       windows are long enough to contain all delayed states that the arms use.
     - Nothing is extrapolated. V at a time is computed when all records up to it have arrived,
       and is left out if records are lost.
@@ -58,7 +58,7 @@ KEPT_S = 12.0
 It covers the largest age of a sample, and the time within which a gap is filled.
 """
 _NEVER_TICK = -(2**40)
-"""Stands for the last resting tick of a site that has never rested."""
+"""Value of the last resting tick for a site that has never rested."""
 _RAMP_MARGIN_S = 1.0
 """Time for which a ramp is kept after a later ramp has replaced it, in s."""
 
@@ -93,7 +93,8 @@ class RecordWindow:
         self._limits = spec.limits
         self._kept = max(8, round(kept_s * self.rate_hz))
 
-        # records move to the front only once as many again have arrived
+        # twice the needed rows, so records move to the front only after as many new ones have
+        # arrived
         capacity = 2 * self._kept
         layout = scenario.layout(site)
         names = [*RECORD_COLUMNS]
@@ -120,7 +121,7 @@ class RecordWindow:
         self._last_resting_tick = _NEVER_TICK
 
     def receive(self, record: State) -> bool:
-        """Stores the record of one control period at the row of its number.
+        """Stores the record of one control period in the row of its tick.
 
         Records come over the network, and may therefore arrive in any order.
 
@@ -212,7 +213,7 @@ class RecordWindow:
             for column in values.T:
                 known_values = column[known_rows]
                 column[:] = np.interp(ticks, known_rows, known_values)
-            # other values than numbers are those of the last record before the gap
+            # values that are not numbers are those of the last record before the gap
             next_known = np.searchsorted(known_rows, ticks, side="right")
             preceding = np.maximum(next_known - 1, 0)
             last_known = known_rows[preceding]
@@ -242,7 +243,8 @@ class RecordWindow:
 class EnergyCourse(NamedTuple):
     """The energy function V of the stability proof, over a span of time of a running session.
 
-    A live display shows V and the energy that was supplied: V may rise only by the latter.
+    A live display shows V and the energy that was supplied: V may rise only by the supplied
+    energy.
 
     Attributes:
         t_s: Times of the ticks of the site with the highest tick rate, shape (T,), in s.
@@ -280,7 +282,9 @@ class RunningEnergy:
         rules = [spec.on_stale.rule for spec in scenario.sites.values()]
         degrades = any(rule.degrades for rule in rules)
         if degrades and not self.reason:
-            self.reason = "shares change when a peer is lost: `trilat certify` computes V"
+            self.reason = (
+                "the shares may change because a peer is lost: `trilat certify` computes V"
+            )
 
         self._scenario = scenario
         self._windows = windows
@@ -289,7 +293,7 @@ class RunningEnergy:
         self._supplied = 0.0
 
     def add_changes(self, site: str, changes: Iterable[CoreChange]) -> None:
-        """Takes into account that a command changed how strongly a site follows its peers.
+        """Takes into account commands that changed how strongly a site follows its peers.
 
         The weights with which a site follows its peers, other sites, are its dominance factors.
         Other changes are ignored, because they have no effect on the energy.
@@ -314,7 +318,7 @@ class RunningEnergy:
                 any more: each record up to this tick has arrived, or is known to be lost.
 
         Returns:
-            V over the new span of time. None if the span is too short yet, or if V cannot be
+            V over the new span of time. `None` if the span is too short yet, or if V cannot be
             computed in it.
         """
         if self.reason or min(complete.values()) < 1:
@@ -339,7 +343,7 @@ class RunningEnergy:
         return self._compute_span(begin_s, end_s)
 
     def _compute_span(self, begin_s: float, end_s: float) -> EnergyCourse | None:
-        """Returns the energy function V over a span of time. None if V is not known there.
+        """Returns the energy function V over a span of time. `None` if V is not known.
 
         Changes of the dominance factors that ended long before the span are removed, so that a
         long session needs bounded memory.
@@ -387,8 +391,8 @@ class RunningEnergy:
         """Computes the energies of all sites over a span of ticks, as the records arrive.
 
         A site uses samples that its peers sent earlier. Therefore the records of each peer are
-        needed from the oldest sample in use on, and two ticks more, because the motion between
-        samples is interpolated.
+        needed from the oldest sample in use, with two additional ticks, because the motion
+        between samples is interpolated.
 
         Args:
             tick_spans: First and last tick of the span, by site.
@@ -419,7 +423,7 @@ class RunningEnergy:
         return derive_site_energies(self._scenario, records, pasts, self._trace_dominance)
 
     def _trace_dominance(self, site: str, t_s: Array) -> DominanceHistory:
-        """Returns the dominance factors of a site, its weights of the peers, at times in s."""
+        """Returns the dominance factors with which a site follows its peers, over time."""
         start, ramps = self._dominance[site]
         h_s = 1.0 / self._windows[site].rate_hz
         return evaluate_ramps(start, ramps, t_s, h_s)

@@ -1,6 +1,6 @@
 """Judges from a log whether the run was stable, and explains the judgement.
 
-`certify` is the entry point, and `Certificate` its result. A certificate combines:
+`certify_log` is the entry point, and `Certificate` its result. A certificate combines:
 
 - the conditions (premises) of the stability theorem, which `premises` checks;
 - the energy function V of the stability proof, which must not rise unless an operator or an
@@ -15,8 +15,8 @@ Invariant:
       amount, because the theorem excludes such a rise.
     - Energy without any cause means that the equations stated in the log did not produce the
       records. The energy balance is then called broken.
-    - Anything that a log cannot decide is stated. If V does not exist, the end of the run alone
-      decides.
+    - Questions that a log cannot decide are named. If V does not exist, the end of the run
+      alone decides.
 """
 
 from collections.abc import Sequence
@@ -56,10 +56,10 @@ Below it, a tick period that is long for the gains may be the cause.
 TORQUE_TOLERANCE = 1e-6
 """Largest difference of a recorded torque from the law, Eq. (13), relative to 1 + |tau|."""
 COARSE_TOLERANCE_SHARE = 1e-2
-"""Largest tolerance of a rise, as a share of the scale of V, with which V is still judged."""
+"""Largest tolerance for a rise at which V is still judged, as a share of the scale of V."""
 
 
-def certify(
+def certify_log(
     log: Log,
     *,
     min_coverage: float = MIN_COVERAGE,
@@ -73,13 +73,13 @@ def certify(
 
     Args:
         log: The log of the run.
-        min_coverage: Least fraction of the ticks of each site that must be recorded. With less,
-            a run that would be stable is left open.
+        min_coverage: Least fraction of the ticks of each site that must be recorded. With a
+            smaller fraction, a run that would be stable is left open.
         own_laws: True to run the code of control laws that are not part of this program. This
             is necessary to check the energies that they declare.
 
     Raises:
-        LogError: A record cannot be read, or names a change that is not valid.
+        LogError: A record cannot be read, or contains a change that is not valid.
     """
     run = gather_facts(log)
     facts = run.functional
@@ -169,7 +169,7 @@ def _judge_site_balances(run: FunctionalFacts, _: Sequence[Premise]) -> Stabilit
 def _judge_torques(run: FunctionalFacts, _: Sequence[Premise]) -> StabilityVerdict | None:
     """Returns the verdict BROKEN if recorded torques differ from the control law, Eq. (13).
 
-    The records are then false, so that nothing can be concluded from them. None if all agree.
+    The records are then false, and nothing can be concluded from them. `None` if all agree.
     """
     for site, energy in run.energies.items():
         records = energy.motion.records

@@ -22,11 +22,13 @@ from .premise_quantities import MissingFunctional, PremiseQuantities
 class StabilityFinding(Enum):
     """Possible results of examining V, the energy function of the stability proof, over a run.
 
-    JSON output has the names of the members, in small letters, as values of `verdict`.
+    In JSON output, the values of `verdict` are the names of the members in lower case.
     """
 
     COVERED = auto()
-    """All premises of the theorem hold and V did not rise, so that the run is stable by it."""
+    """All premises of the theorem hold and V did not rise. The theorem then proves the run
+    stable.
+    """
     DID_NOT_RISE = auto()
     """A premise of the theorem fails, and V did not rise."""
     ROSE = auto()
@@ -38,7 +40,7 @@ class StabilityFinding(Enum):
 
 
 class FunctionalRise(NamedTuple):
-    """Largest rise of the energy function V by energy that nobody supplied from outside.
+    """Largest rise of the energy function V without energy supplied from outside.
 
     V is the total energy of the arms in the stability proof. The work of operators and walls is
     subtracted from it. What remains must not rise.
@@ -64,7 +66,7 @@ class UnsuppliedGrowth(NamedTuple):
 
     Attributes:
         energy_j: Size of the growth, in J.
-        from_s: Time from which V rises, in s. None if V is compared with its beginning.
+        from_s: Time from which V rises, in s. `None` if V is compared with its beginning.
     """
 
     energy_j: float
@@ -79,7 +81,8 @@ class UnsuppliedGrowth(NamedTuple):
 class NoFunctional(NamedTuple):
     """Finding that the energy function V does not exist for some arms.
 
-    For example, V exists only for certain control laws. The run is then judged without V.
+    One reason is the control law, because V exists only for certain laws. Without V, the run is
+    judged by other evidence.
 
     Attributes:
         missing: Sites of these arms, grouped by the reason.
@@ -89,7 +92,7 @@ class NoFunctional(NamedTuple):
 
 
 class RecordGap(Enum):
-    """Finding that the energy function V of a run cannot be computed, as records are missing.
+    """Finding that records are missing, so the energy function V cannot be computed.
 
     V, the energy of the stability proof, exists for the control laws of this run.
     """
@@ -103,8 +106,8 @@ class RecordGap(Enum):
 class UnclosedBalance(NamedTuple):
     """Finding that the energy of an arm changed by more than the known causes explain.
 
-    The energies of a run that obeys the equations of the log add up. If they do not, the log or
-    the simulation is wrong, or the control period is too long.
+    The energies of a run that obeys the equations of the log add up. If the energies do not add
+    up, the log or the simulation is wrong, or the control period is too long.
 
     Attributes:
         site: Site with the largest error.
@@ -127,7 +130,8 @@ class UnclosedBalance(NamedTuple):
 class WrongTorque(NamedTuple):
     """Finding that recorded torques of an arm do not follow from its control law, Eq. (13).
 
-    The log is then not consistent, for example because it was changed or the law is another.
+    The log is then inconsistent, for example because it was changed or the arm ran a different
+    law.
 
     Attributes:
         site: Name of the site, the process that controls the arm.
@@ -144,10 +148,11 @@ class AmbiguousWeights(NamedTuple):
     """Finding that V is not unique, because its weights beta are not.
 
     V is the weighted sum of the energies of all arms. The weights are unique if every arm
-    follows every other arm, at least through further arms.
+    follows every other arm, directly or through further arms.
 
     Attributes:
-        groups: Names of the sites in each closed group, which follows nobody outside.
+        groups: Names of the sites in each closed group, which follows no site outside the
+            group.
     """
 
     groups: tuple[tuple[str, ...], ...]
@@ -170,18 +175,18 @@ class CoarseEnergies(NamedTuple):
 class FunctionalCourse(NamedTuple):
     """The energy function V during a run: first, last and largest value, and largest rise.
 
-    V is the energy of the stability proof. It must never rise by energy that nobody supplied.
+    V is the energy of the stability proof. V must never rise without supplied energy.
 
     Attributes:
         failed: Names of the premises that fail. The theorem does not apply if there are any.
-        undecided: Quantities of the premises that the log does not decide.
+        undecided: Quantities of the premises on which the log does not decide.
         external: Names of operators and environments that did work, as in "hands".
-        from_s: First time of V, in s.
-        to_s: Last time of V, in s.
+        from_s: First time at which V is known, in s.
+        to_s: Last time at which V is known, in s.
         first_j: V at the first time, in J. 0 if V is a rounding error.
         last_j: V at the last time, in J. 0 if V is a rounding error.
         largest_j: Largest V, in J.
-        rise: Largest rise of V that nobody supplied. None if V did not rise.
+        rise: Largest rise of V without supplied energy. `None` if V did not rise.
     """
 
     failed: tuple[str, ...]
@@ -210,13 +215,13 @@ VerdictFacts = (
 class StabilityVerdict(NamedTuple):
     """Result of the energy test of a run: whether the energy function V rose, and by how much.
 
-    V belongs to the stability proof. If it rises by energy that nobody supplied, the proof does
-    not hold for the run.
+    V belongs to the stability proof. If V rises without supplied energy, the proof does not
+    hold for the run.
 
     Attributes:
         finding: The finding, such as that V never rose.
         facts: The numbers behind the finding.
-        rise: The largest rise of V beyond the tolerance. None if V did not rise.
+        rise: The largest rise of V beyond the tolerance. `None` if V did not rise.
         tolerance: Size that a rise must exceed to count, in J.
     """
 
@@ -242,12 +247,12 @@ class Evidence(NamedTuple):
     Attributes:
         coverage: Recorded ticks and expected ticks of every site.
         functional_share: Fraction of the tick periods in which the energy of the stability
-            proof is known from records. Periods in which a site was absent do not count. None
+            proof is known from records. Periods in which a site was absent do not count. `None`
             if this energy is not judged.
         min_coverage: Least fraction that suffices, for the ticks and for the periods.
         integrity: Whether the log is unchanged since it was written.
-        unmet: Sites that did not react to the other sites, because their motion was copied from
-            an earlier run when the run was repeated.
+        unmet: Sites that did not react to the other sites, because the run is a repetition in
+            which their motion was copied from an earlier run.
     """
 
     coverage: Coverage
@@ -258,7 +263,7 @@ class Evidence(NamedTuple):
 
     @property
     def doubts(self) -> "tuple[EvidenceDoubt, ...]":
-        """What the records lack to call the run stable. Empty if they suffice.
+        """Reasons why the records do not suffice to call the run stable. Empty if they suffice.
 
         Examples are a log that was changed after the run, or too many missing records.
         """
@@ -286,7 +291,7 @@ class Evidence(NamedTuple):
     def text(self) -> str:
         """A sentence for the user: how many records exist, and whether the log is unchanged.
 
-        The certificate prints this sentence for every run, also if the records suffice.
+        The certificate prints this sentence for every run, even if the records suffice.
         """
         return str(find_hook("describe a finding")(self))
 
@@ -311,11 +316,11 @@ class EvidenceDoubt(NamedTuple):
     """Finding that records do not suffice to call a run stable.
 
     Attributes:
-        name: Name of the finding. "changed log": the log is not as it was made. "missing
-            records": too few ticks of a site are recorded. "missing periods": the energy
-            function V is known in too few tick periods. "copied sites": the motion of some
-            sites was copied from an earlier run.
-        evidence: The records, with their numbers.
+        name: Name of the finding. "changed log": the log was changed after it was written.
+            "missing records": too few ticks of a site are recorded. "missing periods": the
+            energy function V is known in too few tick periods. "copied sites": the motion of
+            some sites was copied from an earlier run.
+        evidence: The evidence on the records, with the numbers behind the finding.
     """
 
     name: Literal["changed log", "missing records", "missing periods", "copied sites"]

@@ -47,9 +47,9 @@ _ALONG_AXES = {
 """Units of quantities along an axis, by the units of the same quantities of a joint."""
 
 _SubjectValues = dict[str, MetricValues]
-"""Metrics of the subjects of a kind, such as all sites, by name of the subject."""
+"""Metrics of all subjects of one kind, such as all sites, by name of the subject."""
 _JsonEntry = dict[str, Any]
-"""Plain values of a load, a ratio or a response, by key."""
+"""Plain values of a joint load, a sharing ratio or a frequency response, by key."""
 
 METRICS_JSON_VERSION = 1
 """Version of the JSON: keys may be added, but no key is removed or changes its meaning."""
@@ -74,7 +74,7 @@ class LogMetrics(Result):
         static_windows: Number of windows of time in which all arms rest.
         joint_loads: Torques of all loaded sites at each loaded joint, in each static window.
         sharing_ratios: Force sharing at each joint at which two sites are loaded.
-        stiffness: Stiffness that an operator met between successive static windows.
+        stiffness: Stiffness that an operator felt between successive static windows.
         responses: Impedances and reflections over frequency.
         axes: Names of the shared coordinates in task space, where the number of a joint stands
             for a coordinate. Empty in joint space.
@@ -102,7 +102,7 @@ class LogMetrics(Result):
     def label(self, number: int) -> str:
         """Returns the name of a joint or an axis for a table, such as "1", "3 elbow" or "x".
 
-        The name of a joint is added to its number if all arms name their joints alike.
+        The name of a joint is added to its number if all arms have the same joint names.
 
         Args:
             number: Number of the joint or axis, from 1.
@@ -114,7 +114,7 @@ class LogMetrics(Result):
         return str(number)
 
     def unit(self, joint_unit: str, number: int) -> str:
-        """Returns the unit of a quantity, which may belong to a joint or to an axis of space.
+        """Returns the unit of a quantity, which may belong to a joint or to an axis in space.
 
         For arms whose end effectors follow each other, the first three numbers are axes of
         space. A quantity in N m at a joint is then a force in N, for example.
@@ -143,7 +143,7 @@ class LogMetrics(Result):
         """Returns the metrics as plain values, with the keys of `trilat metrics --json`.
 
         Each subject has its own dictionary: `["sites"]["m1"]` has the metrics of site m1 by
-        key. A value that is not known is None, and the entry "unknown" has the reason.
+        key. A value that is not known is `None`, and the entry "unknown" has the reason.
         """
         content: dict[str, Any] = {
             "version": METRICS_JSON_VERSION,
@@ -172,7 +172,7 @@ class LogMetrics(Result):
 
     @property
     def _subjects(self) -> dict[str, _SubjectValues]:
-        """The metrics by name of the subject, for each kind of subject but the run."""
+        """The metrics by name of the subject, for each kind of subject except the run."""
         return {
             "sites": self.sites,
             "links": self.links,
@@ -201,7 +201,8 @@ class LogMetrics(Result):
         """Returns a table with a row for each quantity and each subject that has the quantity.
 
         A subject is the run, a site, a link or a wall. A row has the keys "group", "key",
-        "name", "of" (the subject), "unit", "value", and "why", the reason if the value is None.
+        "name", "of" (the subject), "unit", "value", and "why" (the reason if the value is
+        `None`).
         """
         rows: list[dict[str, Any]] = []
         for description, metric in self._list_values():
@@ -224,7 +225,7 @@ class LogMetrics(Result):
                 yield description, metric
 
     def values_of(self, quantity: Quantity) -> dict[str, Metric]:
-        """Returns the values of one metric for every subject that has it, by the subject.
+        """Returns the values of one metric for every subject that has the metric, by subject.
 
         A subject is an arm, a network link or a wall, or the whole run, whose name is empty.
 
@@ -250,9 +251,9 @@ class LogMetrics(Result):
 
 
 def _reduce_to_run(quantity: Quantity, values_by_subject: Mapping[str, Metric]) -> Metric:
-    """Reduces the numbers of a quantity to one number of the whole run.
+    """Reduces the values of a quantity to one value for the whole run.
 
-    It is the largest number of all subjects (sites, links or walls), or their sum. Subjects to
+    The value is the largest of all subjects (sites, links or walls), or their sum. Subjects to
     which the quantity does not apply are left out. If the number of any other subject is
     missing, the number of the run is missing as well.
 
@@ -385,9 +386,9 @@ def find_quantity(key: str) -> Quantity:
 
 @np.errstate(over="ignore", invalid="ignore", divide="ignore")  # as in compute_log_metrics
 def measure_run(log: Log, keys: Iterable[str]) -> dict[str, Metric]:
-    """Computes only some quantities of a whole run, which is faster than all of them.
+    """Computes selected quantities of a whole run, which is faster than computing all of them.
 
-    Other commands need a few numbers of many runs, for example to compare the points of a
+    Other commands need a few quantities of many runs, for example to compare the points of a
     sweep.
 
     Args:
@@ -446,7 +447,7 @@ def _details_to_json(metrics: LogMetrics) -> dict[str, Any]:
 
 
 def _load_to_json(load: JointLoad) -> _JsonEntry:
-    """Returns the torques that a joint carries at rest, with their weights, as plain values."""
+    """Converts the external torques at a joint at rest, with their weights, to plain values."""
     content = load._asdict()
     content["weight"] = _values_to_json(load.weight)
     return content | _value_and_reason("imbalance", load.imbalance)
@@ -472,8 +473,8 @@ def _impedance_to_json(metrics: LogMetrics, estimate: ImpedanceEstimate) -> _Jso
 def _name_axis(metrics: LogMetrics, entry: _JsonEntry) -> _JsonEntry:
     """Converts the entry of a joint to that of an axis, for arms that follow end effectors.
 
-    The key "joint" becomes "axis". Keys that end in a unit of torque or angle get the unit
-    along the axis, for example "force_nm" becomes "force_n".
+    The key "joint" becomes "axis". In keys that end in a unit of torque or angle, the unit is
+    replaced by that along the axis. For example, "force_nm" becomes "force_n".
     """
     number = entry.pop("joint")
     axis_entry = {"axis": metrics.label(number)}
@@ -507,7 +508,7 @@ def _value_and_reason(key: str, value: Metric) -> _JsonEntry:
 
 
 def _replace_not_finite(value: Any) -> Any:
-    """Replaces all numbers that are not finite by None, in nested dictionaries and lists."""
+    """Replaces all numbers that are not finite by `None`, in nested dictionaries and lists."""
     if isinstance(value, float):
         return value if math.isfinite(value) else None
     if isinstance(value, dict):
@@ -518,5 +519,5 @@ def _replace_not_finite(value: Any) -> Any:
 
 
 def _values_to_json(metrics: MetricValues) -> dict[str, float | None]:
-    """Returns the numbers of metrics by key. Missing numbers are None."""
+    """Returns the values of metrics by key. Missing values are `None`."""
     return {key: metric.value for key, metric in metrics.items()}

@@ -1,8 +1,8 @@
 """Estimates the impedance that an operator feels at an arm, from the records of a run.
 
 The impedance is the ratio of the operator's torque to the velocity of the arm, as a function of
-frequency: a large impedance feels stiff or heavy. The module also estimates which share of the
-torque with which the environment pushes another arm reaches the operator (the reflected force).
+frequency: a large impedance feels stiff or heavy. The module also estimates the force
+reflection: the share of the environment's torque on another arm that reaches the operator.
 
 In a closed loop, each of the two signals x and y of such a ratio depends on the other, and
 their plain ratio would be biased. Therefore a third signal d, the drive, is needed, which
@@ -13,8 +13,8 @@ literature.
 Invariant:
     - A ratio is given at the frequency with the strongest drive, and at all frequencies whose
       drive is at least 0.55 times as strong.
-    - A ratio counts only if at least `MIN_SEGMENTS` independent segments of the run excite the
-      frequency, and if both signals have a coherence of at least `MIN_COHERENCE` with the
+    - A ratio is accepted only if at least `MIN_SEGMENTS` independent segments of the run excite
+      the frequency, and if both signals have a coherence of at least `MIN_COHERENCE` with the
       drive. These two limits keep its relative random error to at most 17.2 %.
     - Otherwise the reason is given instead of the ratio.
 """
@@ -43,7 +43,7 @@ MIN_COHERENCE = 0.9
 MIN_SEGMENTS = 4.0
 """Least number of independent segments that excite a spectral line."""
 _OVERLAP_FACTOR = 1.06
-"""Number of segments that count as one independent segment.
+"""Number of overlapping segments that are worth one independent segment.
 
 Segments overlap by half, and are weighted by a Hann window.
 """
@@ -52,7 +52,7 @@ MIN_DRIVE_TORQUE_NM = 0.05
 _DRIVEN_SHARE = 0.55
 """Share of the strongest drive above which a line counts as driven.
 
-A Hann window leaks 0.5 of a line into the next line.
+A Hann window leaks half of a line's amplitude into the next line.
 """
 STILL_SCRIPT_NM_S = 1e-6
 """Largest rate of change of a planned torque that counts as constant, in N m/s."""
@@ -63,7 +63,7 @@ class FrequencyResponse(NamedTuple):
     """Ratio of two recorded signals at one frequency, such as torque over velocity.
 
     Both signals are caused by a known drive, the motion of an operator. Values that the log
-    does not determine are None.
+    does not determine are `None`.
 
     Attributes:
         frequency_hz: Frequency of the spectral line, in Hz.
@@ -71,8 +71,8 @@ class FrequencyResponse(NamedTuple):
         phase_rad: Phase of the ratio, in rad.
         coherence: The smaller of the coherences of input and output with the drive, from 0 to
             1.
-        segments: Number of segments of equal power that would drive the line as much as all
-            recorded segments do.
+        segments: Effective number of segments: the number of segments of equal power that would
+            excite the line as much as all recorded segments do.
         error: Random error of the magnitude: one standard deviation, relative to the magnitude.
         why: The reason why the ratio is undecided. Empty if it is decided.
     """
@@ -110,18 +110,18 @@ def estimate_responses(
 
     Returns:
         The responses, the one with the strongest drive first. If no frequency is driven, a
-        single response with the reason.
+        single response that contains the reason.
     """
     length = round(SEGMENT_S * rate_hz)
     starts = _find_segments(usable, length)
     if not starts:
-        reason = f"the log has no stretch of {SEGMENT_S:g} s in which nobody else drives"
+        reason = f"the log has no interval of {SEGMENT_S:g} s without another drive"
         return [FrequencyResponse(why=reason)]
 
     D = _compute_spectra(drive, starts, length)
     drive_power = (np.abs(D) ** 2).mean(axis=0)
     if not np.isfinite(drive_power).all():
-        return [FrequencyResponse(why="the numbers of the drive are too large")]
+        return [FrequencyResponse(why="the values of the drive are too large")]
 
     strongest = int(drive_power.argmax())
     if math.sqrt(2.0 * drive_power[strongest]) < least:
@@ -276,11 +276,12 @@ class ImpedanceEstimate(NamedTuple):
             joint velocity, in N m s/rad. It includes the effect of all coupled arms. A
             reflection is the torque that an operator feels, divided by the torque of the
             environment on another arm.
-        at: Site of the operator, the process that runs the operator's arm.
+        at: Site of the operator, which is the process that runs the operator's arm.
         of: Site of the environment, for a reflection. Empty for an impedance.
         joint: Number of the joint, from 1.
         ratio: The complex ratio at the frequency at which the arm is driven most.
-        spectrum: The ratios at all frequencies that are driven enough, by rising frequency.
+        spectrum: The ratios at all frequencies that are sufficiently driven, by rising
+            frequency.
     """
 
     kind: str
@@ -384,9 +385,10 @@ def _find_still_rows(
     *,
     alone: bool,
 ) -> Bools | None:
-    """Finds the ticks (control periods) at which no operator moves an arm by a planned signal.
+    """Finds the ticks (control periods) at which no operator makes a planned motion.
 
-    Impedance is measured only there, because other operators would disturb the measurement.
+    Impedance is measured only at these ticks, because other operators would disturb the
+    measurement.
 
     Args:
         runs: All sites with records.
@@ -394,7 +396,7 @@ def _find_still_rows(
         alone: True if the operator of that site may move, because it is the drive itself.
 
     Returns:
-        True for each such tick, shape (K,). None if the plan of some operator is unknown.
+        True for each such tick, shape (K,). `None` if the plan of some operator is unknown.
     """
     t_s = runs[reference_site].records.t_s
     is_still = np.ones(len(t_s), dtype=np.bool_)

@@ -1,4 +1,4 @@
-"""Lets a function register itself as a metric, so that tables and commands find it by name.
+"""Registers functions as metrics, so that tables and commands find them by name.
 
 A metric is a number that describes a run or a part of it, for example the RMS error of an arm.
 Each module of this folder contains functions that compute such numbers. The decorator
@@ -6,9 +6,9 @@ Each module of this folder contains functions that compute such numbers. The dec
 and meanings). A new metric therefore needs no change of the commands that print metrics.
 
 Invariant:
-    - A value is a finite number, or None with a reason.
-    - A quantity is defined beside its function in this folder and explained in
-      docs/reference/metrics.md. Everything that shows, compares or requests a metric uses this
+    - A value is a finite number, or `None` with a reason.
+    - A quantity is defined next to its function in this folder and explained in
+      docs/reference/metrics.md. All code that shows, compares or requests a metric uses this
       definition.
 """
 
@@ -24,11 +24,11 @@ from ..run_view import RunView
 
 
 class Metric(NamedTuple):
-    """Value of one metric, such as the largest error of an arm, or the reason for having none.
+    """Value of a metric, such as the largest error of an arm, or the reason why it is missing.
 
     Attributes:
-        value: The number, which is finite. None if there is none.
-        why: The reason why there is no number. Empty if there is one.
+        value: The finite number. `None` if the metric has no number.
+        why: The reason why there is no number. Empty if there is a number.
         applies: False if the quantity cannot exist for this subject in any run of this
             scenario. In that case no information is missing.
     """
@@ -45,13 +45,13 @@ _NOT_FINITE = "the number is not finite"
 
 
 def metric(value: float | None, why: str = _NOT_FINITE) -> Metric:
-    """Wraps a number in a metric. A missing number, or one that is not finite, gets a reason.
+    """Wraps a number in a metric. If the number is missing or not finite, a reason is added.
 
-    For example, metric(nan, "no contact") has the value None and the reason "no contact".
+    For example, metric(nan, "no contact") has the value `None` and the reason "no contact".
 
     Args:
-        value: The number. None if there is none.
-        why: The reason that is stated if the number is None or not finite.
+        value: The number. `None` if the metric has no number.
+        why: The reason that is stated if the number is `None` or not finite.
     """
     if value is None or not math.isfinite(value):
         return Metric(None, why)
@@ -65,7 +65,7 @@ def unavailable(
     of: str = "",
     applies: bool = True,
 ) -> MetricValues:
-    """Returns metrics without values, with a common reason, for all quantities of one heading.
+    """Returns metrics without values, with a common reason, for all quantities under a heading.
 
     For example, a function that measures tracking returns them if an arm has no records.
 
@@ -152,7 +152,7 @@ def rms(values: ArrayLike) -> float:
 
 
 def peak(values: ArrayLike) -> float:
-    """Returns the largest absolute value of numbers, such as the peak torque: 3 for [1, -3].
+    """Returns the largest absolute value, such as the peak torque. For [1, -3] it is 3.
 
     Args:
         values: The numbers, of any shape.
@@ -170,9 +170,9 @@ class Quantity(NamedTuple):
     For example, the RMS error has the unit rad and applies to each arm.
 
     Attributes:
-        key: Key in programs. It ends in the unit, if there is any.
-        name: Name for people.
-        unit: Unit. Empty for a pure number.
+        key: Key in programs. It ends in the unit if the quantity has a unit.
+        name: Name that users read.
+        unit: Unit. Empty for a dimensionless number.
         reduction: How the number of the run follows from those of its subjects: "max" or "sum".
         of: Kind of subject: "run", "site", "link" or "wall".
         group: Heading under which the quantity is shown.
@@ -213,7 +213,7 @@ _DeclaredMeasuring = TypeVar("_DeclaredMeasuring", bound=Measuring)
 
 
 class Measure(NamedTuple):
-    """A function that computes some metrics of a run, with the heading that tables show above.
+    """A function that computes some metrics of a run, with their heading in tables.
 
     Modules of this folder register such functions with the decorator `measures`.
 
@@ -221,7 +221,7 @@ class Measure(NamedTuple):
         of: Kind of subject that is measured: "run", "site", "link" or "wall".
         group: Heading under which the quantities are shown.
         quantities: Definitions of the quantities.
-        measure: The function, which returns the numbers of one subject.
+        measure: The function, which returns the values for one subject.
     """
 
     of: str
@@ -263,7 +263,7 @@ _GROUP_ORDER = (
 def measures(
     of: str, group: str, *quantities: Quantity
 ) -> Callable[[_DeclaredMeasuring], _DeclaredMeasuring]:
-    """Registers a function that measures some quantities. Use it as a decorator.
+    """Decorator that registers a function which measures some quantities.
 
     The function is called for each run, site (the process that runs one arm), link or wall,
     depending on `of`. It must return a metric for each of the quantities.

@@ -64,9 +64,9 @@ LONG_END_S = 5.0
 """Length of the end of a run in which contact and slopes of estimates are measured, in s."""
 _ERRORS = {"rms_error": "RMS e", "max_error": "peak |e|", "max_error_end": "peak |e|, last 1 s"}
 _UNDELAYED_ERRORS = {
-    "undelayed_rms": "RMS of {0} from where the peers are then",
-    "undelayed_max": "largest distance of {0} from where the peers are then",
-    "undelayed_end": "largest distance of {0} from where the peers are then, last 1 s",
+    "undelayed_rms": "RMS of {0} from the peers at the same time",
+    "undelayed_max": "largest distance of {0} from the peers at the same time",
+    "undelayed_end": "largest distance of {0} from the peers at the same time, last 1 s",
 }
 _SPREADS = {
     "spread_rms": "RMS spread, undelayed",
@@ -128,21 +128,21 @@ def measure_undelayed_error(
 
         q_i(t) - sum_j alpha_ij(t) q_j(t)
 
-    It therefore includes what the delay costs. Between the ticks of a peer its motion is
-    interpolated.
+    It therefore includes the effect of the delay. Between the ticks of a peer the peer's motion
+    is interpolated.
 
     Args:
         view: The run.
         site: Name of the site.
         other: A run with the same sites, such as a rerun, which may end earlier. If given, only
-            times are used of which it has a record of the site too.
+            times at which this run also has a record of the site are used.
     """
     followed = _list_followed_peers(view, site)
     missing = [name for name in (site, *followed) if name not in view.sites]
     if missing:
         return unavailable(UNDELAYED, f"no records of {', '.join(missing)}")
     if not followed:
-        return unavailable(UNDELAYED, f"{site} follows nobody", applies=False)
+        return unavailable(UNDELAYED, f"{site} follows no other site", applies=False)
     error, known = _compute_undelayed_error(view, site, followed)
     if other is not None and site in other.sites:
         # Equal times of different tick rates are equal floats: a division rounds correctly.
@@ -150,7 +150,7 @@ def measure_undelayed_error(
         other_t_s = other_records.t_s[other_records.known]
         known &= np.isin(view.sites[site].records.t_s, other_t_s)
     if not known.any():
-        return unavailable(UNDELAYED, "no instant of which every site has a record")
+        return unavailable(UNDELAYED, "there is no time at which every site has a record")
     return measure_shared(
         group=UNDELAYED,
         space=view.scenario.sites[site].task.space,
@@ -166,8 +166,8 @@ def _compute_undelayed_error(
 ) -> tuple[Array, Bools]:
     """Returns the distance of an arm from the weighted mean of the other arms at one time.
 
-    The error of the control law differs: it compares the arm with delayed poses. This distance
-    shows how far apart the arms really were.
+    The error of the control law differs: it compares the arm with delayed poses. The distance
+    returned here shows how far apart the arms really were.
 
     Args:
         view: The run, which has records of the site and of the followed peers.
@@ -218,8 +218,9 @@ def _measure_spread(view: RunView, _run: str) -> MetricValues:
     """Measures the spread of a run: how far the sites are apart at the same instant.
 
     It is the largest difference of a joint angle between two sites. In task space the positions
-    of end effectors are compared instead, along the axes that all sites follow. The instants
-    are the ticks of the first site at which every other site has a record of its latest tick.
+    of end effectors are compared instead, along the axes that all sites follow. The spread is
+    evaluated at those ticks of the first site at which every other site has a record of its
+    latest tick.
 
     Args:
         view: The run.
@@ -234,7 +235,7 @@ def _measure_spread(view: RunView, _run: str) -> MetricValues:
     for records, row in zip(sites, rows, strict=True):
         poses_by_site.append(records.shared[row])
     if not known.any():
-        return unavailable(SPREAD, "no instant of which every site has a record")
+        return unavailable(SPREAD, "there is no time at which every site has a record")
 
     poses = np.stack(poses_by_site)[:, known]
     # two rotation vectors of nearly the same orientation, on both sides of half a turn, differ
@@ -264,9 +265,10 @@ def _measure_following(view: RunView, link: str) -> MetricValues:
     """Measures how far a slave is from the delayed motion of its master.
 
     The distance is q_m(t - T) - q_s, where T is the age of the sample in use, the state of the
-    master that the slave has received. At every tick of the slave from its first sample of that
-    master on, the slave's angles q_s are compared with the angles q_m in the master's record of
-    that sample. In task space the poses of the end effectors are compared.
+    master that the slave has received. At every tick of the slave after its first sample of
+    that master, the slave's angles q_s are compared with the angles q_m that the master
+    recorded when it sent the sample in use. In task space the poses of the end effectors are
+    compared.
 
     Args:
         view: The run.
@@ -276,7 +278,9 @@ def _measure_following(view: RunView, link: str) -> MetricValues:
     site = view.links[link].site
     specs = view.log.scenario.sites
     if specs[peer].role != "master" or specs[site].role != "slave":
-        return unavailable(FOLLOWING, "no link of a master to a slave", applies=False)
+        return unavailable(
+            FOLLOWING, "the link does not lead from a master to a slave", applies=False
+        )
     missing = [name for name in (peer, site) if name not in view.sites]
     if missing:
         return unavailable(FOLLOWING, f"no records of {', '.join(missing)}")
@@ -314,7 +318,7 @@ def _measure_following(view: RunView, link: str) -> MetricValues:
     Quantity("rms_tau_nm", "RMS tau", "N m"),
     Quantity("peak_tau_nm", "peak |tau|", "N m"),
     Quantity("saturated_share", "ticks at the limit"),
-    Quantity("chatter_nm", "chatter, mean change of tau a tick", "N m"),
+    Quantity("chatter_nm", "chatter, mean change of tau per tick", "N m"),
 )
 def _measure_effort(view: RunView, site: str) -> MetricValues:
     """Measures the torque that a controller applies, and how often it is at its limit.
@@ -353,22 +357,22 @@ def _measure_effort(view: RunView, site: str) -> MetricValues:
     "wall",
     CONTACT,
     Quantity("force_mean_n", "normal force, mean", "N"),
-    Quantity("force_deviation_n", "its deviation", "N"),
-    Quantity("force_peak_n", "its peak", "N"),
+    Quantity("force_deviation_n", "normal force, deviation", "N"),
+    Quantity("force_peak_n", "normal force, peak", "N"),
     Quantity("hits", "hits", "", "sum"),
     Quantity("contact_share", "ticks in contact"),
     Quantity("depth_max_m", "deepest", "m"),
     Quantity("end_force_mean_n", "normal force, mean, last 5 s", "N"),
-    Quantity("end_force_deviation_n", "its deviation, last 5 s", "N"),
-    Quantity("end_force_peak_n", "its peak, last 5 s", "N"),
+    Quantity("end_force_deviation_n", "normal force, deviation, last 5 s", "N"),
+    Quantity("end_force_peak_n", "normal force, peak, last 5 s", "N"),
     Quantity("end_hits", "hits, last 5 s", "", "sum"),
 )
 def _measure_wall_contact(view: RunView, name: str) -> MetricValues:
     """Measures the contact of an end effector with a virtual wall: force, hits and depth.
 
-    The numbers are given for the whole run and for its last 5 s. A contact in the first record,
-    or in the first record after a gap, is not counted as a hit, because its beginning is
-    unknown.
+    The metrics are computed for the whole run and for its last 5 s. A contact in the first
+    record, or in the first record after a gap, is not counted as a hit, because its beginning
+    is unknown.
 
     Args:
         view: The run.
@@ -413,12 +417,13 @@ class _BaseEstimates(NamedTuple):
 
     Attributes:
         parameter: Index in theta of the parameter after which each combination is named.
-        theta: True values. None if unknown.
+        theta: True values. `None` if unknown.
         first: Estimates in the first record.
         last: Estimates in the last record.
         consistent_first: For each link, whether some rigid body has the estimated parameters of
             the first record.
-        consistent_last: The same for the last record.
+        consistent_last: For each link, whether some rigid body has the estimated parameters of
+            the last record.
     """
 
     parameter: list[int]
@@ -430,18 +435,18 @@ class _BaseEstimates(NamedTuple):
 
 
 class ParameterEstimates(NamedTuple):
-    """What an adaptive control law learnt about the dynamic parameters theta of an arm.
+    """Estimates of an arm's dynamic parameters theta that an adaptive control law learnt.
 
     The parameters combine masses, inertias and lengths of the links. Each array has shape (P,).
 
     Attributes:
         learnt: True for each parameter that the law adapts.
-        theta: True parameters. None if unknown.
+        theta: True parameters. `None` if unknown.
         first: Estimates in the first record.
         last: Estimates in the last record.
-        slope_per_s: Slopes of straight lines through the last 5 s, in 1/s. None with fewer than
-            two records.
-        base: Estimates of a chain in base parameters. None for the planar arm.
+        slope_per_s: Slopes of straight lines through the last 5 s, in 1/s. `None` with fewer
+            than two records.
+        base: Estimates of a chain in base parameters. `None` for the planar arm.
     """
 
     learnt: list[bool]
@@ -452,7 +457,7 @@ class ParameterEstimates(NamedTuple):
     base: _BaseEstimates | None = None
 
     def to_json(self) -> JsonObject:
-        """Converts what the control law learnt about the arm to plain values for JSON.
+        """Converts the estimates of the control law to plain values for JSON.
 
         The key "base" is left out if there are no base parameters.
         """
@@ -466,7 +471,7 @@ class ParameterEstimates(NamedTuple):
 def _read_parameter_estimates(
     scenario: Scenario, records: AlignedRecords
 ) -> ParameterEstimates:
-    """Reads from the records what an adaptive control law learnt about the arm's masses.
+    """Reads the parameter estimates of an adaptive control law from the records of an arm.
 
     The law estimates dynamic parameters, combinations of masses, inertias and lengths.
 
@@ -511,9 +516,9 @@ def _read_parameter_estimates(
 
 
 def read_all_estimates(view: RunView) -> dict[str, ParameterEstimates]:
-    """Reads what adaptive control laws learnt about their arms during a run.
+    """Reads the parameter estimates that adaptive control laws learnt during a run.
 
-    The result compares first and last estimates of masses and inertias with the true ones.
+    The result contains the first, the last and the true values of masses and inertias.
 
     Args:
         view: The run.
@@ -533,7 +538,7 @@ def _estimate_base_parameters(
     theta: list[float] | None,
     theta_hat: Array,
 ) -> _BaseEstimates:
-    """Returns what the law of a chain of joints learnt, in base parameters of the chain.
+    """Returns the estimates that the law of a chain of joints learnt, in base parameters.
 
     Base parameters are the combinations of masses and inertias that the motion determines.
     Single masses cannot be learnt from motion alone, see `_BaseEstimates`.
@@ -541,7 +546,7 @@ def _estimate_base_parameters(
     Args:
         arm: The chain.
         learnt: True for each parameter that the law adapts, shape (P,).
-        theta: True parameters. None if unknown.
+        theta: True parameters. `None` if unknown.
         theta_hat: Estimates in every record, shape (K, P).
     """
     base = find_base_parameters(arm, learnt)
@@ -564,12 +569,12 @@ def _estimate_base_parameters(
 @measures(
     "site",
     LEARNING,
-    Quantity("theta_error_first", "|theta_hat - theta| at first"),
-    Quantity("theta_error_last", "|theta_hat - theta| at last"),
-    Quantity("theta_energy_first_j", "theta~' Gamma^-1 theta~ / 2 at first", "J"),
-    Quantity("theta_energy_last_j", "theta~' Gamma^-1 theta~ / 2 at last", "J"),
+    Quantity("theta_error_first", "initial |theta_hat - theta|"),
+    Quantity("theta_error_last", "final |theta_hat - theta|"),
+    Quantity("theta_energy_first_j", "initial theta~' Gamma^-1 theta~ / 2", "J"),
+    Quantity("theta_energy_last_j", "final theta~' Gamma^-1 theta~ / 2", "J"),
     Quantity("theta_slope_per_s", "|theta_hat'|, last 5 s", "1/s"),
-    Quantity("unphysical_links", "unphysical links, at last", "", "sum"),
+    Quantity("unphysical_links", "unphysical links at the end", "", "sum"),
 )
 def _measure_parameter_error(view: RunView, site: str) -> MetricValues:
     """Measures how far a site's estimates of its arm's parameters are from the true values.
@@ -583,8 +588,8 @@ def _measure_parameter_error(view: RunView, site: str) -> MetricValues:
 
     Returns:
         The metrics, by key: the distance and the energy of the errors in the first and the last
-        record, the rate at which the estimates still change, and the number of links that no
-        rigid body can have. A metric without a value contains the reason.
+        record, the rate at which the estimates still change, and the number of links with
+        parameters that no rigid body can have. A metric without a value contains the reason.
     """
     scenario = view.scenario
     estimates = view.compute_once(read_all_estimates).get(site)
@@ -604,7 +609,7 @@ def _measure_parameter_error(view: RunView, site: str) -> MetricValues:
         learnt_slopes = np.array(estimates.slope_per_s)[learnt]
         slope = float(np.linalg.norm(learnt_slopes))
 
-    metrics["theta_slope_per_s"] = metric(slope, "less than two records in the last 5 s")
+    metrics["theta_slope_per_s"] = metric(slope, "fewer than two records in the last 5 s")
     metrics["unphysical_links"] = Metric(
         None, "the arm is not a chain with ten parameters per link", applies=False
     )
@@ -620,7 +625,7 @@ def _measure_parameter_error(view: RunView, site: str) -> MetricValues:
         errors = np.array([base.first, base.last]) - np.array(base.theta)
 
     energies: list[float | None] = [None, None]
-    why = "the gains of learning are not known"
+    why = "the adaptation gains are not known"
     if gains.law is Law.ADAPTIVE:
         energies = _compute_parameter_energy(arm, learnt, np.array(gains.Gamma), errors)
         why = "the number is not finite"
@@ -641,7 +646,8 @@ def _compute_parameter_energy(
     """Returns the energy of parameter errors, which is a part of the energy function V.
 
     The energy of the errors d is d' Gamma^-1 d / 2 with the adaptation gains Gamma. Base
-    parameters learn with the gain B Gamma B', where B is the matrix of their combinations.
+    parameters are adapted with the gain B Gamma B', where B is the matrix of their
+    combinations.
 
     Args:
         arm: The arm.
@@ -686,7 +692,7 @@ def _measure_network(view: RunView, name: str) -> MetricValues:
     link = view.links[name]
     age = link.age_ms
     unused = "no sample ever came into use"
-    unknown = "of no sample it is known whether it came"
+    unknown = "for no sample is it known whether it arrived"
     burst = metric(link.burst, unknown)
     if link.loss == 0.0:
         burst = Metric(None, "nothing was lost", applies=False)

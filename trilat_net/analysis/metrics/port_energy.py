@@ -1,12 +1,12 @@
 """Computes the energy that enters each arm, and the energy that network delays inject.
 
 Delays can make coupled arms unstable, because the control torques then supply energy that no
-operator supplied. These numbers show where it comes from. Energy enters an arm from the
-controller, the operator and the environment. The work of a torque tau during a small motion dq
-of the joints is tau'dq. If the torque tau_k is constant during tick k, its work is exactly
-tau_k' (q_{k+1} - q_k), where q_k are the joint angles. If the torque follows the motion, the
-trapezoid rule is used, which is exact for springs. The sum over the ticks is known as a
-passivity observer (Hannaford and Ryu 2002).
+operator supplied. The metrics of this module show where this energy comes from. Energy enters
+an arm from the controller, the operator and the environment. The work of a torque tau during a
+small motion dq of the joints is tau'dq. If the torque tau_k is constant during tick k, its work
+is exactly tau_k' (q_{k+1} - q_k), where q_k are the joint angles. If the torque follows the
+motion, the trapezoid rule is used, which is exact for springs. The sum of this work over the
+ticks is known as a passivity observer (Hannaford and Ryu 2002).
 
 A link carries the state of arm j to arm i with the delay T_ij. The control torque of arm i is
 the torque without delay, plus a term for each link. The energy of this term is
@@ -137,8 +137,8 @@ def _measure_port_energy(view: RunView, site: str) -> MetricValues:
     """Measures the energies that an arm exchanged with controller, operator and environment.
 
     Only tick periods with a record at both ends count. The mechanical stops of joints count as
-    environment. Friction absorbs energy that the arm does not gain. The difference between the
-    energy gained and the energy supplied is reported as unaccounted, and should be small.
+    environment. Friction absorbs part of the supplied energy. The difference between the energy
+    gained and the energy supplied is reported as unaccounted, and should be small.
 
     Args:
         view: The run.
@@ -206,7 +206,7 @@ def _measure_port_energy(view: RunView, site: str) -> MetricValues:
 
 
 def _measure_most(energy: Array) -> Metric:
-    """Returns the metric of the largest energy over time, but at least 0, in J."""
+    """Returns the metric of the largest energy over time, in J, which is at least 0."""
     largest = float(energy.max())
     return metric(max(0.0, largest))
 
@@ -220,18 +220,18 @@ def _measure_most(energy: Array) -> Metric:
 def _measure_delay_energy(view: RunView, link: str) -> MetricValues:
     """Measures the energy that the delay of a link injects into the receiving arm, in J.
 
-    A site is the process that runs one arm. The delay makes it follow an old position of the
-    sending site (peer). The difference from the torque without delay does work on the arm. This
-    is the torque of the control law before it is limited. Only tick periods count that have a
-    record at both ends, and in which the site follows its peers.
+    A site is the process that runs one arm. The delay makes the receiving site follow an old
+    position of the sending site (peer). The difference from the torque without delay does work
+    on the arm. The torques are those of the control law before they are limited. Only tick
+    periods that have a record at both ends and in which the site follows its peers are counted.
 
     Args:
         view: The recorded run.
         link: Name of the link, such as "m1->s" for the link from site m1 to site s.
 
     Returns:
-        The energy at the end of the run and its maximum, by key. If they are unknown, each
-        contains the reason.
+        The energy at the end of the run and its maximum, by key. If the energies are unknown,
+        each metric contains the reason.
     """
     runs = view.sites
     peer = view.links[link].peer
@@ -292,15 +292,16 @@ def _compute_delay_torque(
 ) -> Array:
     """Returns the change of a control law's torque that is due to the network delay.
 
-    It is the torque less the torque without delay. The effect of the delay on the Coulomb
-    friction that a law compensates is left out.
+    This change is the torque minus the torque without delay. The effect of the delay on the
+    Coulomb friction that a law compensates is left out.
 
     Args:
         gains: Gains of the law.
         arm: Arm of the site.
         records: Records of the site.
         peer_records: Records of the peer.
-        peer_motion: Motion of the peer as the site sees it, and at the same time.
+        peer_motion: Motion of the peer with the delay as the site receives it, and without
+            delay.
         alpha: Dominance factor of the peer, shape (K, 1).
         alpha_rate: Time derivative of the dominance factor, shape (K, 1), in 1/s.
 

@@ -14,8 +14,8 @@ other. K_i is the stiffness, in N m/rad, with which the controller of arm i pull
 position that it follows. docs/reference/metrics.md derives each metric.
 
 Invariant:
-    - A stiffness is reported only if nothing but a single operator changed between the two
-      windows. Other joints of the arm may have moved as well.
+    - A stiffness is reported only if the action of a single operator is the only change between
+      the two windows. Other joints of the arm may have moved as well.
     - No torque is predicted if a control law learns the gravity of its arm, because its
       estimates then change under a load.
 """
@@ -44,13 +44,13 @@ MAX_TORQUE_VARIATION = 0.01
 MIN_LOAD_NM = 0.05
 """Smallest torque that counts as a load, in N m."""
 MOVING_SCRIPT_NM = 1e-9
-"""Largest change of a planned torque from tick to tick that counts as constant, in N m."""
+"""Largest change from tick to tick at which a planned torque counts as constant, in N m."""
 MIN_TORQUE_CHANGE_NM = 0.1
 """Least change of a torque from which a stiffness is computed, in N m."""
 MIN_ANGLE_CHANGE_RAD = 1e-4
 """Least change of an angle from which a stiffness is computed, in rad."""
 STILL_SCRIPT_NM = 1e-6
-"""Largest change of a planned torque between two windows that counts as constant, in N m."""
+"""Largest change between two windows at which a planned torque counts as constant, in N m."""
 MIN_LOAD_SHARE = 0.02
 """Smallest torque of a loaded site, as a share of the largest torque of all sites."""
 
@@ -58,15 +58,16 @@ MIN_LOAD_SHARE = 0.02
 class _StaticWindow(NamedTuple):
     """Interval of time in which all arms rest, with mean torques and angles of each arm.
 
-    Stiffness and force sharing are measured in such intervals, because no inertia acts there.
+    Stiffness and force sharing are measured in such intervals, because inertia has no effect at
+    rest.
 
     Attributes:
         from_s: Time of the first tick, in s.
         to_s: Time of the last tick, in s.
         torque: Torque of operator and environment on the arm, shape (n,), in N m.
         environment: Torque of the environment alone, shape (n,), in N m.
-        script: Torque that the scenario plans for the operator, shape (n,), in N m. None if it
-            is unknown.
+        script: Torque that the scenario plans for the operator, shape (n,), in N m. `None` if
+            it is unknown.
         q: Joint angles, shape (n,), in rad.
         alpha: Matrix of the dominance factors, shape (N, N).
     """
@@ -83,8 +84,8 @@ class _StaticWindow(NamedTuple):
 def _find_static_windows(run_view: RunView) -> list[_StaticWindow]:
     """Finds the windows of time in which all arms rest, in order.
 
-    A window is the last `WINDOW_S` of an interval in which all arms rest. Each interval has one
-    window at most.
+    A window is the last `WINDOW_S` of an interval in which all arms rest. Each interval
+    contains at most one window.
 
     Args:
         run_view: The run.
@@ -105,7 +106,7 @@ def _find_static_windows(run_view: RunView) -> list[_StaticWindow]:
 
     window_ticks = int(np.ceil(WINDOW_S * first_records.rate_hz))
     padded = np.concatenate([[False], is_still, [False]])
-    # first tick of each interval and first tick after it, in turns
+    # first tick of each interval and first tick after it, alternately
     change_ticks = np.flatnonzero(np.diff(padded))
     windows = []
     for begin, end in change_ticks.reshape(-1, 2).tolist():
@@ -199,7 +200,7 @@ def _average_window(
 
 
 class StiffnessEstimate(NamedTuple):
-    """Stiffness that an operator met at a joint, between two successive static windows.
+    """Stiffness that an operator felt at a joint, between two successive static windows.
 
     All arms rest in a static window. The stiffness is the change of torque over the change of
     angle, for example of an arm that leans against a wall.
@@ -211,8 +212,8 @@ class StiffnessEstimate(NamedTuple):
         joint: Number of the joint, from 1.
         torque_nm: Change of the operator's torque on its arm.
         angle_rad: Change of the joint's angle.
-        stiffness_nm_rad: Ratio of both changes. None if the joint did not move and is therefore
-            too stiff to be measured.
+        stiffness_nm_rad: Ratio of both changes. `None` if the joint did not move, because the
+            joint is then too stiff to be measured.
     """
 
     from_s: float
@@ -268,8 +269,9 @@ def estimate_stiffness(view: RunView) -> list[StiffnessEstimate]:
 def _find_single_mover(before: _StaticWindow, after: _StaticWindow) -> str:
     """Returns the site of the only operator that acted differently in two static windows.
 
-    If several operators moved, the stiffness that one of them met cannot be told. The name is
-    then empty, as it is if no operator moved or the plan of an operator is unknown.
+    If several operators moved, the stiffness that one of them felt cannot be determined. In
+    this case the name is empty. It is also empty if no operator moved, or if the plan of an
+    operator is unknown.
     """
     moved_sites = []
     for site, plan_after in after.script.items():
@@ -282,7 +284,7 @@ def _find_single_mover(before: _StaticWindow, after: _StaticWindow) -> str:
 
 
 class SharingRatio(NamedTuple):
-    """Measured force sharing at a joint: how much one operator feels of a torque elsewhere.
+    """Measured force sharing at a joint: how much of a torque on another arm an operator feels.
 
     It is measured while all arms rest, at a joint at which exactly two arms are loaded.
 
@@ -293,7 +295,7 @@ class SharingRatio(NamedTuple):
         pushed: Site at which the torque acts.
         pushed_nm: Torque on the arm of this site, in N m.
         by_wall: True if the environment contributes most of this torque.
-        holds: Site of the operator that feels the torque.
+        holds: Site of the operator who feels the torque.
         felt_nm: Torque that this operator feels, in N m: the negative of the operator's torque
             on the arm.
         expected_nm: Torque that the operator should feel according to the dominance factors,
@@ -312,9 +314,9 @@ class SharingRatio(NamedTuple):
 
     @property
     def off(self) -> float | None:
-        """Deviation of the felt torque from the expected torque, relative to the latter.
+        """Relative deviation of the felt torque from the expected torque.
 
-        For example, 0.1 means that the felt torque is 10 % larger or smaller. None if the
+        For example, 0.1 means that the felt torque is 10 % larger or smaller. `None` if the
         expected torque is unknown or zero.
         """
         expected = self.expected_nm.value
@@ -387,7 +389,8 @@ def count_static_windows(view: RunView) -> Metric:
         view: The recorded run.
 
     Returns:
-        The number. If it is zero or unknown, the metric has no number but the reason.
+        The number. If it is zero or unknown, the metric contains the reason instead of a
+        number.
     """
     if view.absent:
         return Metric(None, f"no records of {', '.join(view.absent)}")
@@ -404,8 +407,8 @@ def count_static_windows(view: RunView) -> Metric:
 def _measure_force_sharing(view: RunView, _run: str) -> MetricValues:
     """Measures how well the torques that operators feel agree with the predicted sharing.
 
-    Operators feel torques on other arms according to the dominance factors, the weights with
-    which the arms follow each other.
+    The dominance factors, the weights with which the arms follow each other, determine how
+    strongly operators feel torques on other arms.
 
     Args:
         view: The recorded run.
@@ -461,7 +464,7 @@ def _weigh_load(
         imbalance_ratio = None
         if largest > 0.0:
             imbalance_ratio = abs(sum(weighted)) / largest
-        imbalance = metric(imbalance_ratio, "no site that others follow is loaded")
+        imbalance = metric(imbalance_ratio, "no loaded site is followed by other sites")
         weight_metrics = {site: metric(weight[site]) for site in torque}
 
     return JointLoad(
@@ -477,9 +480,10 @@ def _weigh_load(
 def find_sharing_ratios(view: RunView) -> list[SharingRatio]:
     """Compares the torque that an operator feels with the torque that another arm receives.
 
-    This is done at every joint at which exactly two arms carry a torque, while all arms rest.
-    The operator who feels the torque is the operator who holds an arm like a spring. If both do
-    so, or none, it is the operator of the master. The torque on the other arm is the cause.
+    The comparison is made at every joint at which exactly two arms carry a torque, while all
+    arms rest. The operator who feels the torque is the one who holds an arm like a spring. If
+    both operators do so, or neither of them, it is the operator of the master. The torque on
+    the other arm is the cause.
 
     Args:
         view: The recorded run.
@@ -509,7 +513,9 @@ def find_sharing_ratios(view: RunView) -> list[SharingRatio]:
         if pushed_weight.value is None or holds_weight.value is None:
             expected = Metric(None, pushed_weight.why)
         elif holds_weight.value == 0.0:
-            expected = Metric(None, f"no site follows {holds} in the end")
+            expected = Metric(
+                None, f"no site depends on {holds} in the end, so its weight is 0"
+            )
         else:
             expected = metric(torque * pushed_weight.value / holds_weight.value)
 
@@ -560,7 +566,7 @@ def _compute_torque_weights(scenario: Scenario, alpha: Array) -> Array | str:
         The weights, shape (N, n), or the reason why they are unknown.
     """
     if len(find_closed_groups(alpha)) > 1:
-        return "two groups of sites follow nobody else: who feels whom is not unique"
+        return "two groups of sites do not follow each other: it is not unique who feels whom"
     stiffness = []
     for site in scenario.names:
         K, why = _find_holding_stiffness(scenario, site)
@@ -579,8 +585,8 @@ def _find_holding_stiffness(scenario: Scenario, site: str) -> tuple[Array, str]:
         site: Name of the site, the process that controls the arm.
 
     Returns:
-        The stiffness, shape (n,), in N m/rad. NaN along axes that the site does not follow.
-        The reason why the stiffness is unknown. Empty if it is known.
+        The stiffness, shape (n,), in N m/rad. NaN along axes that the site does not follow. The
+        reason why the stiffness is unknown, empty if the stiffness is known.
     """
     spec = scenario.sites[site]
     arm = build_arm_rows(scenario, site)

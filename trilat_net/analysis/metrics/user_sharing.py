@@ -6,7 +6,7 @@ of the user, which may change during the run. The slave is the first one of the 
 
 Invariant:
     - The user with the largest dominance factor leads.
-    - Only the torques with which the operators push their arms count, and not those of walls
+    - Only the torques with which the operators push their arms count, not the torques of walls
       and other environments. In task space, forces at the end effectors replace them.
     - Ticks without a record do not count.
 """
@@ -41,11 +41,11 @@ from .measures import (
 JACKKNIFE_BLOCKS = 8
 """Number of blocks of ticks that the jackknife leaves out, one at a time."""
 LARGEST_HALF_WIDTH = 0.25
-"""Largest half-width of the 95 % interval with which a share in the motion is reported."""
+"""Largest half-width of the 95 % interval at which a share in the motion is reported."""
 STUDENT_T = 2.3646
 """The 0.975 quantile of Student's t with `JACKKNIFE_BLOCKS` - 1 = 7 degrees of freedom."""
 LEAST_INDEPENDENCE = 1e-9
-"""Smallest singular value of the users' relative velocities, as a share of the slave's motion.
+"""Smallest singular value of the users' relative velocities, relative to the slave's motion.
 
 With a smaller value the users' motions count as dependent.
 """
@@ -199,18 +199,18 @@ def _identify_shares(view: RunView) -> list[float] | Metric:
     Quantity("internal_rms_nm", "RMS torque that cancels", "N m"),
     Quantity("internal_rms_n", "RMS force that cancels", "N"),
     Quantity("internal_share", "part of the users' efforts that cancels"),
-    Quantity("intervention_share", "time in which another user than the program leads"),
-    Quantity("takeovers", "changes of who leads"),
+    Quantity("intervention_share", "time in which a user other than the program leads"),
+    Quantity("takeovers", "changes of the leader"),
     Quantity("takeover_s", "longest takeover", "s"),
-    Quantity("lead_jump", "largest step of q_id while shares change, to that of the rest"),
+    Quantity("lead_jump", "largest step of q_id while shares change / other steps"),
 )
 def _measure_sharing(view: RunView, _run: str) -> MetricValues:
     """Measures how the users of a slave arm disagree, intervene and take over.
 
     Each user moves a master arm, and the slave follows the masters with weights. The user with
-    the largest weight leads. A change of the leader is a takeover. A program may move the arm
-    of a user, which the log tells; otherwise the last user counts as the program. Any other
-    user who leads is then said to intervene.
+    the largest weight leads. A change of the leader is a takeover. The log states whether a
+    program moved the arm of a user. If no program did, the last user counts as the program. If
+    any other user leads, this user is said to intervene.
 
     Args:
         view: The recorded run.
@@ -268,7 +268,7 @@ def _measure_disagreement(runs: list[SiteRun]) -> MetricValues:
     cancelled = 0.5 * (sum_of_sizes - size_of_sum)
     total = sum_of_sizes.sum()
 
-    internal_share = _not_applicable("nobody pushes")
+    internal_share = _not_applicable("no user pushes")
     if total:
         internal_share = metric(2.0 * cancelled.sum() / total)
     values = {"internal_share": internal_share}
@@ -280,7 +280,9 @@ def _measure_disagreement(runs: list[SiteRun]) -> MetricValues:
         if amounts.shape[1]:
             values[f"internal_rms_{unit}"] = metric(rms(amounts))
         else:
-            values[f"internal_rms_{unit}"] = _not_applicable("the users share none")
+            values[f"internal_rms_{unit}"] = _not_applicable(
+                "the users share no such coordinate"
+            )
     return values
 
 

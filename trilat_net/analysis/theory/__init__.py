@@ -3,7 +3,7 @@
 The control loop of all arms, with its delays and sampling, is linearised about a pose in which
 all arms rest. Its characteristic roots tell whether small motions die away. For example, the
 delay margin is the largest network delay for which they do. docs/studies/linear.md and
-docs/studies/ports.md have the definitions, equations and literature.
+docs/studies/ports.md contain the definitions, equations and literature.
 
 Invariant:
     - The equations are written a second time in plain NumPy and share nothing with the compiled

@@ -18,7 +18,8 @@ this module computes the rightmost ones, in two steps:
    "Algorithms for the nonlinear eigenvalue problem", SIAM J. Numerical Analysis 10 (1973).
 
 Invariant:
-    - A root solves the equation to rounding, for every discretisation that supplies its guess.
+    - A root solves the equation up to rounding errors, for every discretisation that supplies
+      its guess.
     - Some roots are zero for every delay, because the equations do not change if all arms are
       shifted, or if a parameter estimate changes that no motion affects. Such roots are
       counted, and never called the rightmost.
@@ -40,11 +41,11 @@ from .linear_loop import LinearLoop
 Complex = NDArray[np.complex128]
 
 SAME_ROOT_TOLERANCE = 1e-8
-"""Largest difference of two guesses of the same root, relative to 1 + abs(s)."""
+"""Largest difference between two guesses of the same root, relative to 1 + abs(s)."""
 STABILITY_EDGE_PER_S = 1e-6
 """Largest distance from the imaginary axis of a root that counts as on the axis, in 1/s."""
 EDGE_DEVIATIONS = 2.0
-"""Standard deviations within which a root of random delays counts as zero."""
+"""Number of standard deviations within which a root for random delays counts as zero."""
 ROOT_RESIDUAL_TOLERANCE = 1e-12
 """Largest residual of a root, relative to the norms of the terms of Delta."""
 _MAX_NEWTON_STEPS = 30
@@ -64,15 +65,15 @@ _MAX_DISTANCE_PER_S = 1e6
 ZERO_SHARE = 1e-12
 """Largest singular value that counts as zero, relative to the largest one."""
 _LONGEST_CHAIN = 4
-"""Length of the longest Jordan chain of roots at zero that is searched."""
+"""Length of the longest Jordan chain of roots at zero that is considered."""
 NAMED_SHARE = 0.3
-"""Least participation of a state that is named with a root, relative to the largest one."""
+"""Smallest participation at which a state is named with a root, relative to the largest one."""
 _INITIAL_ORDER = 12
 """Degree of the polynomials in the first discretisation."""
 MAX_GENERATOR_SIZE = 1600
 """Number of rows of the largest discretisation, whose eigenvalues take some seconds."""
 _ROOT_AGREEMENT = 1e-9
-"""Largest difference of roots of two orders that agree, relative to 1 + abs(s)."""
+"""Largest difference at which the roots of two orders agree, relative to 1 + abs(s)."""
 
 
 class Pencil(NamedTuple):
@@ -87,7 +88,7 @@ class Pencil(NamedTuple):
         delays: Delays T_k, in s, shape (K,).
         Ad: Matrices A_k of the delayed terms, shape (K, n, n).
         E: Diagonal of E, shape (n,): 1 for a state with a rate, 0 for a state that an algebraic
-            equation determines. None if every state has a rate.
+            equation determines. `None` if every state has a rate.
     """
 
     A: Array
@@ -129,10 +130,10 @@ class Pencil(NamedTuple):
         return delta.astype(np.complex128), derivative.astype(np.complex128)
 
     def sum_term_norms(self, s: complex) -> float:
-        """Returns the size of the terms of the characteristic matrix Delta(s).
+        """Returns the size of the terms in the characteristic matrix Delta(s).
 
-        It is the sum of their norms. A residual of Delta(s) counts as zero if it is small
-        compared with this sum.
+        The size is the sum of the norms of the terms. A residual of Delta(s) counts as zero if
+        it is small compared with this sum.
 
         Args:
             s: Complex frequency, in 1/s.
@@ -170,15 +171,15 @@ class Pencil(NamedTuple):
     def delayed_states(self) -> NDArray[np.intp]:
         """Indices of the states whose delayed values act on the arms.
 
-        An arm, for example, follows the angles that another arm had some time ago. Few states
-        do so, and only these are discretised over the delay, which keeps the matrices small.
+        For example, an arm follows the angles that another arm had some time ago. Only these
+        few states are discretised over the delay, which keeps the matrices small.
         """
         effects = np.abs(self.Ad).sum(axis=(0, 1))
         return np.flatnonzero(effects)
 
 
 MovingPart = tuple[Pencil, tuple[str, ...], int]
-"""A loop without its constant states and its states without effect.
+"""A loop without its constant states and without its states that have no effect.
 
 The entries are the matrices of the loop, the names of its states, and the number of omitted
 states, each of which has a root at zero.
@@ -231,8 +232,8 @@ def extract_moving_part(pencil: Pencil, names: Sequence[str]) -> MovingPart:
 class CharacteristicRoot(NamedTuple):
     """A characteristic root s of the control loop: small motions may change like exp(s t).
 
-    They grow if the real part of s is positive. A complex root comes with its conjugate, which
-    is not listed.
+    The motions grow if the real part of s is positive. A complex root comes with its conjugate,
+    which is not listed.
 
     Attributes:
         s: The root with a non-negative imaginary part, in 1/s. Its real part is the growth
@@ -276,7 +277,7 @@ class Spectrum(NamedTuple):
     """The rightmost characteristic roots of a loop, which decide its stability.
 
     Some roots are zero by structure, because all arms can rest in other poses too, or because
-    nothing excites an estimate. They say nothing about stability.
+    nothing excites an estimate. Roots that are zero by structure say nothing about stability.
 
     Attributes:
         roots: The rightmost roots that are not zero by structure, by falling real part.
@@ -286,10 +287,10 @@ class Spectrum(NamedTuple):
         dropped: Number of guesses from which Newton's method reached no root.
         order: Order of the discretisation that gave the guesses. 0 if none was needed.
         span_s: Time over which the roots are computed, in s: the period after which delays and
-            tick rates repeat, or the analysed span of delays that do not repeat. None if all
+            tick rates repeat, or the analysed span of delays that do not repeat. `None` if all
             ticks are alike.
         deviation_per_s: Standard deviation of the rightmost root between parts of the span, in
-            1/s. None if delays repeat.
+            1/s. `None` if delays repeat.
         is_exact: False if the delays of the loop do not repeat exactly after the span.
     """
 
@@ -325,17 +326,17 @@ class Spectrum(NamedTuple):
 
         The real part is the growth rate of a small motion. Roots that are zero because of the
         structure of the loop are not considered: they exist, for example, because all arms can
-        rest in other poses too. None if there are no other roots.
+        rest in other poses too. `None` if there are no other roots.
         """
         return self.roots[0] if self.roots else None
 
     @property
     def verdict(self) -> str:
-        """The stability by the rightmost root: "stable", "unstable" or "at the edge".
+        """The stability according to the rightmost root: "stable", "unstable" or "at the edge".
 
         A root closer to the imaginary axis than `STABILITY_EDGE_PER_S`, or than twice its
-        standard deviation for random delays, is at the edge. So is a loop with a zero root
-        whose motion drifts.
+        standard deviation for random delays, is at the edge. A loop with a zero root whose
+        motion drifts is at the edge too.
         """
         rightmost_per_s = -math.inf
         if self.roots:
@@ -364,7 +365,7 @@ def _solve_for_root(
         names: Names of the states.
 
     Returns:
-        The root, with its multiplicity and its states. None if the method does not converge.
+        The root, with its multiplicity and its states. `None` if the method does not converge.
     """
     s = complex(guess)
     with np.errstate(all="ignore"):
@@ -397,7 +398,7 @@ def _solve_for_root(
 
 
 def _compute_newton_step(pencil: Pencil, s: complex) -> complex | None:
-    """Computes by how much Newton's method changes a guess s of a root.
+    """Computes the step by which Newton's method changes a guess s of a root.
 
     The step is the eigenvalue mu of smallest modulus of Delta(s) v = mu Delta'(s) v. The next
     guess is s - mu.
@@ -407,7 +408,7 @@ def _compute_newton_step(pencil: Pencil, s: complex) -> complex | None:
         s: The guess, in 1/s.
 
     Returns:
-        The step. None if there is no finite mu.
+        The step. `None` if there is no finite mu.
     """
     delta, derivative = pencil.evaluate(s)
     # far to the left, exp(-s T) overflows
@@ -443,7 +444,8 @@ def _measure_participation(pencil: Pencil, s: complex) -> tuple[int, Array] | No
         s: The root, in 1/s.
 
     Returns:
-        The number of null vectors, and the participation, shape (n,). None if s is not a root.
+        The number of null vectors, and the participation, shape (n,). `None` if s is not a
+        root.
     """
     delta, derivative = pencil.evaluate(s)
     if not np.isfinite(delta).all():
@@ -471,17 +473,17 @@ def _count_zero_roots(pencil: Pencil) -> tuple[int, int]:
     """Counts the roots that are zero by structure, and how many of them drift.
 
     The characteristic matrix has the Taylor series Delta(s) = D_0 + s D_1 + s^2 D_2 + .... A
-    root at zero can belong to a Jordan chain, a sequence of modes of which each drives the
-    next. The block Toeplitz matrix of D_0 ... D_(m-1) has as many null vectors as there are
-    roots at zero, with each chain counted up to length m. When the number no longer rises with
-    m, all roots are counted. Roots in chains longer than 1 drift: their modes grow with time.
+    root at zero can belong to a Jordan chain, a sequence of modes in which each mode drives the
+    next. The number of null vectors of the block Toeplitz matrix of D_0 ... D_(m-1) is the
+    number of roots at zero, where each chain counts up to length m. When this number no longer
+    rises with m, all roots are counted. Roots in chains longer than 1 drift: their modes grow
+    with time.
 
     Args:
         pencil: Matrices of the loop.
 
     Returns:
-        The number of roots at zero.
-        The number of those that drift.
+        The number of roots at zero. The number of those roots that drift.
     """
     counts = [0]
     for length in range(1, _LONGEST_CHAIN + 1):
@@ -524,13 +526,13 @@ def refine_roots(
         wanted: Number of roots. A conjugate pair counts once.
 
     Returns:
-        The `wanted` rightmost roots, or fewer if there are not as many.
-        The number of guesses from which no root was reached.
+        The `wanted` rightmost roots, or fewer if the loop does not have so many. The number of
+        guesses from which no root was reached.
     """
     roots: list[CharacteristicRoot] = []
     dropped = 0
     for guess in candidates:
-        # the conjugate of another guess
+        # this guess is the conjugate of another guess
         if guess.imag < -SAME_ROOT_TOLERANCE * (1.0 + abs(guess)):
             continue
 
@@ -621,8 +623,8 @@ def compute_delay_spectrum(loop: LinearLoop, wanted: int = 6) -> Spectrum:
 def _guess_roots(pencil: Pencil, order: int, zeros: int) -> Complex:
     """Returns approximations of the roots of the control loop, by falling real part.
 
-    They are eigenvalues of the discretised loop. The smallest are left out, as these
-    approximate the roots that are zero by structure.
+    The approximations are eigenvalues of the discretised loop. The smallest eigenvalues are
+    left out, because they approximate the roots that are zero by structure.
 
     Args:
         pencil: Matrices of the loop.
@@ -664,7 +666,7 @@ def _eliminate_states(matrix: Array, E: Array) -> Array:
 def _agree(previous: list[CharacteristicRoot], roots: list[CharacteristicRoot]) -> bool:
     """Returns True if two successive approximations of the roots agree.
 
-    The order of the approximation is doubled until this is so.
+    The order of the approximation is doubled until the roots agree.
 
     Args:
         previous: Roots from the previous order.

@@ -8,10 +8,10 @@ unit and w an angular frequency, if
     det(I - exp(-j w T) G(j w)) = 0.
 
 G(j w) consists of those rows of (j w I - A)^-1 A_d that belong to the delayed components. Such
-a root exists if and only if G(j w) has an eigenvalue of modulus 1 whose phase is w T modulo
-2 pi. If T increases, a pair of roots moves into the unstable half plane if the modulus of this
-eigenvalue falls with w, and out of it if the modulus rises. These crossings are counted from a
-small delay on, which gives the number of unstable roots for every delay.
+a root exists if and only if G(j w) has an eigenvalue of modulus 1 whose phase is w T modulo 2
+pi. If T increases, a pair of roots moves into the unstable half plane if the modulus of this
+eigenvalue falls with w, and out of it if the modulus rises. The crossings are counted upwards
+from a small delay, which gives the number of unstable roots for every delay.
 
 Sources:
     - Chen, Gu and Nett, "A new method for computing delay margins for stability of linear delay
@@ -20,7 +20,7 @@ Sources:
       Ekvacioj 29 (1986).
 
 Invariant:
-    - Crossings of the imaginary axis are searched over frequency and not over delay, so that no
+    - Crossings of the imaginary axis are sought over frequency and not over delay, so that no
       crossing is missed between two delays.
 """
 
@@ -38,7 +38,7 @@ from . import characteristic_roots
 from .linear_loop import DelayedTerm, LinearLoop
 
 MAX_COMMON_DELAY_S = 10.0
-"""Longest common delay that is searched, in s."""
+"""Longest common delay that is examined, in s."""
 _LISTED_INTERVALS = 3
 """Largest number of intervals that the description lists one by one."""
 _POINTS = 600
@@ -74,15 +74,15 @@ class _AxisCrossing(NamedTuple):
 
 
 class _DelayInterval(NamedTuple):
-    """Interval of network delays, the same on all links, for which a control loop is stable.
+    """Interval of network delays, equal on all links, for which a control loop is stable.
 
     A crossing is a delay at which a root of the loop reaches the imaginary axis.
 
     Attributes:
         low_s: Lower end, in s. 0 if the loop is stable without delay.
-        high_s: Upper end, in s. `MAX_COMMON_DELAY_S` if no root crosses before.
-        low: Crossing at the lower end. None if there is none.
-        high: Crossing at the upper end. None if there is none.
+        high_s: Upper end, in s. `MAX_COMMON_DELAY_S` if no root crosses at a smaller delay.
+        low: Crossing at the lower end. `None` if no root crosses there.
+        high: Crossing at the upper end. `None` if no root crosses there.
     """
 
     low_s: float
@@ -180,8 +180,8 @@ def find_delay_margin(loop: LinearLoop) -> DelayMargin:
 
     The delays that the loop itself contains are replaced by this common delay. The unstable
     characteristic roots are counted for a small delay, below the first delay at which roots
-    cross the imaginary axis. From there on, every crossing changes the count by the number of
-    roots that cross.
+    cross the imaginary axis. For larger delays, every crossing changes the count by the number
+    of roots that cross.
 
     Args:
         loop: Linear model of the coupled arms.
@@ -223,9 +223,9 @@ def find_delay_margin(loop: LinearLoop) -> DelayMargin:
 
 
 def _count_unstable_roots(loop: LinearLoop) -> int:
-    """Returns how many roots of the loop have a positive real part, so that motions grow.
+    """Returns the number of roots with a positive real part, which belong to growing motions.
 
-    More and more of the rightmost roots are computed, until one of them is stable.
+    An increasing number of the rightmost roots is computed, until one of them is stable.
     """
     requested_roots = 8
     while True:
@@ -317,7 +317,7 @@ class _FrequencySweep:
     """Eigenvalues of the open-loop frequency response G(j w) over the frequency w.
 
     `_find_axis_crossings` searches them for the frequencies at which a modulus is 1, because
-    the loop can become unstable only there.
+    the loop can become unstable only at these frequencies.
 
     Args:
         pencil: Matrices of the loop, with a single delay.
@@ -343,10 +343,11 @@ class _FrequencySweep:
     def build_grid(self) -> Array:
         """Returns the frequencies to evaluate, ascending, in rad/s.
 
-        They are evenly spaced on a logarithmic scale. Near the frequency of each oscillating
-        mode there are 13 more, within three times the decay rate of the mode, because sharp
-        resonances would fall between the others. Without decay, the response is infinite at the
-        frequency of the mode, and the points lie on both sides of this frequency.
+        The frequencies are evenly spaced on a logarithmic scale. Near the frequency of each
+        oscillating mode there are 13 more points, within three times the decay rate of the
+        mode, because sharp resonances would fall between the evenly spaced points. If a mode
+        does not decay, the response is infinite at its frequency, and the points lie on both
+        sides of this frequency.
         """
         lowest = _LOWEST * self._highest
         even = np.geomspace(lowest, self._highest, _POINTS)

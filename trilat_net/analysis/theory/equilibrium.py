@@ -1,11 +1,11 @@
 """Finds a pose in which all coupled arms and their parameter estimates are at rest.
 
 The linear stability analysis describes small motions about such a pose, an equilibrium. There
-are infinitely many, because any pose on which all arms agree may be an equilibrium. Therefore
-`find_equilibrium` computes the one nearest to a given pose, for example to the last pose of a
-run. `predict_equilibrium` computes the one that the arms reach from their start poses according
-to their linear model. A simulated run may supply a pose to start from, but the equilibrium
-itself is found by solving the equations.
+may be infinitely many equilibria, because any pose on which all arms agree may be an
+equilibrium. Therefore `find_equilibrium` computes the equilibrium nearest to a given pose, for
+example to the last pose of a run. `predict_equilibrium` computes the equilibrium that the arms
+reach from their start poses according to their linear model. A simulated run may supply a pose
+to start from, but the equilibrium itself is found by solving the equations.
 
 Invariant:
     - The result solves the equations to 1e-10, or a note states that it does not.
@@ -38,14 +38,15 @@ from .site_dynamics import (
 from .textbook_arm import SINGULAR
 
 MAX_PROLONGATION = 8.0
-"""Longest run that is simulated to find a rest, as a multiple of the duration of the run."""
+"""Longest run that is simulated to find a pose of rest, as a multiple of the original duration.
+"""
 _MAX_RUN_TICKS = 4_000_000
 """Length of the longest extended run, in ticks of all sites together."""
 
 MAX_EQUILIBRIUM_RESIDUAL = 1e-10
 """Largest residual of an equilibrium, in rad/s^2."""
 _NEWTON_RESIDUAL = 1e-11
-"""Residual at which the Gauss-Newton steps end, in rad/s^2: it is the rounding error."""
+"""Residual at which the Gauss-Newton steps end, in rad/s^2: the size of the rounding error."""
 _GAUSS_NEWTON_STEPS = 60
 """Largest number of Gauss-Newton steps."""
 _MAX_STEP = 0.3
@@ -57,15 +58,16 @@ _SETTLING_TICKS = 20_000
 _FLAT = 1e-8
 """Largest singular value that counts as zero, relative to the largest one.
 
-Its direction leads to further equilibria.
+A step along its direction leads to other equilibria.
 """
 
 
 def extend_scenario(scenario: Scenario, duration_s: float) -> Scenario:
     """Returns the same experiment with a longer duration, so that it can come to rest.
 
-    Nothing new begins in the additional time. Operators and environments that are present at
-    the original end stay. Chirps and multisines are removed, as they never rest.
+    Nothing new begins in the additional time. Operators and environments that act at the
+    original end keep acting. Chirps and multisines are removed, because they never come to
+    rest.
 
     Args:
         scenario: The description of the experiment.
@@ -74,9 +76,10 @@ def extend_scenario(scenario: Scenario, duration_s: float) -> Scenario:
     end_s = scenario.duration_s
 
     def extend_actors(actors: tuple[Any, ...]) -> tuple[Any, ...]:
-        """Adapts operators and walls to a longer run, in which the arms shall come to rest.
+        """Adapts operators and walls to a longer run in which the arms are to come to rest.
 
-        Those that never rest are left out, and springs of the original end stay for ever.
+        Operators that never rest are left out, and springs that act at the original end act
+        until the new end.
         """
         extended = []
         for actor in actors:
@@ -108,8 +111,9 @@ def extend_scenario(scenario: Scenario, duration_s: float) -> Scenario:
 def compute_equilibrium_residual(conditions: OperatingConditions, rest: Equilibrium) -> Array:
     """Computes how far a pose is from an equilibrium: the rates of the loop's states.
 
-    They are zero at an equilibrium. The rates of the angles are zero by definition, because all
-    arms are at rest. The others are the accelerations and the rates of the estimates.
+    All rates are zero at an equilibrium. The rates of the angles are zero by definition,
+    because all arms are at rest. The other rates are the accelerations and the rates of the
+    estimates.
 
     Args:
         conditions: The sites, gains and delays of the loop.
@@ -130,7 +134,7 @@ def _select_loop_states(conditions: OperatingConditions, states: Sequence[Array]
     """Joins the states of all sites to one vector, without states that never change.
 
     The states of a site that are not part of the linear loop are the parameters of a law that
-    learns nothing.
+    does not learn.
     """
     masks = linear_loop.mask_loop_states(conditions)
     pairs = zip(states, masks, strict=True)
@@ -141,9 +145,10 @@ def _select_loop_states(conditions: OperatingConditions, states: Sequence[Array]
 def _find_nearest_equilibrium(
     conditions: OperatingConditions, rest: Equilibrium
 ) -> Equilibrium:
-    """Finds the pose nearest to a given pose in which all arms rest.
+    """Finds the equilibrium, a pose in which all arms rest, that is nearest to a given pose.
 
-    Each Gauss-Newton step is the smallest step that solves the linearised equations of rest.
+    Each Gauss-Newton step is the smallest step that solves the linearised equilibrium
+    equations.
 
     Args:
         conditions: The sites (processes that each run one arm), gains and delays.
@@ -176,14 +181,14 @@ def _find_nearest_equilibrium(
                 break
             fraction *= 0.5
         else:
-            break  # no shorter step helps either
+            break  # shorter steps do not reduce the residual either
         rest = candidate
         residual = candidate_residual
     return rest._replace(residual=float(np.abs(residual).max()))
 
 
 def _limit_step(step: Array) -> float:
-    """Returns the factor by which an iteration step is reduced to change no state too much.
+    """Returns the factor that shortens an iteration step so that no state changes too much.
 
     The limit is `_MAX_STEP`. Longer steps would leave the region in which the linearisation is
     useful.
@@ -199,8 +204,8 @@ def _compute_gauss_newton_step(
 ) -> Array:
     """Returns the smallest step of the loop's states that solves the linearised equations.
 
-    Velocities stay zero. States that nothing moves stay too: an estimate without a gain, or at
-    a limit of its range. The shape is (states,).
+    Velocities stay zero. States that cannot change also stay constant, such as an estimate
+    without a gain or at a limit of its range. The shape is (states,).
     """
     loop = linear_loop.linearise_loop(conditions, rest, all_estimates=True)
     delayed_matrices = [term.A for term in loop.delayed]
@@ -226,7 +231,7 @@ def _shift_equilibrium(
     rest: Equilibrium,
     step: Array,
 ) -> Equilibrium:
-    """Returns the pose and estimates of a pose of rest after an iteration step of its search.
+    """Returns the pose and estimates after one iteration step in the search for a pose of rest.
 
     Velocities in the step are ignored, because all arms rest.
     """
@@ -274,7 +279,7 @@ def _refuse_singular_poses(conditions: OperatingConditions, rest: Equilibrium) -
         rest: The pose of rest.
 
     Raises:
-        ScenarioError: The pose of a site is singular, so that the loop has no derivative there.
+        ScenarioError: The pose of a site is singular, and the loop has no derivative there.
     """
     arguments = linear_loop.gather_site_arguments(conditions, rest)
     for site, x in zip(conditions.sites, arguments, strict=True):
@@ -309,8 +314,8 @@ def _predict_from_start(conditions: OperatingConditions, scenario: Scenario) -> 
     """
     q = pad_rows([spec.q0_rad for spec in scenario.sites.values()])
     start = Equilibrium(q, _complete_estimates(conditions), "", 0.0)
-    # far from the equilibrium, steps of a chain's ten estimates per link diverge; at the mean
-    # pose the estimates are true
+    # far from the equilibrium, steps of a chain's ten estimates per link diverge; the start is
+    # therefore the mean pose with true estimates
     layout = conditions.sites[0].layout
     first_guess = start
     if layout.chain and not layout.task:
@@ -361,7 +366,7 @@ def _project_on_zero_roots(loop: linear_loop.LinearLoop, deviation: Array) -> Ar
     """Returns the part of an initial deviation that never decays, shape (states,).
 
     This part belongs to the roots at zero. `_predict_from_start` has the equation. The result
-    is None if the loop has no roots at zero, or too few vectors for them.
+    is `None` if the loop has no roots at zero, or too few vectors for them.
     """
     left, values, right = np.linalg.svd(loop.static_matrix)
     is_zero = values <= _FLAT * values[0]
@@ -388,13 +393,13 @@ def _project_on_zero_roots(loop: linear_loop.LinearLoop, deviation: Array) -> Ar
 def find_equilibrium(scenario: Scenario, pose: tuple[float, ...] | None = None) -> Equilibrium:
     """Finds a pose in which all arms of a scenario rest, as a base for linear analysis.
 
-    It is the pose nearest to the end of a run, or a pose that the user gives.
+    The result is the pose nearest to the end of a run, or a pose that the user gives.
 
     Args:
         scenario: Description of the experiment.
         pose: Pose in which all arms rest: an angle per joint in rad, or in task space the pose
             of the end effectors. The estimates of the arm parameters are then assumed to be
-            true. None for the equilibrium at the end of a run.
+            true. If `None`, the equilibrium at the end of a run is used.
 
     Returns:
         The equilibrium, with remarks for the user.
@@ -427,7 +432,7 @@ def add_limit_notes(conditions: OperatingConditions, rest: Equilibrium) -> Equil
 def predict_equilibrium(scenario: Scenario) -> Equilibrium:
     """Predicts where the arms come to rest, by linear analysis without simulating the motion.
 
-    They begin in the start poses of the scenario.
+    The arms begin in the start poses of the scenario.
 
     Args:
         scenario: The description of the experiment.
@@ -443,8 +448,9 @@ def follow_equilibrium(scenario: Scenario, rest: Equilibrium) -> Equilibrium:
     """Finds the equilibrium of a scenario that is nearest to a known equilibrium.
 
     The known equilibrium belongs to a similar scenario, so that an equilibrium can be followed
-    while a setting, such as a gain, changes in small steps. If it is also an equilibrium of
-    this scenario, it is returned, and only missing parameter estimates are added.
+    while a setting, such as a gain, changes in small steps. If the known equilibrium is also an
+    equilibrium of this scenario, it is returned, and only missing parameter estimates are
+    added.
 
     Args:
         scenario: Description of the experiment.
@@ -465,7 +471,7 @@ def follow_equilibrium(scenario: Scenario, rest: Equilibrium) -> Equilibrium:
 
 
 def choose_equilibrium(scenario: Scenario) -> Equilibrium:
-    """Finds the pose in which the arms of a scenario come to rest, by the suitable method.
+    """Finds the pose in which the arms of a scenario come to rest, by a suitable method.
 
     If no control law estimates parameters, and no operator or environment acts, the arms can
     rest in any pose on which they agree. Then a linear model of the coupled arms predicts which
@@ -486,7 +492,7 @@ def choose_equilibrium(scenario: Scenario) -> Equilibrium:
         return find_equilibrium(scenario)
     if all(site.gains.law is Law.KNOWN for site in sites):
         return predict_equilibrium(scenario)
-    # an imported law need not compensate gravity, so that the prediction may fail
+    # an imported law need not compensate gravity, so the prediction may fail
     with suppress(ScenarioError):
         return predict_equilibrium(scenario)
     return find_equilibrium(scenario)
@@ -498,10 +504,10 @@ def _complete_estimates(
     """Returns the parameter estimates of all control laws in one array, padded with zeros.
 
     Args:
-        conditions: The numbers of the loop.
-        theta_hat: Known estimates, shape (N, P). None for the true parameters, and for an
-            imported law its initial memory. Laws that learn nothing have their assumed
-            parameters.
+        conditions: The gains, delays and weights of the loop.
+        theta_hat: Known estimates, shape (N, P). If `None`, the true parameters are used, or
+            for an imported law its initial memory. For laws that do not learn, the assumed
+            parameters are used.
     """
     rows = []
     for index, site in enumerate(conditions.sites):
@@ -534,11 +540,11 @@ def _iterate_memories(
 
 
 def settle_memories(conditions: OperatingConditions, state: Equilibrium) -> Equilibrium:
-    """Returns a state in which the memories of imported control laws suit its pose.
+    """Returns a state in which the memories of imported laws are consistent with its pose.
 
     The memory of an imported law, a law that a user wrote, takes the position of its estimate.
-    It starts with its initial values, and the law is called in the pose of the state until the
-    memory is constant. The estimates of other laws stay.
+    The memory starts with its initial values, and the law is called in the pose of the state
+    until the memory is constant. The estimates of other laws stay unchanged.
 
     Args:
         conditions: The sites, gains and delays of the loop.
@@ -588,7 +594,7 @@ def _build_at_pose(pose: tuple[float, ...], conditions: OperatingConditions) -> 
 
 
 def _describe_pose(coordinates: int, *, task: bool) -> str:
-    """Returns a phrase for an error message on the numbers of which a pose consists."""
+    """Returns a phrase for error messages that lists the numbers of a pose."""
     if task:
         rotation = " and a rotation vector in rad" if coordinates > 3 else ""
         return f"a position in m{rotation} of the end effectors"
@@ -600,8 +606,8 @@ def _describe_pose(coordinates: int, *, task: bool) -> str:
 def _reach_pose(site: SiteSetup, pose: Array) -> Array:
     """Returns joint angles for a desired pose of the end effector, in rad, shape (n,).
 
-    This is inverse kinematics: Gauss-Newton steps from the start pose find the nearest such
-    angles.
+    The inverse kinematics are solved by Gauss-Newton steps from the start pose, which find the
+    nearest solution.
 
     Args:
         site: Setup of a site that follows in task space.
@@ -654,8 +660,8 @@ def find_mean_pose(scenario: Scenario) -> tuple[float, ...]:
 def _find_at_run_end(scenario: Scenario, conditions: OperatingConditions) -> Equilibrium:
     """Finds the pose of rest nearest to the end of a simulated run.
 
-    The run is extended until the arms rest, up to `MAX_PROLONGATION` times its duration. If it
-    diverges, the pose is predicted from the start poses.
+    The run is extended until the arms rest, up to `MAX_PROLONGATION` times its duration. If the
+    run diverges, the pose is predicted from the start poses.
     """
     ticks = sum(map(scenario.ticks, scenario.names))
     affordable_extension = _MAX_RUN_TICKS / ticks
@@ -709,10 +715,11 @@ def _find_at_run_end(scenario: Scenario, conditions: OperatingConditions) -> Equ
 def _require_equilibrium(scenario: Scenario, rest: Equilibrium) -> Equilibrium:
     """Checks that the arms rest in a pose, and returns the pose.
 
-    The residual is the acceleration that remains there. At an equilibrium it is 0.
+    The residual is the largest acceleration that remains in the pose. At an equilibrium it is
+    0.
 
     Raises:
-        ScenarioError: The residual is too large, so that the pose is no equilibrium.
+        ScenarioError: The residual is too large, so the pose is not an equilibrium.
     """
     if not rest.residual <= MAX_EQUILIBRIUM_RESIDUAL:
         raise ScenarioError(
@@ -726,8 +733,8 @@ def _require_equilibrium(scenario: Scenario, rest: Equilibrium) -> Equilibrium:
 def _describe_limits(conditions: OperatingConditions, rest: Equilibrium) -> Iterator[str]:
     """Yields remarks for the user on effects that the linear loop leaves out.
 
-    They are a pose that is no equilibrium, damping near a singular pose, torques at their
-    limits, and points at which the model has different derivatives on both sides.
+    The remarks concern a pose that is not an equilibrium, damping near a singular pose, torques
+    at their limits, and points at which the model has different derivatives on both sides.
     """
     if rest.residual > MAX_EQUILIBRIUM_RESIDUAL:
         yield (

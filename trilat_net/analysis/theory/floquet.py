@@ -24,7 +24,7 @@ torque, and h the tick. Both schemes store a number eta with eta_{k+1} = eta_k +
 
 The law `sync` uses the estimate eta_k + h/2 f_k in either scheme.
 
-A control law that a user wrote may have a memory, the numbers m_k that it stores at tick k. The
+A control law that a user wrote may have a memory, the values m_k that it stores at tick k. The
 memory takes the place of eta, with the rate f_k = (m_k - m_{k-1}) / h.
 
 Invariant:
@@ -96,15 +96,16 @@ class _SiteTickMap(NamedTuple):
     """Linear model of one arm over one tick (control period): X' = P X + Q w.
 
     X contains the n states of the arm at a tick, and X' the states at the next tick. w contains
-    what the arm receives from the other arms.
+    the values that the arm receives from the other arms.
 
     Attributes:
         P: Effect of the states, shape (n, n). The states are the joint angles and velocities,
             the stored parameter estimates, and, for the scheme `second_order`, the torque of
             the previous tick.
         Q: Effect of the received values, shape (n, inputs).
-        output: Matrix that computes the values for the other sites from X, shape (3 m, n). They
-            are the pose, its velocity and the reflected torque, with m numbers each.
+        output: Matrix that computes the values for the other sites from X, shape (3 m, n).
+            These values are the pose, its velocity and the reflected torque, with m entries
+            each.
         names: Names of the states.
     """
 
@@ -148,10 +149,11 @@ def _linearise_site_tick(site: SiteSetup, jacobian: SiteJacobian) -> _SiteTickMa
     Phi, Gamma = _discretise_arm(jacobian, h_s)
 
     def compute_control(arguments: Array) -> Array:
-        """Returns what the controller adds to the state of a site during one tick.
+        """Returns the contribution of the controller to the state of a site during one tick.
 
-        Its torque moves the arm, and its parameter estimates change. The torque of this tick is
-        kept for the next tick if the integration scheme needs it. All quantities are linear.
+        The torque of the controller moves the arm, and its parameter estimates change. The
+        torque of this tick is kept for the next tick if the integration scheme needs it. All
+        quantities are linear.
 
         Args:
             arguments: States and inputs of the site, in the order of `ArgumentLayout`, shape
@@ -188,7 +190,7 @@ def _linearise_site_tick(site: SiteSetup, jacobian: SiteJacobian) -> _SiteTickMa
 def _discretise_arm(jacobian: SiteJacobian, h_s: float) -> tuple[Array, Array]:
     """Returns the matrices of an arm over a tick in which the torque is held.
 
-    The controller computes its torque once per tick, but the arm moves all the time. The free
+    The controller computes its torque once per tick, but the arm moves continuously. The free
     arm moves by its own dynamics, and by environments that act continuously.
 
     Args:
@@ -291,7 +293,7 @@ DRAWN_SPAN_S = 30.0
 _LEAST_SPAN_S = 0.5
 """Shortest analysed span, in s.
 
-Shorter periods, and periods shorter than twice the ages, are repeated.
+If the period is shorter than this, or shorter than twice the ages, it is repeated.
 """
 _PART_TICKS = 100
 """Ticks of the fastest site after which columns are scaled.
@@ -307,16 +309,16 @@ _RESIDUAL = 1e-9
 _LOOSE_RESIDUAL = 1e-4
 """Largest residual once the Krylov space has its largest dimension."""
 _SMALLEST = 1e-7
-"""Smallest multiplier that is searched, as a share of the largest."""
+"""Smallest multiplier that is considered, as a share of the largest."""
 _SAME_ROOT = 1e-6
 """Largest absolute or relative difference of roots that count as equal."""
 
 
 class SamplesInUse(NamedTuple):
-    """Which message of each other arm every arm uses, in every tick of a span of time.
+    """The messages that every arm uses from each other arm, in every tick of a span of time.
 
     A tick is one period of a control loop. A sample is the message with an arm's state in one
-    tick. At the beginning of the span, all arms have a tick.
+    tick. At the beginning of the span, the ticks of all arms coincide.
 
     Attributes:
         span_s: Length of the span, in s.
@@ -324,7 +326,7 @@ class SamplesInUse(NamedTuple):
             an entry for each tick of site i. The sample that site j sends at the beginning of
             the span has the number 0.
         period_s: Time after which the pattern of ticks and delays repeats, in s. The span
-            contains it a whole number of times. None if the pattern does not repeat.
+            contains it a whole number of times. `None` if the pattern does not repeat.
         is_exact: True if the pattern repeats exactly, False if it repeats to within half a tick
             or not at all.
     """
@@ -336,7 +338,7 @@ class SamplesInUse(NamedTuple):
 
 
 def find_samples_in_use(conditions: OperatingConditions) -> SamplesInUse:
-    """Finds which samples of the other sites each site uses, in every tick of a span of time.
+    """Finds the samples of the other sites that each site uses, in every tick of a time span.
 
     A sample is the state that a site sends in one tick (period of its control loop). The
     pattern of used samples repeats after some time, and the span consists of whole repetitions.
@@ -424,7 +426,7 @@ def _plan_parts(
     used: Mapping[tuple[int, int], IntArray],
     count: int,
 ) -> list[_SpanPart]:
-    """Plans in which order the ticks of all sites are computed, and where the span is divided.
+    """Plans the order in which the ticks of all sites are computed, and divides the span.
 
     A tick can be computed only after all samples that it uses. The plan collects as many
     consecutive ticks of a site as possible, because their effects are then computed together.
@@ -454,7 +456,7 @@ def _plan_parts(
         stops = [-(-total * n // count) for total in ticks]
         while done != stops:
             for i, stop in enumerate(stops):
-                # as far as the peers' samples suffice that have been computed so far
+                # as far as the samples of the peers that have been computed so far suffice
                 known_until = [computable[i, j][done[j]] for j in peers[i]]
                 until = min([stop, *known_until])
                 first = done[i]
@@ -466,7 +468,7 @@ def _plan_parts(
 
 
 class _PeerEffect(NamedTuple):
-    """Effect of one arm on another, and which of its messages the other uses at each tick.
+    """Effect of one arm on another, and the messages that the other arm uses at its ticks.
 
     A tick is a period of the control loop.
 
@@ -487,7 +489,8 @@ class _Tracks(NamedTuple):
     Each start state has its own column.
 
     Attributes:
-        states: States from the start of the span on, shape (1 + ticks, n_i, columns).
+        states: States after the start of the span, including the start, shape (1 + ticks, n_i,
+            columns).
         sent: Sent values of all ticks that are used, shape (past + 1 + ticks, r_i, columns).
             The first `past` rows are ticks before the start of the span.
     """
@@ -499,7 +502,7 @@ class _Tracks(NamedTuple):
 class _SpanMap:
     """The linear map of small motions from the start of a span of time to its end.
 
-    The sites act on each other by few numbers only. The sent values of a site are r_i
+    The sites act on each other through few quantities only. The sent values of a site are r_i
     combinations of its n_i states, from which the effects on all other sites follow. A column
     contains one motion: for each site, its sent values of the last ticks, as far back as a peer
     uses them, and then its present states. The matrix of the map would be very large, because
@@ -589,8 +592,8 @@ class _SpanMap:
     def build_constant_columns(self, X: Array) -> Array:
         """Returns columns of states for motions in which nothing has changed in the past.
 
-        Each column contains what all arms sent at their last ticks, as far back as it is used,
-        and their states.
+        Each column contains the values that all arms sent at their last ticks, as far back as
+        they are used, and the states of all arms.
 
         Args:
             X: The constant states, shape (n, columns), with the n states of all sites.
@@ -608,7 +611,7 @@ class _SpanMap:
     def divide_out_constant(self, V: Array) -> Array:
         """Removes motions that never change, such as a constant offset, from columns of states.
 
-        Their multipliers are exactly 1. Without them, the search finds the moving roots.
+        Their multipliers are exactly 1. After their removal, the search finds the other roots.
 
         Args:
             V: Columns, shape (size, columns).
@@ -672,7 +675,7 @@ class _SpanMap:
     ) -> tuple[Array, list[Array]]:
         """Computes how small motions of the arms develop over the analysed span of time.
 
-        If they grow over one span, they grow without limit, because the spans repeat.
+        Motions that grow over one span grow without limit, because the spans repeat.
 
         Args:
             V: Motions at the start of the span, shape (size, columns).
@@ -681,9 +684,9 @@ class _SpanMap:
             sizes: List to which the norm of each column after each part is appended.
 
         Returns:
-            The motions at the end of the span, shape (size, columns).
-            For each site i, its n_i states from the start of the span on, shape (ticks + 1,
-            n_i, columns).
+            The motions at the end of the span, shape (size, columns). For each site i, its n_i
+            states at the start of the span and at every tick after it, shape (ticks + 1, n_i,
+            columns).
         """
         tracks = self._build_tracks(V)
         for n, part in enumerate(self._parts):
@@ -704,18 +707,18 @@ class _SpanMap:
         return V, [site_tracks.states for site_tracks in tracks]
 
     def _send_present(self, tracks: Sequence[_Tracks], stops: Sequence[int]) -> None:
-        """Computes the sent values of the present states, after these were changed."""
+        """Recomputes the values that the arms send, after their present states were changed."""
         for site_tracks, sent, past, stop in zip(
             tracks, self._sent, self._past, stops, strict=True
         ):
             site_tracks.sent[past + stop] = sent @ site_tracks.states[stop]
 
     def _run_ticks(self, tracks: Sequence[_Tracks], run: _TickRun) -> None:
-        """Computes the states of one site over consecutive ticks, and what it sends.
+        """Computes the states of one site over consecutive ticks, and the values that it sends.
 
         The effects of the peers are known before the first of these ticks, so they are added
-        for all ticks at once. The site's own states follow tick by tick, since each depends on
-        the one before.
+        for all ticks at once. The site's own states are computed tick by tick, since each
+        depends on the previous state.
 
         Args:
             tracks: Motion of each site over the span, filled in up to the first tick.
@@ -748,9 +751,9 @@ def _find_multipliers(
 
     The method applies the map again and again, each time to the block of columns that the last
     application added, and keeps an orthonormal basis of all columns so far. The eigenvalues of
-    the small matrix H, which is the map in this basis, approach the largest multipliers. It
-    ends when all wanted multipliers are exact, when no new direction is found, or when the
-    basis is full.
+    the small matrix H, which is the map in this basis, approach the largest multipliers. The
+    method ends when all wanted multipliers are exact, when no new direction is found, or when
+    the basis is full.
 
     Args:
         span: The map.
@@ -830,7 +833,7 @@ def compute_sampled_spectrum(
     wanted: int = 6,
     uses: SamplesInUse | None = None,
 ) -> Spectrum | None:
-    """Computes the rightmost characteristic roots of coupled arms with controllers in ticks.
+    """Computes the rightmost characteristic roots of coupled arms with sampled controllers.
 
     A tick is one period of the control loop. A small motion is followed over a span of T
     seconds, after which the pattern of delays and ticks repeats. This gives a linear map of the
@@ -840,11 +843,11 @@ def compute_sampled_spectrum(
         conditions: The sites (processes that each run one arm), gains and delays.
         rest: The pose of rest about which the loop is linearised.
         wanted: Number of roots. Fewer result if the others are too close to -infinity.
-        uses: Which samples of the other sites each site uses. None to derive this from the
-            links.
+        uses: The samples of the other sites that each site uses. If `None`, they are derived
+            from the links.
 
     Returns:
-        The roots. None if a control law can be linearised in continuous time only.
+        The roots. `None` if a control law can be linearised in continuous time only.
     """
     if conditions.has_forms:
         return None
@@ -854,14 +857,14 @@ def compute_sampled_spectrum(
 class SampledLoop:
     """Linear model of coupled arms whose controllers act in ticks, for several poses of rest.
 
-    The modes about a first pose are a good start for the search of those about a second pose
-    nearby, which then takes half of the time.
+    The modes about a first pose are a good start for the search for the modes about a second
+    pose nearby, which then takes half of the time.
 
     Args:
         conditions: The sites (processes that each run one arm), gains and delays. All control
             laws can be linearised in ticks.
-        uses: Which samples of the other sites each site uses. None to derive this from the
-            links.
+        uses: The samples of the other sites that each site uses. If `None`, they are derived
+            from the links.
     """
 
     def __init__(
@@ -887,7 +890,7 @@ class SampledLoop:
         uses = self._uses
         span_s: float | None = uses.period_s or uses.span_s
         if uses.period_s is not None and uses.period_s * max(self._rates_hz) < 1.5:
-            # every tick is like the tick before
+            # every tick is like the previous tick
             span_s = None
 
         loop = couple_ticks(self._conditions, rest)
@@ -941,10 +944,12 @@ class SampledLoop:
 
         Args:
             pose: The pose about which the loop is linearised.
-            scale_per_s: The error is about a thousandth of this rate or less, in 1/s.
+            scale_per_s: Rate, in 1/s, that sets the accuracy: the error is at most about a
+                thousandth of this rate.
 
         Returns:
-            The real part, in 1/s. None if no root moves.
+            The real part of the rightmost root, in 1/s. `None` if all roots are zero by
+            structure.
         """
         loop = couple_ticks(self._conditions, pose)
         if not loop.names:
@@ -964,7 +969,7 @@ class SampledLoop:
 
 
 def _draw_start(span: _SpanMap, n: int) -> Array:
-    """Returns random start columns for the search of eigenvectors, equal in every run.
+    """Returns random start columns for the search for eigenvectors, equal in every run.
 
     A fixed seed makes results repeatable.
 
@@ -993,7 +998,8 @@ def _find_roots(
         span: The map.
         start: Columns from which the search of modes starts, shape (size, columns).
         span_s: Length of the span, in s.
-        wanted: Number of moving roots. Roots at zero are found in addition.
+        wanted: Number of roots that are not zero by structure. Roots at zero are found in
+            addition.
         largest_residual: Largest residual of a multiplier, relative to its modulus.
 
     Returns:
@@ -1042,8 +1048,8 @@ def _describe_modes(
 
     Args:
         s: Principal values of the roots, shape (K,), in 1/s.
-        tracks: States of each site from the start of the span on, with K columns of real parts
-            and then K of imaginary parts.
+        tracks: States of each site over the span, with K columns of real parts and then K
+            columns of imaginary parts.
         loop: The loop.
         rates_hz: Tick rate of each site.
     """
@@ -1084,7 +1090,7 @@ def _describe_modes(
 
 
 def _find_strongest_offset(velocity: Complex, principal: complex, hz: int) -> float:
-    """Returns how far the strongest frequency of a motion is from its principal root.
+    """Returns the distance from the principal root of a motion to its strongest frequency.
 
     The multiplier of a period determines a frequency only up to multiples of 2 pi / period. The
     strongest frequency selects one of them.
@@ -1105,13 +1111,13 @@ def _find_strongest_offset(velocity: Complex, principal: complex, hz: int) -> fl
 
 
 def _find_root(roots: Sequence[CharacteristicRoot], s: complex) -> int | None:
-    """Returns the index of the first known root that is equal to a new one, or None.
+    """Returns the index of the first known root that is equal to a new one, or `None`.
 
     A root is a complex growth rate of small motions. Equal roots must not be counted twice.
 
     Args:
         roots: The known roots.
-        s: A root, in 1/s. It may differ by `_SAME_ROOT`.
+        s: The new root, in 1/s. Roots that differ by at most `_SAME_ROOT` count as equal.
     """
     for index, known in enumerate(roots):
         if abs(known.s - s) <= _SAME_ROOT * (1.0 + abs(s)):

@@ -6,8 +6,8 @@ response changes by more than a tenth between two points, and around minima unti
 of each minimum lie less than 1 % above it.
 
 Invariant:
-    - Values on a grid are evidence but no proof: features that are narrower than the steps of
-      the grid stay hidden.
+    - Values on a grid are evidence but not a proof: features that are narrower than the steps
+      of the grid stay hidden.
 """
 
 from collections.abc import Callable
@@ -45,7 +45,7 @@ _SETTLED = 0.01
 
 
 class FrequencyBand(NamedTuple):
-    """A range of frequencies, in Hz, for example that in which a system is not passive."""
+    """A range of frequencies, in Hz, for example the range in which a system is not passive."""
 
     from_hz: float
     to_hz: float
@@ -134,10 +134,10 @@ def find_resolved_hz(low_hz: float, high_hz: float, delay_s: float) -> float:
 
 
 def refine_frequencies(response: PortResponse, w_rad_s: Array) -> Array:
-    """Adds frequencies until a response changes little from one to the next.
+    """Adds frequencies until a response changes little from one frequency to the next.
 
-    The change is at most a tenth. The number of points is limited. At a pole on the imaginary
-    axis, refinement stops when two points differ by a millionth.
+    The relative change is at most a tenth. The number of points is limited. At a pole on the
+    imaginary axis, refinement stops when two points differ by a millionth.
 
     Args:
         response: The response as a function of frequency.
@@ -150,7 +150,7 @@ def refine_frequencies(response: PortResponse, w_rad_s: Array) -> Array:
     def find_large_changes(Y: Complex) -> NDArray[np.bool_]:
         """Marks neighbouring frequencies between which the response changes too much.
 
-        These steps of the grid are then divided.
+        These steps of the grid are then halved.
         """
         size = np.linalg.norm(Y, axis=(1, 2))
         larger_size = np.maximum(size[1:], size[:-1])
@@ -207,7 +207,8 @@ def cache_response(response: PortResponse, w_rad_s: Array) -> PortResponse:
     """Returns a frequency response with its values at given frequencies stored.
 
     Several analyses evaluate the response at the same frequencies, and the values are then
-    computed only once. They are used whenever the function is called with this very array.
+    computed only once. The stored values are returned whenever the function is called with this
+    very array.
 
     Args:
         response: The function of frequency.
@@ -237,7 +238,7 @@ def find_minima(
         level: Value of the curve below which bands of frequencies are reported.
         tolerance: Function that returns the rounding error of the curve at given frequencies.
             Smaller differences from the level, or between neighbouring values, are ignored.
-            None if there is no rounding error.
+            `None` if there is no rounding error.
 
     Returns:
         The frequencies and values, and the bands in which the curve is below the level.
@@ -283,7 +284,7 @@ def _find_steps_at_minima(curve_and_rounding: Array) -> NDArray[np.bool_]:
     settled_rise = _SETTLED * size
     limit = np.maximum(settled_rise, rounding[1:-1])
     is_coarse = is_minimum & (rise > limit)
-    # the steps on both sides of such a point; the ends of the grid are no minima
+    # the steps on both sides of such a point; the ends of the grid are not minima
     at_points = np.concatenate([[False], is_coarse, [False]])
     steps: NDArray[np.bool_] = at_points[1:] | at_points[:-1]
     return steps

@@ -52,7 +52,9 @@ DEFAULT_ROOTS = 6
 MAX_ROOTS = 60
 """Largest number of roots that can be requested."""
 SAMPLED_ROOT_DIFFERENCE = 0.01
-"""Largest difference of a continuous and a sampled root that is ignored, relative to abs(s)."""
+"""Largest difference between a continuous and a sampled root that is ignored, relative to
+abs(s).
+"""
 
 
 @dataclass(frozen=True, repr=False)
@@ -64,21 +66,21 @@ class LinearAnalysis(Result):
 
     Attributes:
         scenario: The description of the experiment.
-        conditions: The numbers from which the loop is built: dominance factors, delays,
-            operators and environments in force.
+        conditions: The data from which the loop is built: dominance factors, delays, operators
+            and environments in force.
         rest: The equilibrium about which the loop is linearised.
         loop: The loop linearised at the equilibrium.
         continuous: Characteristic roots of the continuous loop, a delay-differential equation.
-        sampled: Characteristic roots of the loop with its ticks. None if a law can be
+        sampled: Characteristic roots of the loop with its ticks. `None` if a law can be
             linearised in continuous time only.
         margin: The delays, common to all links, for which the continuous loop is stable.
         scans: For each requested key of the scenario, the values at which the loop becomes
             stable or unstable.
-        ports: Analysis of the joints at which operators act, the haptic ports. None if it was
+        ports: Analysis of the joints at which operators act, the haptic ports. `None` if it was
             not requested.
         distance_rad: Largest difference between the last angle of a joint in the run and its
-            angle at the equilibrium, in rad. None if the equilibrium was not sought next to the
-            end of a run.
+            angle at the equilibrium, in rad. `None` if the equilibrium was not sought next to
+            the end of a run.
     """
 
     scenario: Scenario
@@ -108,14 +110,15 @@ class LinearAnalysis(Result):
     def decisive(self) -> Spectrum:
         """The characteristic roots on which the verdict about stability is based.
 
-        They belong to the sampled loop, whose controllers compute once per tick. If a control
-        law can be linearised in continuous time only, they belong to the continuous loop.
+        These roots belong to the sampled loop, whose controllers compute once per tick. If a
+        control law can be linearised in continuous time only, the roots belong to the
+        continuous loop.
         """
         return self.continuous if self.sampled is None else self.sampled
 
     @property
     def verdict(self) -> str:
-        """Whether small motions of the arms die away: "stable", "unstable" or "at the edge".
+        """The verdict on small motions of the arms: "stable", "unstable" or "at the edge".
 
         The roots in `decisive` determine the verdict.
         """
@@ -134,14 +137,14 @@ class LinearAnalysis(Result):
     def notes(self) -> tuple[str, ...]:
         """Remarks for the user that qualify the verdict of the linear analysis.
 
-        They concern the analysed conditions (such as delays and operators), the pose of rest
-        about which the arms are linearised, and the characteristic roots.
+        The remarks concern the analysed conditions (such as delays and operators), the pose of
+        rest about which the arms are linearised, and the characteristic roots.
         """
         notes = [*self.conditions.notes, *self.rest.notes]
         if self.is_far_from_rest:
             notes.append(
                 f"the run of {self.scenario.duration_s:g} s ends {self.distance_rad:.3g} rad "
-                "away from this rest: the verdict does not say whether it gets there"
+                "away from this rest: the verdict does not say whether the run would reach it"
             )
         if self.sampled is not None and self.sampled.verdict != self.continuous.verdict:
             decides = "ticks and delays decide"
@@ -172,7 +175,7 @@ class LinearAnalysis(Result):
     def to_dict(self) -> dict[str, Any]:
         """Converts the analysis to plain values, as `trilat linear --json` prints them.
 
-        Parts that were not requested, or that do not exist for this loop, are None or empty.
+        Parts that were not requested, or that do not exist for this loop, are `None` or empty.
         """
         sampled = None
         if self.sampled is not None:
@@ -205,7 +208,7 @@ class LinearAnalysis(Result):
         theta_hat = {}
         for n, site in enumerate(self.conditions.sites):
             q[site.name] = rest.q[n][: site.layout.joints].tolist()
-            # the memory of an imported law is no estimate
+            # the memory of an imported law is not an estimate
             is_imported = isinstance(site.law_factory, NumericLaw)
             parameters = 0 if is_imported else site.layout.parameters
             theta_hat[site.name] = rest.theta_hat[n][:parameters].tolist()
@@ -253,14 +256,14 @@ class LinearAnalysis(Result):
     def find_sampled_root(self, root: CharacteristicRoot) -> CharacteristicRoot | None:
         """Finds the root of the sampled loop that corresponds to a root of the continuous loop.
 
-        It is the nearest one. It is worth showing only if both differ.
+        The nearest root is taken. It is worth showing only if the two roots differ.
 
         Args:
             root: A root of the continuous loop.
 
         Returns:
-            The sampled root. None if both differ by less than 1 %, or if there is no sampled
-            root.
+            The sampled root. `None` if the two roots differ by less than 1 %, or if there is no
+            sampled root.
         """
         if self.sampled is None or not self.sampled.roots:
             return None
@@ -276,10 +279,10 @@ class _AnalysedLoop(NamedTuple):
 
     Attributes:
         scenario: The scenario.
-        conditions: The numbers from which the loop is built.
+        conditions: The data from which the loop is built.
         rest: The equilibrium.
-        uses: The samples in use in every tick. None if the scenario determines them.
-        distance_rad: Distance of the end of the run from the equilibrium, in rad. None if the
+        uses: The samples in use in every tick. `None` if the scenario determines them.
+        distance_rad: Distance of the end of the run from the equilibrium, in rad. `None` if the
             equilibrium was not sought next to the end of a run.
     """
 
@@ -294,11 +297,11 @@ def _find_end_loop(scenario: Scenario, log: Log | None) -> _AnalysedLoop:
     """Finds the control loop at the end of a run, which the linear analysis examines.
 
     A stability certificate states the roots of the same loop. If the arms have no equilibrium
-    near the end, that of a longer run or a prediction is used.
+    near the end, the equilibrium of a longer run or a prediction is used.
 
     Args:
         scenario: The scenario of the run.
-        log: The log of the run. None to simulate the run.
+        log: The log of the run. `None` to simulate the run.
     """
     conditions = OperatingConditions.derive(scenario)
     try:
@@ -315,7 +318,7 @@ def _find_end_loop(scenario: Scenario, log: Log | None) -> _AnalysedLoop:
     if not end.has_mean_ages:
         conditions = end.conditions
     else:
-        # The remarks on delays that vary stay, although the loop has only their means.
+        # The remarks on varying delays are kept, although the loop contains only their means.
         conditions = conditions._replace(age_s=end.conditions.age_s)
     rest = add_limit_notes(conditions, end.rest)
     return _AnalysedLoop(scenario, conditions, rest, end.uses, end.distance_rad)
@@ -339,12 +342,13 @@ def analyse_linear_loop(
     Args:
         source: A scenario (description of an experiment), its file, the name of a shipped
             scenario, or the log of a run.
-        overrides: Settings of the scenario that are replaced. A log then counts only as its
-            scenario.
-        pose: Pose of rest that all arms share, in rad. None for the pose at the end of a run.
+        overrides: Settings of the scenario that are replaced. If there are any, only the
+            scenario of a log is used, and not its records.
+        pose: Pose of rest that all arms share, in rad. If `None`, the pose at the end of a run
+            is used.
         roots: Number of characteristic roots to compute.
-        over: Ranges of settings in which to search the values where stability changes, such as
-            "control.d=0.1:3".
+        over: Ranges of settings in which to search for the values at which stability changes,
+            such as "control.d=0.1:3".
         ports: True to analyse also what operators feel when they hold an arm.
         hands: Measured impedances of operators. Any of them may hold the arm of any master.
 
@@ -354,7 +358,7 @@ def analyse_linear_loop(
     """
     ranges = [parse_edge_range(text) for text in over]
     if not 1 <= roots <= MAX_ROOTS:
-        raise UsageError(f"--roots is a number of roots, 1 to {MAX_ROOTS}, not {roots}")
+        raise UsageError(f"--roots must be from 1 to {MAX_ROOTS}, not {roots}")
 
     scenario = load_scenario(source, overrides)
     if pose is None:

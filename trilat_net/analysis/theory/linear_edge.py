@@ -3,14 +3,14 @@
 For example, an edge of the damping gain of a slave is the gain at which its oscillations
 neither grow nor decay. The setting is a number of the scenario (the description of an
 experiment), named by its key. The growth rate of small motions is the real part of the
-rightmost characteristic root of the linearised control loop, and the loop is unstable if it is
-positive. It is evaluated for some values of the setting. Between two values with different
-signs, Brent's method finds its zero, the edge.
+rightmost characteristic root of the linearised control loop, and the loop is unstable if this
+rate is positive. The rate is evaluated for some values of the setting. Between two values at
+which the rate has different signs, Brent's method finds the zero of the rate, the edge.
 
 The sampled loop, whose controllers compute once per tick (period of the control loop), is
-analysed if the tick matters. This is so for the integration scheme `digital` (zero-order hold,
-as in a plain digital controller), and for walls or operators that act once per tick. Otherwise
-the continuous loop is analysed.
+analysed if the tick matters. This is the case for the integration scheme `digital` (zero-order
+hold, as in a plain digital controller), and for walls or operators that act once per tick.
+Otherwise the continuous loop is analysed.
 
 Invariant:
     - The equilibrium, the pose of rest about which the arms are linearised, is determined once.
@@ -51,16 +51,16 @@ _LOGARITHMIC = 20.0
 A larger range is scanned in equal steps of the logarithm.
 """
 _LEAST_PER_S = -1e3
-"""Least growth rate in Brent's method, in 1/s, which replaces -infinity if nothing moves."""
+"""Smallest growth rate in Brent's method, in 1/s, which replaces -infinity if nothing moves."""
 _INTEGER_KEYS = ("rate_hz", "seed")
 
 ASSUMED_EQUILIBRIUM_REMARK = (
-    "the linear analysis of a law that learns is about the mean start pose, with true "
-    "estimates: the equilibrium of a run depends on its whole history"
+    "for a law that learns, the linear analysis is about the mean start pose with true "
+    "estimates, because the equilibrium of a run depends on its whole history"
 )
 MEAN_POSE_REMARK = (
-    "about the rest that is nearest to the mean start pose: where estimates, operators and "
-    "walls move the arms to, only a run shows"
+    "the linear analysis is about the pose of rest nearest to the mean start pose: only a run "
+    "shows where estimates, operators and walls move the arms"
 )
 
 
@@ -73,16 +73,17 @@ def find_rightmost_root(
 ) -> CharacteristicRoot | None:
     """Returns the fastest growing (rightmost) root of the control loop about a pose of rest.
 
-    Its real part is the growth rate of small motions. If it is negative, they die away.
+    The real part of this root is the growth rate of small motions. If the rate is negative, the
+    motions die away.
 
     Args:
-        conditions: The numbers of the loop.
+        conditions: The gains, delays and weights of the loop.
         rest: The equilibrium.
-        sampled: True to analyse the sampled loop. The continuous loop is analysed all the same
-            if a law can be linearised in continuous time only.
+        sampled: True to analyse the sampled loop. If a law can be linearised in continuous time
+            only, the continuous loop is analysed nevertheless.
 
     Returns:
-        The root. None if all roots are zero.
+        The root. `None` if all roots are zero.
     """
     spectrum = compute_sampled_spectrum(conditions, rest, 1) if sampled else None
     if spectrum is None:
@@ -93,8 +94,8 @@ def find_rightmost_root(
 def find_deepest_contact(scenario: Scenario, q: Array) -> int | None:
     """Finds the state of a run in which an end effector has penetrated a wall most deeply.
 
-    The linear analysis then includes the stiffness of the wall. Only sampled walls count, which
-    compute their force once per tick (period of the control loop).
+    The linear analysis then includes the stiffness of the wall. Only sampled walls are
+    considered, which compute their force once per tick (period of the control loop).
 
     Args:
         scenario: Description of the experiment.
@@ -102,7 +103,7 @@ def find_deepest_contact(scenario: Scenario, q: Array) -> int | None:
             in rad.
 
     Returns:
-        Index of the state. None if no wall is touched.
+        Index of the state. `None` if no wall is touched.
     """
     depth_m = np.full(len(q), -np.inf)
     for site_index, name in enumerate(scenario.names):
@@ -124,8 +125,8 @@ def find_contact_growth(scenario: Scenario, q: Array, theta_hat: Array) -> float
 
     Only sampled walls are considered, which compute their force once per tick (period of the
     control loop). The arms are linearised at the equilibrium nearest to the state of a run that
-    is deepest in a wall. The mean of the states would not do: an arm that chatters leaves the
-    wall again and again.
+    is deepest in a wall. The mean of the states is not suitable, because an arm that chatters
+    leaves the wall again and again.
 
     Args:
         scenario: Description of the experiment.
@@ -174,7 +175,7 @@ class LinearEdge(NamedTuple):
 class EdgeScan(NamedTuple):
     """Values of one setting, within a range, at which coupled arms become stable or unstable.
 
-    Without such a value, the arms are stable in the whole range, or unstable.
+    Without such a value, the arms are either stable or unstable in the whole range.
 
     Attributes:
         key: Key of the scenario, such as "control.d".
@@ -190,7 +191,7 @@ class EdgeScan(NamedTuple):
 
 
 def parse_edge_range(text: str) -> tuple[str, float, float]:
-    """Parses the setting and the range of values in which a stability limit is searched.
+    """Parses a setting and the range of values in which to search for a stability limit.
 
     Args:
         text: The text, for example "control.d=0.1:3".
@@ -227,10 +228,11 @@ def iterate_linear_edges(
         key: Key of the scenario, such as "control.d".
         low: Lower end of the range.
         high: Upper end of the range.
-        rest: Equilibrium of the scenario, if known. It is followed along the key.
+        rest: Equilibrium of the scenario, if known. The equilibrium is tracked as the key
+            varies.
         points: Number of values that the scan evaluates.
         sampled: True to analyse the loop with its ticks, False to analyse the continuous loop.
-            None to choose as the module's docstring says.
+            `None` to choose as the module's docstring says.
 
     Raises:
         ScenarioError: A value is not valid for that key, or the scenario has no linear loop.
@@ -274,8 +276,7 @@ class _GrowthPoint(NamedTuple):
     def is_unstable(self) -> bool:
         """True if small motions of the arms grow at this value of the setting.
 
-        The limit of stability lies between two neighbouring values of which only one is
-        unstable.
+        The limit of stability lies between a stable and an unstable neighbouring value.
         """
         return self.growth_per_s > 0.0
 
@@ -289,7 +290,7 @@ class _GrowthRate:
     Args:
         scenario: The experiment.
         key: Key of the scenario.
-        rest: Equilibrium of the scenario. None to determine it.
+        rest: Equilibrium of the scenario. `None` to determine it.
         sampled: Whether to analyse the sampled loop, see `iterate_linear_edges`.
 
     Attributes:
@@ -384,9 +385,9 @@ class GrowthColumn(NamedTuple):
             -infinity if nothing moves.
         edges: Values at which stability changes. The key n means that the change lies between
             the values n and n + 1.
-        remarks: Remarks for the user on the analysis, each once.
-        is_sampled: True if a root is that of a Floquet multiplier of the loop with its ticks,
-            False if the loops were analysed in continuous time.
+        remarks: Remarks for the user on the analysis, without repetition.
+        is_sampled: True if the roots follow from Floquet multipliers of the loop with its
+            ticks, False if the loops were analysed in continuous time.
     """
 
     growth_per_s: list[float]
@@ -406,20 +407,19 @@ class GrowthColumn(NamedTuple):
         """Computes how the growth of small motions depends on one setting of a scenario.
 
         For each value of the setting, the coupled arms are linearised about a pose of rest.
-        This pose is followed from one value to the next. Between two neighbouring values of
-        which exactly one gives an unstable loop, the value at which stability changes is
-        searched.
+        This pose is tracked from one value to the next. Between a stable and an unstable
+        neighbouring value, the value at which stability changes is located.
 
         Args:
             scenarios: The experiments, which differ in the setting only, by its rising value.
             key: Name of the setting, such as "control.d".
             values: Values of the setting, one per scenario.
             at_mean_pose: True to linearise each scenario about the rest that is nearest to the
-                mean of its start poses, with true estimates. No run is simulated then.
+                mean of its start poses, with true estimates. No run is simulated in this case.
 
         Returns:
-            The growth rates, and the values at which stability changes. A value of change is
-            missing if the setting does not allow the numbers that the search needs.
+            The growth rates, and the values at which stability changes. Such a value is missing
+            if the setting does not permit the values that the search needs.
         """
         rest: Equilibrium | None = None
         column = GrowthColumn([], {}, [])
@@ -490,11 +490,11 @@ def _assume_equilibrium(
     """Returns an equilibrium of a scenario, without a simulation if possible.
 
     Adaptive sites without operators and environments have the mean start pose as their
-    equilibrium. Otherwise it is the equilibrium next to the previous one.
+    equilibrium. Otherwise the equilibrium nearest to the previous one is found.
 
     Args:
         scenario: The experiment.
-        previous: Equilibrium of a similar scenario, or None.
+        previous: Equilibrium of a similar scenario, or `None`.
 
     Returns:
         The equilibrium.
@@ -518,8 +518,8 @@ def _find_mean_equilibrium(scenario: Scenario) -> tuple[Equilibrium, str]:
         scenario: The experiment.
 
     Returns:
-        The equilibrium.
-        A remark on the assumption. Empty if all arms and nothing else decide where they rest.
+        The equilibrium. A remark on the assumption. Empty if the pose of rest depends on the
+        arms alone.
     """
     mean = find_equilibrium(scenario, find_mean_pose(scenario))
     rest = follow_equilibrium(scenario, mean)

@@ -44,11 +44,11 @@ class SiteJacobian(NamedTuple):
     """Linear model of one site (a process that runs one arm) about a pose of rest.
 
     It contains the derivatives of the site's rates of change with respect to its states and to
-    what it receives from the other sites. States that no small motion changes or shows are left
-    out.
+    the values that it receives from the other sites. States that small motions do not change,
+    or that have no effect on the motion, are left out.
 
     Attributes:
-        layout: Which column of the derivatives belongs to which quantity. There are no columns
+        layout: Assignment of the columns of the derivatives to quantities. There are no columns
             for parameter estimates if the control law estimates nothing.
         rates: The derivatives of accelerations, estimates, torques and sent values.
         states: Names of the states, such as "q1", "qd2" and "theta4" (parameter estimate).
@@ -63,10 +63,10 @@ class SiteJacobian(NamedTuple):
 
     @property
     def output(self) -> Array:
-        """Matrix from the states of an arm to the numbers that the arm sends to the others.
+        """Matrix from the states of an arm to the values that the arm sends to the others.
 
-        The numbers are its pose, the velocity of this pose, and the external torque, m of each.
-        The matrix has the shape (3 m, states).
+        The values are its pose, the velocity of this pose, and the external torque, with m
+        entries each. The matrix has the shape (3 m, states).
         """
         rates = self.rates
         samples = np.vstack([rates.x, rates.xd, rates.reflected])
@@ -106,10 +106,10 @@ class LinearLoop(NamedTuple):
         B: Matrix of the inputs, shape (n, m).
         C: Matrix of the outputs, shape (p, n).
         delayed: One entry per distinct delay above zero, by rising delay.
-        omitted_states: Number of states that no small motion changes or shows, each with a root
-            at zero.
+        omitted_states: Number of states that were left out because small motions do not change
+            them or do not depend on them. Each has a root at zero.
         E: Diagonal of the matrix E in E x' = A x + ..., shape (n,): 1 for a state with a rate,
-            0 for a state that an algebraic equation determines, such as a wave. None if every
+            0 for a state that an algebraic equation determines, such as a wave. `None` if every
             state has a rate.
     """
 
@@ -157,9 +157,9 @@ def join_diagonal_blocks(blocks: Sequence[Array]) -> Array:
 def gather_site_arguments(conditions: OperatingConditions, rest: Equilibrium) -> list[Array]:
     """Collects the states and inputs of each site when all arms are at rest.
 
-    The states are joint angles, joint velocities and parameter estimates. The inputs are what a
-    site (process that runs one arm) receives from the other sites, and the external torque.
-    `ArgumentLayout` describes their order.
+    The states are joint angles, joint velocities and parameter estimates. The inputs are the
+    values that a site (process that runs one arm) receives from the other sites, and the
+    external torque. `ArgumentLayout` describes their order.
 
     Args:
         conditions: The sites, gains and delays of the coupled arms.
@@ -220,9 +220,10 @@ def compute_shared_poses(conditions: OperatingConditions, rest: Equilibrium) -> 
 
 
 def compute_references(conditions: OperatingConditions, rest: Equilibrium) -> list[Array]:
-    """Computes the pose that the control law of each arm tries to reach at rest.
+    """Computes the pose at rest that the control law of each arm tries to reach.
 
-    It is the mean of the other arms' poses, weighted with the dominance factors.
+    This pose, the reference, is the mean of the other arms' poses, weighted with the dominance
+    factors.
 
     Args:
         conditions: The sites, gains and delays of the loop.
@@ -289,7 +290,7 @@ def compute_couplings(
     rest: Equilibrium,
     sites: list[SiteJacobian],
 ) -> dict[tuple[int, int], Array]:
-    """Computes how what each site sends acts on the inputs of the sites that receive it.
+    """Computes how the values that each site sends act on the inputs of the other sites.
 
     A site (process that runs one arm) sends its pose, its velocity and its reflected torque,
     with m numbers each. A receiver weights them with its dominance factors (weights with which
@@ -298,7 +299,7 @@ def compute_couplings(
     Args:
         conditions: The sites, gains and delays of the coupled arms.
         rest: The pose of rest about which the arms are linearised.
-        sites: Linear model of each site, without the others.
+        sites: Linear model of each site by itself, without the other sites.
 
     Returns:
         For each pair (i, j), the effect of the values that site j sends on the inputs of site
@@ -320,7 +321,7 @@ def compute_couplings(
             samples = np.zeros((layout.peers, length, length))
             # tau_x in a sample is the torque of the arm, and not the torque ON the arm
             signs = np.repeat([1.0, 1.0, -1.0], m)
-            # the site itself is not among its peers
+            # a site is not among its own peers
             peer_index = j - 1 if j > i else j
             samples[peer_index] = np.diag(signs)
             coupling = np.vstack([coupling, *samples])
@@ -357,7 +358,7 @@ def differentiate_rates(
     *,
     all_estimates: bool = False,
 ) -> list[SiteJacobian]:
-    """Builds the linear model of each site about a pose of rest, without the other sites.
+    """Builds the linear model of each site by itself about a pose of rest.
 
     A site is a process that runs one arm. The model contains the derivatives of its rates of
     change with respect to its own states and to its inputs.
@@ -408,7 +409,7 @@ def _select_states(
     *,
     all_estimates: bool,
 ) -> SiteJacobian:
-    """Returns derivatives of an arm's motion with respect to the states that the model has.
+    """Returns the derivatives of an arm's motion with respect to the states of the model.
 
     Of the parameter estimates of a chain, only independent combinations that change the torque
     at rest are kept, see the module's docstring.
@@ -467,7 +468,7 @@ def _replace_estimate(
     estimate = layout.estimate
 
     def convert(derivative: Array) -> Array:
-        """Converts a derivative with respect to the estimates to one by the new states z."""
+        """Converts a derivative with respect to the estimates to one with respect to z."""
         motion = derivative[:, : estimate.start]
         by_estimate = derivative[:, estimate]
         by_z = by_estimate @ estimate_by_z
@@ -619,14 +620,14 @@ def _add_law_forms(
 ) -> LinearLoop:
     """Adds control laws that gains do not fully describe to a linear model of the arms.
 
-    These laws may store numbers of their own, or send signals of their own, such as waves. They
+    These laws may have additional states, or send additional signals, such as waves. Such laws
     state their linear equations as a `LinearForm`. A sent signal becomes a state without a rate
     of change: an algebraic equation determines it, and the receiver reacts to its delayed
     value.
 
     Args:
         conditions: The sites (processes that each run one arm), gains and delays.
-        sites: Linear model of each site, without the others.
+        sites: Linear model of each site by itself, without the other sites.
         loop: Linear model of the coupled arms without the additional equations.
 
     Returns:
@@ -659,7 +660,7 @@ def _add_law_forms(
         if form is not None:
             _add_form(conditions, sites, blocks=blocks, i=i, form=form, terms=terms)
 
-    # some laws send accelerations, which are complete only now
+    # some laws send accelerations, which are complete only at this point
     E = np.ones(state_count)
     undelayed_A, _ = terms[0.0]
     for i, form in enumerate(forms):
@@ -706,8 +707,8 @@ def _index_form_states(
     adds its own states, and one state for each signal that it sends to a peer.
 
     Args:
-        conditions: The numbers of the loop.
-        forms: Linear form of each site's law. None for a law without such a form.
+        conditions: The gains, delays and weights of the loop.
+        forms: Linear form of each site's law. `None` for a law without such a form.
         loop: The loop without these states.
 
     Returns:
@@ -749,7 +750,7 @@ def _add_form(
     """Adds the linear equations of one arm's control law to the matrices of the whole loop.
 
     Args:
-        conditions: The numbers of the loop.
+        conditions: The gains, delays and weights of the loop.
         sites: Derivatives of each site's rates.
         blocks: Positions of the states of all signals.
         i: Index of the site.
@@ -765,7 +766,7 @@ def _add_form(
         """Returns the matrix through which delayed states of all arms act on the loop.
 
         The delay is the age of the samples (sent states) of site j when site i uses them. If no
-        matrix for this delay exists, one with zeros is added.
+        matrix for this delay exists, a zero matrix is added.
 
         Args:
             j: Index of the site that sends the samples.

@@ -1,4 +1,4 @@
-"""Computes the characteristic roots of the control loop at the end of a run, for every command.
+"""Computes the characteristic roots of the control loop at the end of a run, for all commands.
 
 If all roots have a negative real part, small motions about the last pose of the run die away.
 The control loop of the coupled arms may change during a run, by planned changes or commands.
@@ -13,13 +13,14 @@ of the records.
 Invariant:
     - Roots are called exact only if every delay is constant or repeats after the analysed
       period, if the loop is analysed with its ticks (the periods of its controllers), and if
-      their rightmost one has the same sign at the last pose and at the rest next to it.
-    - A command that leaves a link or a dominance factor as it was changes nothing.
-    - The code of imported control laws is executed only with permission. Without it, such a
-      loop has no roots.
-    - With permission, unstable roots count as exact and stable ones do not: the law may contain
-      thresholds that its derivative at the pose does not show. The same holds for sampled
-      walls, which may oscillate although the rest beside them is stable.
+      the rightmost root has the same sign at the last pose and at the nearest pose of rest.
+    - A command that sets a link or a dominance factor to its present value counts as no change.
+    - The code of imported control laws is executed only with permission. Without permission, no
+      roots are computed for such a loop.
+    - With permission, unstable roots count as exact and stable ones do not, because the law may
+      contain thresholds that its derivative at the pose does not show. The same rule applies to
+      sampled walls, because an arm may oscillate at a wall although the pose of rest next to
+      the wall is stable.
 """
 
 import math
@@ -51,9 +52,11 @@ from .linear_loop import linearise_loop
 from .operating_point import Equilibrium, OperatingConditions
 
 _SAME_POSE_RAD = 1e-6
-"""Poses that differ by less have the same roots, in rad."""
+"""Poses that differ by less than this, in rad, are assumed to have the same roots."""
 _ZERO_SHARE = 0.1
-"""A root at the last pose counts as zero below this share of the rightmost root at the rest."""
+"""Share of the rightmost root at the pose of rest below which a root at the last pose counts as
+zero.
+"""
 _ROOTS = 2
 """Number of rightmost roots that are computed at the end of a run."""
 _BATCH_RECORDS = 4096
@@ -68,18 +71,18 @@ class _EndLoop(NamedTuple):
     Attributes:
         scenario: The scenario up to the end of the run. Delays that only the run shows are
             replaced by their mean.
-        conditions: The numbers from which the loop is built.
+        conditions: The data from which the loop is built.
         rest: The equilibrium nearest to the end of the run.
         uses: The samples in use in the last quarter of the run, if delays are random or
-            measured. None if the scenario determines all delays.
+            measured. `None` if the scenario determines all delays.
         has_mean_ages: True if the age of the samples on some link is a mean over the last
             quarter of the run.
         distance_rad: Largest difference between the last angle of a joint and its angle at
             the rest, in rad.
-        last_pose: The last pose of the run. None if it is the rest. Arms that nobody holds may
-            rest anywhere in between.
-        programs: Sites whose arms a program of the user moves. How it reacts to the arms is not
-            part of the linearised loop.
+        last_pose: The last pose of the run. `None` if it is the pose of rest. Arms that no
+            operator holds may come to rest anywhere between the two.
+        programs: Sites whose arms a program of the user moves. The reaction of the program to
+            the arms is not part of the linearised loop.
     """
 
     scenario: Scenario
@@ -96,7 +99,7 @@ class _EndLoop(NamedTuple):
 def find_log_roots(log: Log, *, own_laws: bool = False) -> LoopRoots:
     """Decides by linear analysis whether small motions at the end of a recorded run die away.
 
-    The coupled arms are linearised at the pose of rest next to the last pose. The result may
+    The coupled arms are linearised at the pose of rest nearest to the last pose. The result may
     prove the run stable, or refute it.
 
     Args:
@@ -145,7 +148,8 @@ def find_log_loop(log: Log, *, own_laws: bool = False) -> _EndLoop:
         own_laws: True if the code of imported control laws may be executed.
 
     Raises:
-        ScenarioError: The loop cannot be linearised, or the run ended without a rest.
+        ScenarioError: The loop cannot be linearised, or the run did not end near a pose of
+            rest.
     """
     site_logs = [log[site] for site in log.sites]
     if not all(map(len, site_logs)):
@@ -157,8 +161,8 @@ def find_log_loop(log: Log, *, own_laws: bool = False) -> _EndLoop:
         """Returns which messages of another arm were in use at given ticks, from the records.
 
         Such a message, a sample, is the state that an arm sends once per tick (control period).
-        Samples are numbered from 0. A tick without a record has the samples of the last record
-        before.
+        Samples are numbered from 0. For a tick without a record, the samples of the last record
+        before it are returned.
 
         Args:
             i: Index of the receiving site.
@@ -199,7 +203,8 @@ def find_run_loop(scenario: Scenario, run: FusedRun) -> _EndLoop:
         run: Its run in the fused loop.
 
     Raises:
-        ScenarioError: The loop cannot be linearised, or the run ended without a rest.
+        ScenarioError: The loop cannot be linearised, or the run did not end near a pose of
+            rest.
     """
     if run.diverged_s is not None:
         _check_mode(scenario.names[0], "diverged", scenario.name)
@@ -214,7 +219,7 @@ def find_run_loop(scenario: Scenario, run: FusedRun) -> _EndLoop:
 
         The function corresponds to `read_used_samples` of `find_log_loop`. A simulated run
         without a log has no records, but the random delays of the link can be drawn again from
-        its seed. They include its planned changes and outages.
+        its seed. The drawn delays include the planned changes and outages of the link.
 
         Args:
             i: Index of the receiving site.
@@ -225,7 +230,7 @@ def find_run_loop(scenario: Scenario, run: FusedRun) -> _EndLoop:
             Numbers of the samples, shape (K,). -1 before the first sample.
         """
         used = run.read_samples_in_use(i, last_ticks[i] + 1)
-        # A site is no peer of itself, so the peers after it move up by one column.
+        # A site is not its own peer, so the peers after it move up by one column.
         samples: Ints = used[ticks, j - (j > i)]
         return samples
 
@@ -265,8 +270,8 @@ def _check_mode(site: str, mode: str, source: str) -> None:
 def resolve_final_scenario(log: Log) -> Scenario:
     """Returns the scenario of a log, with the users' commands of the run as planned changes.
 
-    Its duration is the recorded one, so that the settings in force at its end are those of the
-    final control loop.
+    The duration of the scenario is the recorded duration. The settings in force at its end are
+    therefore those of the final control loop.
 
     Args:
         log: The log of the run.
@@ -286,8 +291,8 @@ class _FixedDelays(NamedTuple):
     Attributes:
         scenario: The scenario up to the end of the run. A link whose delays only the records
             show has its constant mean delay.
-        uses: The samples in use in the last quarter of the run. None if the scenario determines
-            all delays, or if no sample was received over some link.
+        uses: The samples in use in the last quarter of the run. `None` if the scenario
+            determines all delays, or if no sample was received over some link.
         mean_age_s: Mean age of the samples on links with unknown delays, in s, by (index of the
             receiver, index of the sender).
     """
@@ -298,12 +303,12 @@ class _FixedDelays(NamedTuple):
 
 
 class _EndState(NamedTuple):
-    """Poses of all arms at the end of a run, near which a pose of rest is searched.
+    """Poses of all arms at the end of a run, near which to search for a pose of rest.
 
     Attributes:
         q: Joint angles, shape (N, n), in rad.
         estimates: Estimates of the parameters of the arms, shape (N, P).
-        how: What the state is, as a phrase for the user.
+        how: Phrase for the user that describes the state.
     """
 
     q: Array
@@ -346,7 +351,8 @@ def _build_end_loop(
 def _compute_roots(loop: _EndLoop) -> LoopRoots:
     """Computes the fastest growing (rightmost) roots of the loop at the end of a run.
 
-    A root is the complex growth rate of a small motion. A certificate of stability states them.
+    A root is the complex growth rate of a small motion. A stability certificate states these
+    roots.
 
     Args:
         loop: The loop at the end of a run.
@@ -396,14 +402,14 @@ def _name_left_out(programs: Sequence[str]) -> str:
 
 
 def _has_same_sign(loop: SampledLoop, at_rest: Spectrum, last_pose: Equilibrium) -> bool:
-    """Returns True if the rightmost roots at a rest and at the last pose have the same sign.
+    """Returns True if the rightmost roots at rest and at the last pose have the same sign.
 
-    At a pose that is no rest, the roots at zero are slightly off. Therefore a root below a
-    tenth of the one at the rest counts as zero.
+    At a pose that is not a pose of rest, the roots at zero are slightly displaced. Therefore a
+    root at the last pose counts as zero if it is below a tenth of the root at the pose of rest.
 
     Args:
         loop: The loop at the end of the run.
-        at_rest: Its roots at the rest next to the end of the run.
+        at_rest: The roots at the pose of rest nearest to the end of the run.
         last_pose: The last pose of the run.
     """
     if at_rest.rightmost is None:
@@ -417,7 +423,7 @@ def _has_same_sign(loop: SampledLoop, at_rest: Spectrum, last_pose: Equilibrium)
 
 
 def _summarise_roots(spectrum: Spectrum, span: str, *, exact: bool) -> LoopRoots:
-    """Returns the fastest growing root, and what it says about the stability of the run.
+    """Returns the fastest growing root, and its verdict on the stability of the run.
 
     Args:
         spectrum: The roots at the end pose.
@@ -452,7 +458,7 @@ def _end_traces(scenario: Scenario) -> Scenario:
     """Returns a scenario in which tables of delays that have ended are constant delays.
 
     After the end of such a table its last delay stays in force, so the final loop has a
-    constant delay. It replaces the planned changes of the link too.
+    constant delay. The constant delay also replaces the planned changes of the link.
 
     Args:
         scenario: The scenario up to the end of the run.
@@ -471,7 +477,7 @@ def _end_traces(scenario: Scenario) -> Scenario:
 
 
 def _list_unknown_delays(scenario: Scenario) -> dict[str, bool]:
-    """Finds the network links whose delays are random or measured, so that only a run has them.
+    """Finds the network links whose delays are random or measured, and known only after a run.
 
     Returns:
         For each link, by its name, True if its delays are unknown before a run.
@@ -488,7 +494,7 @@ def _fix_delays(
     last_ticks: Sequence[int],
     find_used: Callable[[int, int, Ints], Ints],
 ) -> _FixedDelays:
-    """Returns a scenario in which random and measured delays are those of its run.
+    """Returns a scenario in which random and measured delays are replaced by those of its run.
 
     These delays cannot be predicted. The messages in use in the last quarter of the run stand
     for all later ones.
@@ -498,8 +504,8 @@ def _fix_delays(
         last_ticks: Last tick of each site.
         find_used: Function that returns the numbers of the samples that a site used. Its
             arguments are the index of the site, the index of the peer that sent the samples,
-            and the ticks of the site. A number is negative before the first sample. A tick
-            without a record uses the samples of the tick before.
+            and the ticks of the site. A number is negative before the first sample. For a tick
+            without a record, the samples of the previous tick are returned.
     """
     scenario = _end_traces(scenario)
     has_unknown_delay = _list_unknown_delays(scenario)
@@ -548,8 +554,8 @@ def _choose_end_state(
 ) -> _EndState:
     """Chooses the joint angles and parameter estimates of all arms at the end of a run.
 
-    The angles of an arm at rest are the last ones. Those of an arm that still moves are the
-    mean over the last quarter of the run, in intervals of 50 ms.
+    For an arm at rest, the last angles are used. For an arm that still moves, the angles are
+    the mean over the last quarter of the run, in intervals of 50 ms.
 
     Args:
         scenario: Scenario of the run.
@@ -606,7 +612,7 @@ def _iterate_motions(scenario: Scenario, trace: RunTrace) -> Iterator[tuple[Arra
 
 
 class _SiteMotion(NamedTuple):
-    """Recorded motion of one arm, and what its control law has learnt.
+    """Recorded motion of one arm, with the estimates of its control law.
 
     Attributes:
         t_s: Times of the K records, shape (K,), in s.
@@ -631,9 +637,9 @@ class _SiteMotion(NamedTuple):
 def _record_motions(scenario: Scenario) -> list[_SiteMotion]:
     """Simulates a scenario again, and returns the motion of each site.
 
-    The run to be judged kept only reduced data and its last records. The state of an arm that
-    chatters at a wall needs all records of the last quarter. They are read in batches, so that
-    a long run does not need memory for whole records.
+    The judged run has kept only reduced data and its last records. The state of an arm that
+    chatters at a wall needs all records of the last quarter. The records are read in batches,
+    so that a long run does not need memory for whole records.
 
     Args:
         scenario: The scenario up to the end of the run.
@@ -664,8 +670,8 @@ def _record_motions(scenario: Scenario) -> list[_SiteMotion]:
 def _has_sampled_wall(scenario: Scenario) -> bool:
     """Returns True if the force of some wall is computed once per control period and held.
 
-    An arm may then chatter at the wall, and its mean pose may be off the wall although the arm
-    hits the wall in every cycle.
+    An arm may then chatter at the wall, and its mean pose may lie outside the wall although the
+    arm hits the wall in every cycle.
 
     Args:
         scenario: Scenario of the run.
@@ -677,7 +683,7 @@ def _has_sampled_wall(scenario: Scenario) -> bool:
 def _find_state_in_wall(scenario: Scenario, motions: Sequence[_SiteMotion]) -> _EndState | None:
     """Finds the deepest state of arms that chatter at a wall in the last quarter of a run.
 
-    The mean of such a motion may be beside the wall, where the loop is another one. The deepest
+    The mean of such a motion may lie outside the wall, where the loop is different. The deepest
     state is inside the wall, so the wall's stiffness is part of the linearised loop.
 
     Args:
@@ -685,7 +691,7 @@ def _find_state_in_wall(scenario: Scenario, motions: Sequence[_SiteMotion]) -> _
         motions: Motion of each site.
 
     Returns:
-        The state. None if all sites are at rest, or if no arm touches a sampled wall.
+        The state. `None` if all sites are at rest, or if no arm touches a sampled wall.
     """
     count = min(len(motion.t_s) for motion in motions)
     rows = slice(3 * count // 4, count)
@@ -708,7 +714,7 @@ def _find_state_in_wall(scenario: Scenario, motions: Sequence[_SiteMotion]) -> _
         return None
     estimates = [motion.theta_hat[rows][deepest] for motion in motions]
     how = (
-        f"the run chatters at a wall, deepest at {first_times_s[deepest]:.4g} s: "
+        f"an arm chatters at a wall, and is deepest in it at {first_times_s[deepest]:.4g} s: "
         "the equilibrium nearest to this state"
     )
     return _EndState(q[deepest], pad_rows(estimates), how)

@@ -1,16 +1,16 @@
-"""Linearises a control law of which only the code exists, by central differences.
+"""Linearises a control law that is known only by its code, by central differences.
 
 A user may write a control law as a Python function. Its derivatives are needed for the linear
 analysis, but its equations are unknown. For one tick (period of the control loop), the code is
-treated as a function of numbers:
+treated as a function:
 
     (tau_k, m_k) = f(q, qd, m_{k-1}, q_des, qd_des, felt, peers, torque)
 
-The results at tick k are the torque tau_k that the law commands and its memory m_k, the numbers
+The results at tick k are the torque tau_k that the law commands and its memory m_k, the values
 that it stores for the next tick. The arguments are:
 
 - the joint angles q and velocities qd, and the desired angles q_des and velocities qd_des,
-- `felt`, the received torques ON the other arms, weighted and summed,
+- `felt`, the weighted sum of the received torques on the other arms,
 - `peers`, the states of these arms one by one,
 - `torque`, the external torque on the law's own arm.
 
@@ -21,7 +21,7 @@ h, where h is the length of a tick.
 Invariant:
     - The law receives the same inputs as in a run. Its torque is not limited.
     - If the law uses the torque or the angles of the previous tick, they belong to the memory.
-    - The analysis that treats each tick adds h m' to the memory m_{k-1}, which gives m_k.
+    - The sampled analysis adds h m' to the memory m_{k-1}, which gives m_k.
 """
 
 from collections.abc import Sequence
@@ -46,22 +46,24 @@ from ...errors import ScenarioError
 from ..arm_rows import Numbers
 
 _TICK = 1_000_000
-"""Number of the tick that is evaluated: late enough that no start-up action is in force."""
+"""Number of the tick that is evaluated. This tick is so late that no start-up action of a law
+is active.
+"""
 _STEP = 1e-5
 """Half the step of a central difference, relative to the argument's size or to 1.
 
 Errors of the derivatives are about 1e-10.
 """
 _STILL = 1e-14
-"""Largest change of the memory in one tick at which the memory counts as constant."""
+"""Largest change in one tick at which the memory counts as constant."""
 
 
 class NumericLaw:
     """A user's control law as a function that the linear analysis can differentiate.
 
-    The law may store numbers from one tick (period of the control loop) to the next. These
-    numbers are its memory. The law object is built once. Calling this object returns the law
-    object, as for the function that normally builds the law of a `SiteSetup`.
+    The law may store values from one tick (period of the control loop) to the next. These
+    values are its memory. The law object is built once. A call of this object returns the law
+    object. It can therefore replace the function that normally builds the law of a `SiteSetup`.
 
     Args:
         setup: Setup of the site, the process that runs the arm.
@@ -69,11 +71,12 @@ class NumericLaw:
         shares: Dominance factors, the weights with which the site follows the other sites.
 
     Attributes:
-        names: Names of the numbers in the memory, such as "error[1]".
+        names: Names of the values in the memory, such as "error[1]".
         memory: The memory at the start of a run.
 
     Raises:
-        ScenarioError: The law sends vectors that it defines, or makes an end effector follow.
+        ScenarioError: The law sends vectors that it defines itself, or makes an end effector
+            follow.
     """
 
     def __init__(self, setup: SiteSetup, code: str, shares: Sequence[float]) -> None:
@@ -141,18 +144,18 @@ class NumericLaw:
         return slice(start, start + len(self.memory))
 
     def __call__(self, _context: LawContext) -> UserLaw:
-        """Returns the law itself, where other code expects a function that builds the law."""
+        """Returns the law, so that this object can stand in for a function that builds it."""
         return self._law
 
     def complete_memory(self, memory: Array | None) -> Array:
-        """Completes the memory of a control law, of which only the beginning may be known.
+        """Completes the memory of a control law if only its first values are known.
 
-        The memory contains all numbers that the law stores from tick to tick (period of the
-        control loop). Unknown numbers are taken from the memory at the start of a run.
+        The memory contains all values that the law stores from tick to tick (period of the
+        control loop). Unknown values are taken from the memory at the start of a run.
 
         Args:
-            memory: Known numbers: the whole memory, or at least the numbers that the law itself
-                stores. Longer arrays are cut. None if nothing is known.
+            memory: Known values: the whole memory, or at least the values that the law itself
+                stores. Longer arrays are cut. `None` if nothing is known.
 
         Returns:
             The whole memory.
@@ -169,8 +172,9 @@ class NumericLaw:
     def iterate_memory(self, x: Array, ticks: int) -> Array:
         """Executes a user's control law with constant inputs until its memory is steady.
 
-        The memory are the values that the law stores from one tick (control period) to the
-        next, such as an integral. The iteration ends early once they no longer change.
+        The memory consists of the values that the law stores from one tick (control period) to
+        the next, such as an integral. The iteration ends early once these values no longer
+        change.
 
         Args:
             x: Arguments in the order of `ArgumentLayout`, shape (arguments,).
@@ -200,9 +204,8 @@ class NumericLaw:
 
         Returns:
             The torque of the n joints, shape (n, ...), in N m. For a complex x, the imaginary
-            part of each column is its small change.
-            The rate of change of the numbers in the law's memory, shape (memory, ...), in 1/s,
-            in the same form.
+            part of each column is the small change of the torque. The rate of change of the
+            law's memory, shape (memory, ...), in 1/s, in the same form.
         """
         if not np.iscomplexobj(x):
             return self._evaluate_rates(x)
@@ -306,7 +309,7 @@ class NumericLaw:
 
 
 def _name_memory(law: Any, count: int) -> tuple[str, ...]:
-    """Returns a name for each number that a law remembers, as "error[1]" or "memory[1]"."""
+    """Returns a name for each value in a law's memory, such as "error[1]" or "memory[1]"."""
     if callable(getattr(law, "memory", None)):
         return tuple(f"memory[{n + 1}]" for n in range(count))
     names = []

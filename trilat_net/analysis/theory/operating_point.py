@@ -1,15 +1,15 @@
 """Determines the delays, weights and operators with which the control loop is linearised.
 
 Delays, weights and operators may change during a run, but a linear loop has only one set of
-these numbers, its operating point. It consists of the numbers at the end of the run.
+them, its operating point. The operating point consists of the values at the end of the run.
 
 The effective delay of a link is the age of the state that the receiver uses in a tick (period
 of its control loop). It may be longer than the network delay T, because a controller uses a
 state only at its next tick. With a constant delay and the same tick h at both ends, it is
-max(1, ceil(T / h)) ticks. Otherwise it is the mean over the same random draws that a run makes.
+max(1, ceil(T / h)) ticks. Otherwise it is the mean over the same random delays as in a run.
 
 Invariant:
-    - A note reports every number that differed earlier in the run or that is random.
+    - A note reports every value that differed earlier in the run or that is random.
     - An operating point that cannot be known before the run is refused.
 """
 
@@ -91,7 +91,7 @@ class _EffectiveDelay(NamedTuple):
         """True if the age of the used samples is not constant.
 
         Differences up to 10 ns do not count, because the times of ticks are whole nanoseconds,
-        so that constant ages differ a little.
+        and constant ages therefore differ a little.
         """
         return self.most_s > self.least_s + 1e-8
 
@@ -99,17 +99,17 @@ class _EffectiveDelay(NamedTuple):
 class OperatingConditions(NamedTuple):
     """Gains, delays, weights and operators from which the linear model of the arms is built.
 
-    They are those at the end of a run of the scenario, see `OperatingConditions.derive`. N is
-    the number of arms (sites).
+    The values are those at the end of a run of the scenario, see `OperatingConditions.derive`.
+    N is the number of arms (sites).
 
     Attributes:
         sites: Setups of the sites in scenario order, with the operators and environments in
             force.
         alpha: Matrix of dominance factors, shape (N, N), Eq. (6). Entry (i, j) is the weight
             with which site i follows site j.
-        age_s: Age of the sample of site j that site i uses, shape (N, N), in s. 0 if it uses
-            none.
-        notes: Remarks for the user on numbers that were left out or fixed.
+        age_s: Age of the sample of site j that site i uses, shape (N, N), in s. 0 if site i
+            uses no sample of site j.
+        notes: Remarks for the user on quantities that were left out or fixed.
         varying: True if ages vary during the run. `age_s` then contains their means.
         laws: Control law of each site.
         links: The link from j to i in force, and the key of its random draws, by (i, j).
@@ -126,15 +126,15 @@ class OperatingConditions(NamedTuple):
     def find_forms(self, inertia: Sequence[Array] = ()) -> list[LinearForm | None]:
         """Returns the linear equations of control laws that gains alone do not describe.
 
-        Examples are laws that store numbers, or send waves. `LinearForm` represents their
-        equations.
+        Examples are laws that store values from tick to tick, or send waves. `LinearForm`
+        represents their equations.
 
         Args:
             inertia: Inertia matrix of each arm, shape (n, n), for n joints. Empty for unit
                 matrices.
 
         Returns:
-            The equations for each site (process that runs one arm). None for a site whose law
+            The equations for each site (process that runs one arm). `None` for a site whose law
             is fully described by its gains.
         """
         forms: list[LinearForm | None] = []
@@ -154,9 +154,9 @@ class OperatingConditions(NamedTuple):
     def coupled_pairs(self) -> list[tuple[int, int]]:
         """Pairs (i, j) of sites for which site i reacts to the states that site j sends.
 
-        A site is a process that runs one arm. It reacts if its dominance factor for site j, the
-        weight with which it follows site j, is not zero. The control law of a user reads the
-        states of all other sites, so that it reacts in any case.
+        A site is a process that runs one arm. Site i reacts if its dominance factor for site j,
+        the weight with which it follows site j, is not zero. The control law of a user reads
+        the states of all other sites and therefore reacts in any case.
         """
         pairs = []
         for i, site in enumerate(self.sites):
@@ -171,7 +171,7 @@ class OperatingConditions(NamedTuple):
     def has_forms(self) -> bool:
         """True if gains alone do not describe the control law of some arm.
 
-        Examples are laws that store numbers from tick to tick (control period), or send waves.
+        Examples are laws that store values from tick to tick (control period), or send waves.
         The coupled arms are then linearised in continuous time only, and not tick by tick.
         """
         return any(form is not None for form in self.find_forms())
@@ -185,7 +185,7 @@ class OperatingConditions(NamedTuple):
     def needs_sampled_loop(self) -> bool:
         """True if the controllers' ticks matter for stability and must therefore be modelled.
 
-        A tick is one period of the control loop. This is so in three cases:
+        A tick is one period of the control loop. Ticks matter in three cases:
 
         - The integration scheme is `digital`: zero-order hold, as in a plain digital
           controller.
@@ -217,9 +217,10 @@ class OperatingConditions(NamedTuple):
 
     @classmethod
     def derive(cls, scenario: Scenario, *, own_laws: bool = True) -> "OperatingConditions":
-        """Collects the numbers of a scenario's linear model, as they are at the end of a run.
+        """Collects the data for a scenario's linear model, as they are at the end of a run.
 
-        They are delays, dominance factors, gains and operators, after all planned changes.
+        The data are the delays, dominance factors, gains and operators after all planned
+        changes.
 
         Args:
             scenario: The description of the experiment.
@@ -247,8 +248,7 @@ class OperatingConditions(NamedTuple):
         if conditions.has_forms:
             pairs = list(permutations(range(len(alpha)), 2))
             notes.append(
-                "a law here has states or waves of its own: "
-                "it is linearised in continuous time only"
+                "a law has additional states or waves: it is linearised in continuous time only"
             )
 
         links = {}
@@ -284,7 +284,7 @@ def _describe_laws(scenario: Scenario) -> list[str]:
     """Returns remarks for the user on how the control laws of a scenario are linearised.
 
     Laws of the user's own code are differentiated numerically, which is less exact than the
-    derivatives of the shipped laws. Some shipped laws state a remark of their own.
+    derivatives of the shipped laws. Some shipped laws provide their own remark.
 
     Args:
         scenario: The experiment.
@@ -413,7 +413,7 @@ def _find_final_link(scenario: Scenario, name: str, notes: list[str]) -> LinkBas
 
 
 def _has_long_period(link: LinkBase, rate_hz: int) -> bool:
-    """Returns True if a link's delay repeats only after more ticks than are worth computing."""
+    """Returns True if a link's delay repeats only after more ticks than can be analysed."""
     period_s = find_link_period_s(link)
     return period_s is not None and period_s * rate_hz > MAX_PERIOD_TICKS
 
@@ -426,8 +426,8 @@ def compute_effective_delay(
 ) -> _EffectiveDelay:
     """Computes how old the other arm's state is when a control loop uses it.
 
-    The ages are those of the run. If the delay repeats after a longer time, they are those of a
-    whole period, because the loop goes on after the run.
+    The ages are those in the run. If the delay repeats after a longer time than the run, the
+    ages in a whole period are used, because the loop is assumed to continue after the run.
 
     Args:
         scenario: The experiment.
@@ -452,7 +452,7 @@ def compute_effective_delay(
 
     duration_s = scenario.duration_s
     if is_constant:
-        # ages repeat, so that two seconds beyond the delay show them all
+        # ages repeat, so two seconds beyond the delay contain all of them
         duration_s = min(duration_s, 2.0 + 2e-6 * model.location)
     period_s = find_link_period_s(link)
     if period_s is not None and not _has_long_period(link, max(site_hz, peer_hz)):
@@ -486,11 +486,11 @@ def compute_effective_delay(
 
 
 def has_lasting_delays(scenario: Scenario) -> bool:
-    """Returns True if delays that are constant in a run stay so after its end.
+    """Returns True if delays that are constant in a run remain constant after its end.
 
-    They do not if a sinusoid or a trace has other delays later. The ages of samples count, so
-    that a play-out buffer may hide such delays. Random and measured delays are ignored: only
-    records show them.
+    Delays do not remain constant if a sinusoid or a trace has other delays later. The ages of
+    samples are compared, because a play-out buffer may hide varying delays. Random and measured
+    delays are ignored: only records show them.
 
     Args:
         scenario: The experiment, with the duration of the run.

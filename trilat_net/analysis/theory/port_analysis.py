@@ -15,8 +15,8 @@ unchanged. A force F on the end effector acts as the joint torque J' F. Ports ar
 their axis: 1 to 3 for the position, 4 to 6 for rotations.
 
 Invariant:
-    - Operators and environments are removed from the loop. Their torque at rest stays as a
-      constant, so that a held pose can be analysed too.
+    - Operators and environments are removed from the loop. Their torque at rest remains as a
+      constant. Therefore a held pose can be analysed too.
     - For an unstable loop only the instability is reported, because this loop has no steady
       oscillations.
     - Every result holds for the analysed band of frequencies.
@@ -84,7 +84,8 @@ def freeze_external_torques(
 def linearise_teleoperator(conditions: OperatingConditions, rest: Equilibrium) -> LinearLoop:
     """Builds the linear model of the arms and their coupling, without operators and walls.
 
-    Operators and walls act at its ports, the joints, and are not part of the model.
+    Operators and walls act at the joints, which are the ports of the model, and are not part of
+    the model.
 
     Args:
         conditions: The sites, gains and delays of the loop.
@@ -109,7 +110,7 @@ def build_proof_output(
         loop: The linear model of the loop.
 
     Returns:
-        The output. None if there is no proof: for laws other than the paper's, for
+        The output. `None` if there is no proof: for laws other than the paper's, for
         orientations, and for axes that a peer does not follow.
     """
     sites = conditions.sites
@@ -167,14 +168,14 @@ class TwoPort(NamedTuple):
     """Result of Llewellyn's stability criterion for one joint of two arms.
 
     The criterion says whether the arms are stable with every passive operator or wall at both
-    joints. Nobody pushes the other joints.
+    joints. No torque acts on the other joints.
 
     Attributes:
         sites: The two sites.
         joint: Number of the joint, or of the coordinate in task space, from 1.
         clamped: Name of the third site if it is clamped. Empty if it is free or does not exist.
-        minima: Llewellyn's parameter over frequency, and the bands in which it is below 1, so
-            that the criterion is violated.
+        minima: Llewellyn's parameter over frequency, and the bands in which it is below 1,
+            where the criterion is violated.
     """
 
     sites: tuple[str, str]
@@ -184,7 +185,7 @@ class TwoPort(NamedTuple):
 
 
 class PortAnalysis(NamedTuple):
-    """What operators feel in coupled arms, and whether the arms are passive.
+    """Result of analysing what operators feel in coupled arms, and the passivity of the arms.
 
     `analyse_ports` computes it. A port is the place where an operator or an environment touches
     an arm, such as a joint.
@@ -197,19 +198,20 @@ class PortAnalysis(NamedTuple):
             edge".
         pole: Pole of the admittance at zero frequency.
         velocity: Passivity at all ports with respect to the velocities.
-        joints: The same for each joint alone, without operators at the others, by number.
-        proof: Passivity with respect to r = qd + Lambda e. None if the law has no r.
+        joints: Passivity at each joint by itself, without operators at the other joints, by
+            number of the joint.
+        proof: Passivity with respect to r = qd + Lambda e. `None` if the law has no r.
         beta: Weights of the sites in `proof`, shape (N,), with the sum N.
         estimates_true: True if all estimates at the equilibrium are true. Otherwise the proof
             counts the energy that they store, which a linear loop cannot show.
-        absolute: Least eigenvalue over frequency under the best weights. The loop is stable
-            with any passive operators if it is never negative.
+        absolute: Least eigenvalue over frequency under the best weights. If it is never
+            negative, the loop is stable with any passive operators.
         two_ports: Llewellyn's criterion for every pair of sites.
         transparency: Transparency at each site, with one other site free and clamped.
-        clamped_verdict: Verdict of the roots with that other site clamped.
-        axes: Name of each port number's axis in task space. Empty in joint space.
-        measured: Result with measured operators at the masters, see `check_against_hands`. None
-            if no operator was measured.
+        clamped_verdict: Verdict of the roots with this other site clamped.
+        axes: Name of the axis in task space, by port number. Empty in joint space.
+        measured: Result with measured operators at the masters, see `check_against_hands`.
+            `None` if no operator was measured.
     """
 
     scenario: Scenario
@@ -268,7 +270,7 @@ class PortAnalysis(NamedTuple):
 
         Args:
             number: Number of a joint, or of an axis of the end effector if end effectors follow
-                each other, from 1. 0 stands for all of them together.
+                each other, from 1. 0 stands for all joints or axes together.
         """
         linear = "N s/m"
         angular = "N m s/rad"
@@ -297,8 +299,8 @@ def analyse_ports(
         scenario: Description of the coupled arms.
         rest: The pose of rest.
         of: Site (process that runs one arm) whose arm is once free and once clamped, while
-            operators feel the other arms. None for the slave, or for the last site if there is
-            no slave.
+            operators feel the other arms. If `None`, the slave is used, or the last site if
+            there is no slave.
         band_hz: Lower and upper end of the band, in Hz.
         hands: Measured impedances of operators. Any of them may hold the arm of any master.
 
@@ -478,7 +480,7 @@ def _check_proof(
         w_rad_s: Frequencies, in rad/s.
 
     Returns:
-        The passivity under the weights of the proof. None if there is no proof for this loop,
+        The passivity under the weights of the proof. `None` if there is no proof for this loop,
         or if some site has the weight zero.
     """
     output = build_proof_output(conditions, loop)
@@ -528,7 +530,8 @@ def _check_llewellyn(
 ) -> frequency_search.Minima:
     """Evaluates Llewellyn's stability parameter of two joints over frequency.
 
-    The arms are stable with any passive operators at the two joints if it is never below 1.
+    The arms are stable with any passive operators at the two joints if the parameter is never
+    below 1.
 
     Args:
         Y: Admittance at all ports.
@@ -547,7 +550,7 @@ def _check_llewellyn(
 def ports_to_json(ports: PortAnalysis) -> dict[str, Any]:
     """Converts an analysis of what operators feel to plain values for JSON.
 
-    Infinite numbers become None, as JSON does not know them.
+    Infinite numbers become `None`, because JSON has no representation for them.
 
     Args:
         ports: The analysis.
@@ -590,7 +593,7 @@ def ports_to_json(ports: PortAnalysis) -> dict[str, Any]:
 
 
 def _passivity_to_json(passivity: Passivity) -> dict[str, Any]:
-    """Returns whether a loop is passive, and the lacking damping, as plain values."""
+    """Converts the passivity of a loop, and the lacking damping, to plain values."""
     return {
         **_minima_to_json(passivity.minima),
         "lacking_nm_s_rad": finite_or_none(passivity.lacking_nm_s_rad),
@@ -598,7 +601,7 @@ def _passivity_to_json(passivity: Passivity) -> dict[str, Any]:
 
 
 def _minima_to_json(minima: frequency_search.Minima) -> dict[str, Any]:
-    """Returns a curve's least value, and the bands in which it fails, as plain values."""
+    """Converts a curve's least value, and the bands below its limit, to plain values."""
     return {
         "holds": not minima.below,
         "least": minima.least,
@@ -608,7 +611,7 @@ def _minima_to_json(minima: frequency_search.Minima) -> dict[str, Any]:
 
 
 def _transparency_to_json(transparency: Transparency) -> dict[str, Any]:
-    """Converts what an operator feels of another arm, free and clamped, to plain values.
+    """Converts the impedances with another arm free and clamped to plain values.
 
     Args:
         transparency: The impedances that the operator feels.
@@ -701,7 +704,7 @@ def _move_ports_to_end_effectors(
         T = np.vstack([J, N.T])
         T_inverse = np.hstack([np.linalg.pinv(J), N])
 
-        # the states of estimates, which follow those of the joints, stay as they are
+        # the states of estimates, which come after those of the joints, are not converted
         site_states = [name for name in loop.names if name.startswith(f"{site.name}.")]
         estimates = site_states[2 * layout.joints :]
         unchanged = np.eye(len(estimates))

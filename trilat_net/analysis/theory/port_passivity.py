@@ -50,7 +50,9 @@ EIGENVALUE_ROUNDING = 1e-8
 MAX_LLEWELLYN = 1e6
 """Largest value of Llewellyn's parameter."""
 _LOW_BAND = 4.0
-"""Ratio of frequencies over which a lack of damping that grows without bound would double."""
+"""Ratio of frequencies over which a lack of damping that grows without bound would at least
+double.
+"""
 _LOG_REACH = 12.0
 """Logarithm of the largest ratio of two weights."""
 _MAX_ROUNDS = 400
@@ -62,7 +64,7 @@ _WEIGHT_TOLERANCE = 1e-3
 class Passivity(NamedTuple):
     """Whether coupled arms are passive: they never supply net energy to their operators.
 
-    Y is the admittance over frequency, the velocities at the operators' joints per torque. The
+    Y is the admittance over frequency: the velocities at the operators' joints per torque. The
     arms are passive if Y + Y^H has no negative eigenvalue, where Y^H is the conjugate
     transpose.
 
@@ -70,7 +72,7 @@ class Passivity(NamedTuple):
         minima: Least eigenvalue of Y + Y^H over frequency, in rad/s per N m, and the bands in
             which it is negative.
         size: Largest singular value of Y at these frequencies, shape (F,), in rad/s per N m.
-            The eigenvalues of Y + Y^H lie within twice that.
+            The eigenvalues of Y + Y^H lie within twice this value.
         lacking_nm_s_rad: Damping that would make the loop passive if each port had it, in N m
             s/rad. Infinite if it grows without bound towards the lowest frequencies.
     """
@@ -141,23 +143,23 @@ def check_against_hands(
     held: Sequence[Sequence[HandMatrices]],
     places: Sequence[Array],
 ) -> Minima | None:
-    """Checks the stability with measured operators, of whom any may hold any end effector.
+    """Checks the stability if any of the measured operators may hold any end effector.
 
-    The result is the least eigenvalue of Z + Z^H + 2 D over every choice of operators, where
-    Z = Y^-1, and D is the resistance of the operators at the ports. If the eigenvalue is
-    negative at no frequency, Z together with D is passive, and so is each operator without D.
-    The loop is then stable with any of these operators, and with passive environments at the
-    other ports. Like passivity, the condition is sufficient.
+    The result is the least eigenvalue of Z + Z^H + 2 D over every choice of operators, where Z
+    = Y^-1, and D is the resistance of the operators at the ports. If the eigenvalue is not
+    negative at any frequency, Z together with D is passive, and each operator without D is
+    passive too. The loop is then stable with any of these operators, and with passive
+    environments at the other ports. Like passivity, this condition is sufficient.
 
     Args:
         response: Admittance Y at the ports.
         w_rad_s: Frequencies, rising, shape (F,), in rad/s.
-        held: For each end effector that is held, the operators of whom any may hold it.
+        held: For each end effector that is held, the operators who may hold it.
         places: For each of these end effectors, the matrix from the velocities at all ports to
             its own velocity, shape (n, p).
 
     Returns:
-        The least eigenvalue over frequency, in N m s/rad or N s/m. None if no operator is
+        The least eigenvalue over frequency, in N m s/rad or N s/m. `None` if no operator is
         known.
     """
     if not held:
@@ -272,16 +274,17 @@ def check_passivity(
 ) -> Passivity:
     """Checks whether coupled arms are passive at the places (ports) where operators act.
 
-    They are passive if they never return more energy than they received. This is examined over
-    frequency, with additional frequencies near the minima.
+    The arms are passive if they never return more energy than they received. This is examined
+    over frequency, with additional frequencies near the minima.
 
     Args:
         response: Function that returns the response at given frequencies: usually the
             admittance, the velocities at the p ports per torque. Another output with p entries
             is allowed too.
         w_rad_s: First frequencies, rising, shape (F,), in rad/s.
-        weights: Positive weights of the ports, shape (p,). None if all are 1. The examined sum
-            of torque times output is then a physical power, if the outputs are velocities.
+        weights: Positive weights of the ports, shape (p,). `None` if all are 1. In this case
+            the examined sum of torque times output is a physical power, if the outputs are
+            velocities.
 
     Returns:
         The least eigenvalue over frequency, which determines passivity, and related numbers.
@@ -336,7 +339,7 @@ def llewellyn_parameter(Y: Complex) -> Array:
     quotient = numerator / size
     parameter: Array = np.minimum(quotient, MAX_LLEWELLYN)
 
-    # A port that is active alone fails the criterion, whatever the quotient is.
+    # A port that is active by itself violates the criterion, whatever the quotient is.
     limit = -EIGENVALUE_ROUNDING * norm
     first_is_active = y11 < limit
     second_is_active = y22 < limit
@@ -348,8 +351,8 @@ def llewellyn_parameter(Y: Complex) -> Array:
 def llewellyn_rounding(Y: Complex) -> Array:
     """Returns the rounding error of Llewellyn's stability parameter at each frequency.
 
-    A value within this error of the limit decides nothing. The error is large if almost nothing
-    is transmitted from one joint to the other.
+    If the parameter is closer to the limit than this error, the criterion does not decide. The
+    error is large if almost nothing is transmitted from one joint to the other.
 
     Args:
         Y: Admittance, shape (F, 2, 2).
@@ -399,8 +402,9 @@ class _BestWeights(NamedTuple):
 
     Attributes:
         margin: Least eigenvalue of the weighted Y + Y^H, with the conjugate transpose Y^H, at
-            each of F frequencies, shape (F,). Y is scaled so that each site's own part has size
-            1, so that the margin has no unit. It is negative if no weights prove stability.
+            each of F frequencies, shape (F,). Y is scaled such that each site's own part has
+            size 1. The margin therefore has no unit. The margin is negative if no weights prove
+            stability.
         weights: The best weights at each frequency, relative to the weight of the first site,
             shape (F, N).
     """
@@ -527,8 +531,9 @@ def _evaluate_margin(
 ) -> tuple[Array, Array]:
     """Returns the least eigenvalue under weights, and its gradient with respect to their logs.
 
-    With the eigenvector v and the projection P_i on the ports of site i, the derivative of
-    v^H (e^{x/2} Y e^{-x/2} + its Hermitian) v with respect to x_i is Re v^H (P_i Y - Y P_i) v.
+    With the eigenvector v and the projection P_i on the ports of site i, the derivative of v^H
+    (e^{x/2} Y e^{-x/2} + its conjugate transpose) v with respect to x_i is Re v^H (P_i Y - Y
+    P_i) v.
 
     Args:
         Y: Response, shape (F, p, p).

@@ -23,12 +23,12 @@ Sources:
       own measure (docs/studies/ports.md).
 
 Invariant:
-    - Torques act on the joint, so that torque times velocity is the power that the operator
-      supplies.
+    - Torques are those that act ON the joint. Torque times velocity is then the power that the
+      operator supplies.
     - A control law that reflects external torques to the other arms also reflects the torque of
       a clamp.
-    - Frequencies are in rad/s. Frequencies that are shown to people are in Hz, and their names
-      end in _hz.
+    - Frequencies are in rad/s. Frequencies that users see are in Hz, and their names end in
+      _hz.
 """
 
 import math
@@ -53,7 +53,7 @@ _BATCH = 512
 _CIRCLE_POINTS = 64
 """Number of points of the circle around zero on which the response is evaluated."""
 _HIGHEST_POWER = 6
-"""Highest order of a pole at zero that is searched."""
+"""Highest order of a pole at zero that is considered."""
 _NEGLIGIBLE = 1e-3
 """Largest part of the response that counts as zero, as a share of its size."""
 
@@ -111,8 +111,8 @@ class PoleAtZero(NamedTuple):
     response is then about residue / s, and higher powers of 1 / s may be added.
 
     Attributes:
-        order: Highest power of 1 / s. If it is 0, there is no pole, and velocities under a
-            constant torque stay bounded.
+        order: Highest power of 1 / s. If the order is 0, there is no pole, and velocities under
+            a constant torque stay bounded.
         residue: Coefficient of 1 / s, shape (p, m), in rad/s^2 per N m.
     """
 
@@ -155,8 +155,8 @@ def evaluate_transfer(
     Args:
         loop: Linear model of the coupled arms.
         s: Complex frequencies, shape (F,), in 1/s.
-        output: The output matrix C(s). None for the joint velocities, so that the result is the
-            admittance, in rad/s per N m.
+        output: The output matrix C(s). If `None`, the output consists of the joint velocities,
+            and the result is the admittance, in rad/s per N m.
 
     Returns:
         The response, shape (F, p, m), with a row for each of p outputs and a column for each of
@@ -286,8 +286,8 @@ def _parse_port_joint(port: str) -> int:
 def group_ports_by_joint(loop: LinearLoop) -> dict[int, list[int]]:
     """Groups the inputs of a linear model by their joint, in the order of the sites.
 
-    The first joints of all arms, for example, can then be analysed together, apart from the
-    others.
+    For example, the first joints of all arms can then be analysed together, without the other
+    joints.
 
     Args:
         loop: The loop.
@@ -305,8 +305,8 @@ def group_ports_by_joint(loop: LinearLoop) -> dict[int, list[int]]:
 def select_ports(response: PortResponse, ports: list[int]) -> PortResponse:
     """Restricts a frequency response to some joints, at which operators act.
 
-    No operator acts at the other joints, so that their torque is zero, and their rows and
-    columns are left out.
+    No operator acts at the other joints. Their torque is zero, and their rows and columns are
+    left out.
 
     Args:
         response: The response at all ports, as a function of frequency.
@@ -332,11 +332,11 @@ def find_longest_delay_s(loop: LinearLoop) -> float:
 def find_pole_at_zero(loop: LinearLoop) -> PoleAtZero:
     """Finds whether constant torques make the velocities of coupled arms grow.
 
-    This is so if the response Y(s), velocity per torque, has a pole at zero. For example, a
-    free mass m has Y(s) = 1 / (m s). A characteristic root at zero alone is not sufficient. The
-    arms have many of these roots, because they can rest in several poses, and a resting arm has
-    no velocity. The pole is found by Cauchy's integral along a small circle around zero, with
-    the radius `ZERO_ROOT_RADIUS_PER_S`.
+    The velocities grow if the response Y(s), velocity per torque, has a pole at zero. For
+    example, a free mass m has Y(s) = 1 / (m s). A characteristic root at zero alone is not
+    sufficient. The arms have many of these roots, because they can rest in several poses, and a
+    resting arm has no velocity. The pole is found by Cauchy's integral along a small circle
+    around zero, with the radius `ZERO_ROOT_RADIUS_PER_S`.
 
     Args:
         loop: Linear model of the coupled arms.
@@ -473,17 +473,19 @@ def clamp_site(loop: LinearLoop, site: str) -> LinearLoop:
 
 
 TRANSPARENCY_BAND_HZ = (0.1, 10.0)
-"""Band of the means: operators drift below it, and do not move deliberately above it."""
+"""Frequency band over which means are taken. Operators drift below it, and do not move
+deliberately above it.
+"""
 QUOTED_AT_HZ = 1.0
-"""Frequency at which impedances are quoted."""
+"""Frequency at which impedances are reported, in Hz."""
 _SHOWN_HZ = (0.01, 100.0)
-"""Band of the figures."""
+"""Frequency band of the figures, in Hz."""
 _PER_DECADE = 100
-"""Frequencies per decade of this band."""
+"""Number of frequencies per decade of this band."""
 
 
 class Transparency(NamedTuple):
-    """How much of another arm an operator feels: the impedance with it free and clamped.
+    """How much of another arm an operator feels: the impedances with this arm free and clamped.
 
     A transparent system feels light while the other arm is free, and stiff while the other arm
     is clamped.
@@ -491,7 +493,7 @@ class Transparency(NamedTuple):
     Attributes:
         operator_site: Site of the operator.
         other_site: Site that is free or clamped.
-        joint: Number of the joint of the operator's site, from 1 on.
+        joint: Number of the joint of the operator's site, counted from 1.
         w_rad_s: Frequencies, shape (F,), in rad/s.
         free: Impedance with the other site free, shape (F,), in N m s/rad.
         clamped: Impedance with the other site clamped, shape (F,), in N m s/rad.
@@ -510,7 +512,7 @@ class Transparency(NamedTuple):
     def softest_nm_s_rad(self) -> float:
         """Mean impedance that the operator feels while the other arm is free, in N m s/rad.
 
-        The smaller it is, the less the operator feels of the arms themselves. It is the
+        The smaller this mean is, the less the operator feels of the arms themselves. It is the
         geometric mean of the impedance's magnitude over the frequencies of `band_hz`, which are
         weighted as on a logarithmic axis.
         """
@@ -520,17 +522,17 @@ class Transparency(NamedTuple):
     def stiffest_nm_s_rad(self) -> float:
         """Mean impedance that the operator feels while the other arm is clamped, in N m s/rad.
 
-        The larger it is, the harder a rigid obstacle feels. It is the geometric mean of the
-        impedance's magnitude over the frequencies of `band_hz`, which are weighted as on a
+        The larger this mean is, the harder a rigid obstacle feels. It is the geometric mean of
+        the impedance's magnitude over the frequencies of `band_hz`, which are weighted as on a
         logarithmic axis.
         """
         return self._average_magnitude(self.clamped)
 
     @property
     def ratio_db(self) -> float:
-        """Mean ratio of the impedances with a clamped and a free other arm, in dB.
+        """Mean ratio of the impedances with the other arm clamped and free, in dB.
 
-        It is the mean of 20 log10(abs(Z_clamped) / abs(Z_free)) over the frequencies of
+        The ratio is the mean of 20 log10(abs(Z_clamped) / abs(Z_free)) over the frequencies of
         `band_hz`, on a logarithmic axis. Z_clamped and Z_free are the impedances that the
         operator feels while the other arm is clamped or free.
         """
@@ -539,7 +541,7 @@ class Transparency(NamedTuple):
 
     @property
     def difference_nm_s_rad(self) -> float:
-        """Mean difference of the impedances with a clamped and a free other arm, in N m s/rad.
+        """Mean difference of the impedances with the other arm clamped and free, in N m s/rad.
 
         It is the geometric mean of abs(Z_clamped - Z_free) over the frequencies of `band_hz`,
         which are weighted as on a logarithmic axis. Z_clamped and Z_free are the impedances
@@ -553,7 +555,7 @@ class Transparency(NamedTuple):
     def interpolate_magnitudes(self, frequency_hz: float) -> tuple[float, float]:
         """Returns the magnitudes of the impedances that an operator feels at one frequency.
 
-        They are interpolated between the computed frequencies on logarithmic axes.
+        The magnitudes are interpolated between the computed frequencies on logarithmic axes.
 
         Args:
             frequency_hz: The frequency, in Hz.
@@ -596,7 +598,7 @@ class Transparency(NamedTuple):
 
 
 def measure_transparency(loop: LinearLoop, at: str, of: str) -> tuple[Transparency, ...]:
-    """Computes what an operator feels of another arm that is free, and that is clamped.
+    """Computes what an operator feels of another arm while it is free and while it is clamped.
 
     With ideal transparency the operator would feel nothing while the other arm is free, and a
     rigid arm while it is clamped. The impedance along each joint i is Z(j w) = 1 / Y_ii(j w)
@@ -611,7 +613,7 @@ def measure_transparency(loop: LinearLoop, at: str, of: str) -> tuple[Transparen
         The transparency along each joint of the operator's site.
 
     Raises:
-        UsageError: There is no such site, or both are the same.
+        UsageError: There is no such site, or the two sites are the same.
     """
     low, high = _SHOWN_HZ
     decades = np.log10(high / low)

@@ -1,11 +1,11 @@
-"""Computes how fast the state of an arm and its controller changes, and the derivatives.
+"""Computes rates of change of the states of an arm and its controller, and their derivatives.
 
 The linear analysis needs the derivatives of the rates of change with respect to the state: the
-joint angles, the joint velocities, and the parameter estimates of the control law. They are
-computed with a complex step: the derivative of a function f at x is Im f(x + i h) / h, where i
-is the imaginary unit and h = 1e-30. Nothing is subtracted. Therefore the result is exact to
-rounding (Squire and Trapp, "Using complex variables to estimate derivatives of real functions",
-SIAM Review 40, 1998).
+joint angles, the joint velocities, and the parameter estimates of the control law. The
+derivatives are computed with a complex step: the derivative of a function f at x is Im f(x + i
+h) / h, where i is the imaginary unit and h = 1e-30. The formula contains no subtraction.
+Therefore the result is exact to rounding (Squire and Trapp, "Using complex variables to
+estimate derivatives of real functions", SIAM Review 40, 1998).
 
 Invariant:
     - All arithmetic is plain NumPy on `textbook_arm`, without the compiled simulation kernel,
@@ -43,7 +43,7 @@ class ArgumentLayout:
     Args:
         joints: Number of joints n, which is the length of q, qd and the external torque.
         parameters: Length of the estimate.
-        shared: Length m of each part that comes from peers. 0 for as many as there are joints.
+        shared: Length m of each part that comes from peers. If 0, m is the number of joints.
         peers: Number of peers whose samples an imported law also reads one by one.
 
     Attributes:
@@ -53,8 +53,8 @@ class ArgumentLayout:
             pose, see `textbook_arm`.
         peer_torque: External torque of the peers. In task space their force.
         external_torque: Torque that an operator adds on the joints.
-        inputs: Everything from peers: the reference, its derivative, their torque, and then the
-            samples of the single peers.
+        inputs: All values from peers: the reference, its derivative, their torque, and then the
+            samples of the individual peers.
         coordinates: Length m of each part that comes from peers.
         states: Length of the site's state: q, qd and theta_hat.
         arguments: Length of the whole vector.
@@ -72,7 +72,7 @@ class ArgumentLayout:
         self.shared = shared
         self.peers = peers
         self.coordinates = m = shared or joints
-        # in the order of the attributes; index 6 are the samples of the single peers
+        # in the order of the attributes; index 6 contains the samples of the individual peers
         lengths = (joints, joints, parameters, m, m, m, 3 * m * peers, joints)
         ends = accumulate(lengths, initial=0)
         slices = [slice(start, stop) for start, stop in pairwise(ends)]
@@ -89,7 +89,7 @@ class ArgumentLayout:
         self.inputs = slice(self.states, self.external_torque.start)
 
     def peer_sample(self, index: int) -> slice:
-        """Returns where the argument vector has the values received from one other arm.
+        """Returns the slice of the argument vector that contains the values from one other arm.
 
         The values are the pose of that arm, the velocity of the pose, and the external torque,
         in this order.
@@ -106,8 +106,8 @@ def lay_out_arguments(site: SiteSetup) -> ArgumentLayout:
     """Returns where each state and input of a site is stored in one vector.
 
     A site is a process that runs one arm. The vector is the argument of the functions that
-    compute how fast the states change. If a user wrote the control law, the numbers that the
-    law stores take the place of the parameter estimates.
+    compute how fast the states change. If a user wrote the control law, the values that the law
+    stores take the place of the parameter estimates.
 
     Args:
         site: Setup of the site.
@@ -154,7 +154,7 @@ class SiteRates(NamedTuple):
         x: Pose that peers receive, shape (m, ...): joint angles, or position and orientation,
             see `textbook_arm.Following`.
         xd: Velocity of x.
-        reflected: External and held torque as peers receive it. In task space a force.
+        reflected: Sum of external and held torque, as peers receive it. In task space a force.
     """
 
     qdd: Numbers
@@ -235,7 +235,7 @@ def evaluate_site_rates(site: SiteSetup, x: Numbers) -> SiteRates:
     """Computes how fast the states of a site change, and the torques that act on its arm.
 
     A site is a process that runs one arm. Its states are joint angles, joint velocities and
-    parameter estimates. Operators and environments, such as walls, act as they do in the setup.
+    parameter estimates. Operators and environments, such as walls, act as defined in the setup.
     The equations are those of the site's control law and of the dynamics of its arm
     (docs/reference/laws.md).
 
@@ -317,11 +317,11 @@ def differentiate_site_rates(site: SiteSetup, x: Array) -> SiteRates:
 
 
 def has_estimate(site: SiteSetup) -> bool:
-    """Returns whether the control law of a site changes numbers from tick to tick.
+    """Returns True if the control law of a site has a state that changes from tick to tick.
 
-    A site is a process that runs one arm, and a tick is a period of its control loop. The
-    numbers are the parameter estimates of the adaptive law, or the memory of a law that a user
-    wrote. They belong to the site's state, in addition to angles and velocities.
+    A site is a process that runs one arm, and a tick is a period of its control loop. This
+    state consists of the parameter estimates of the adaptive law, or of the memory of a law
+    that a user wrote. It belongs to the site's state, in addition to angles and velocities.
 
     Args:
         site: Setup of the site.
@@ -470,8 +470,9 @@ def _sum_actors(
         site: Setup of the site, with the operators and environments in force.
         arm: The arm in the pose of x.
         x: Arguments of the site's rates, shape (arguments, ...).
-        layout: Where x contains the angles and velocities.
-        sampled: True for those that act once per tick, False for those that act continuously.
+        layout: Positions of the angles and velocities in x.
+        sampled: True for the sources that act once per tick, False for the sources that act
+            continuously.
 
     Returns:
         Torque on the joints, shape (n, ...), in N m.
@@ -494,7 +495,7 @@ def _evaluate_actor(
     """Returns the torque of one operator or environment in force, shape (n, ...), in N m.
 
     An operator's motion has ended, and a scripted torque has the constant value `a`. A model
-    that a user wrote keeps its parameters of the time `move_end_s`.
+    that a user wrote keeps the parameters that it has at the time `move_end_s`.
     """
     if actor.kind in SCRIPTED_KINDS:
         return _as_columns(actor.a, q)
@@ -586,8 +587,8 @@ def describe_switching_points(site: SiteSetup, x: Array) -> Iterator[str]:
 def _find_switching_estimates(site: SiteSetup, x: Array) -> NDArray[np.bool_]:
     """Finds parameter estimates at which the control law has no two-sided derivative.
 
-    They rest exactly at a limit, and the law does not hold them. The result is True for each
-    such estimate, shape (P,).
+    These estimates are exactly at a limit, and the law does not hold them there. The result is
+    True for each of them, shape (P,).
     """
     layout = lay_out_arguments(site)
     gains = site.gains

@@ -2,18 +2,18 @@
 
 The arm is a chain of n joints. The module also computes the reference motion with which the arm
 follows other arms. All equations are written in plain NumPy and share no code with the compiled
-simulation, so that both check each other. The planar arm with two joints is in
-`analysis.arm_rows.PlacedArm`. Vectors have their components on the first axis and any number of
-columns behind it.
+simulation, and therefore serve as an independent check. The planar arm with two joints is in
+`analysis.arm_rows.PlacedArm`. Vectors have their components on the first axis, and any number
+of columns on the following axes.
 
-The equations use spatial vectors, which join a linear and an angular half (Featherstone, "Rigid
-Body Dynamics Algorithms", 2008). The linear half comes first and belongs to the origin of the
-link's own frame. The following symbols are used:
+The equations use spatial vectors, which combine a linear and an angular half (Featherstone,
+"Rigid Body Dynamics Algorithms", 2008). The linear half comes first and belongs to the origin
+of the link's own frame. The following symbols are used:
 
 - q, qd: joint angles and their velocities.
 - v, a: reference velocities and accelerations of the joints, from the control law.
 - J_i, I_i: Jacobian and spatial inertia of link i. V_i = J_i qd and W_i = J_i v are velocities.
-- X, S: transformation from the frame of the link before, and axis of the joint.
+- X, S: transformation from the frame of the previous link, and axis of the joint.
 - x, x*: cross products of spatial motions and of spatial forces.
 
 The acceleration of link i includes gravity and follows from the acceleration A_p of the link
@@ -27,14 +27,14 @@ the regressor Y = (J_1' F_1 ... J_n' F_n), the matrix that multiplies the parame
 torque, and the inertia matrix M = sum_i J_i' I_i J_i.
 
 If end effectors instead of joints follow each other, the reference motion is computed as in
-`analysis.following.find_task_reference`. docs/reference/task-space.md has the equations and
-sources.
+`analysis.following.find_task_reference`. docs/reference/task-space.md contains the equations
+and sources.
 
 Invariant:
     - The arithmetic of the compiled simulation is not used.
     - Every function is analytic in every argument. Therefore a complex step gives derivatives
-      that are exact to rounding. The only exception is a chain that meets a joint stop, where
-      the real part of the argument decides.
+      that are exact to rounding. The only exception is a chain at a joint stop, where the real
+      part of the argument selects the branch.
 """
 
 from collections.abc import Sequence
@@ -143,10 +143,10 @@ class _PlacedLink(NamedTuple):
     """Pose and Jacobian of one link of an arm, for one or several poses of the arm.
 
     The arm has n joints. The axes "..." of the arrays stand for the poses. A spatial velocity
-    joins a linear and an angular velocity.
+    combines a linear and an angular velocity.
 
     Attributes:
-        X: Transformation of spatial velocities from the frame of the link before into this
+        X: Transformation of spatial velocities from the frame of the previous link into this
             link's frame, shape (6, 6, ...).
         S: Spatial velocity of the link's joint at speed 1, shape (6,).
         J: Jacobian that maps joint velocities to the link's spatial velocity, shape (6, n,
@@ -166,9 +166,9 @@ class _PlacedLink(NamedTuple):
 class PlacedChain:
     """Dynamics of a serial arm with n joints in given poses, such as its inertia matrix.
 
-    It is written from textbook formulas, independently of the simulation, to check the
-    simulation. The trailing axes "..." stand for the poses. It has the same methods as the
-    planar arm, `PlacedArm`.
+    The class follows textbook formulas and is independent of the simulation, in order to check
+    it. The trailing axes "..." stand for the poses. It has the same methods as the planar arm,
+    `PlacedArm`.
 
     Args:
         chain: Description of the links and joints.
@@ -479,10 +479,10 @@ class PlacedChain:
 
 
 def _multiply_inertia_units(motion: Numbers) -> Numbers:
-    """Returns the momentum that a spatial motion gives each of the ten inertial parameters.
+    """Returns the momentum of a spatial motion for each unit inertial parameter of a link.
 
     Column p of the result, shape (6, 10, ...), is the momentum of a link whose parameter p is 1
-    and all others 0.
+    and whose other parameters are 0.
     """
     momentum: Numbers = np.einsum("pab,b...->ap...", _INERTIA_UNITS, motion)
     return momentum
@@ -494,7 +494,7 @@ def _transform_velocities(R: Numbers, p: Numbers) -> Numbers:
     A spatial velocity has six components, three of rotation and three of translation.
 
     Args:
-        R: Orientation of the link in the frame of the link before, shape (3, 3, ...).
+        R: Orientation of the link in the frame of the previous link, shape (3, 3, ...).
         p: Origin of the link in that frame, shape (3, ...), in m.
     """
     R_transposed = _transpose(R)
@@ -518,7 +518,7 @@ def _find_joint_axis(joint: ChainJoint) -> Array:
 
 
 def _place_joint(joint: ChainJoint, q: Numbers) -> tuple[Numbers, Numbers]:
-    """Returns a link's orientation and origin in the frame of the link before.
+    """Returns a link's orientation and origin in the frame of the previous link.
 
     A revolute joint turns by Rodrigues' formula, R = R_0 (1 + sin q K + (1 - cos q) K^2) with
     the cross matrix K of the axis.
@@ -556,7 +556,7 @@ def _place_joint(joint: ChainJoint, q: Numbers) -> tuple[Numbers, Numbers]:
 SINGULAR = 1e-9
 """A pose is singular if the squared least singular value of its Jacobian is below this."""
 _SMALL = 1e-4
-"""Squares of angles below this are small: four terms of a series are exact."""
+"""Squares of angles below this are small: four terms of a series are then exact."""
 
 
 def rotation_from_vector(vector: Numbers) -> Numbers:
@@ -620,7 +620,7 @@ def vector_from_rotation(R: Numbers) -> Numbers:
     series = 1.0 - t_square * series_inner
     small_factor = 2.0 / small_w * series
 
-    # the arctangent of a ratio of at most 1, so that no part of it divides by zero
+    # the arctangent of a ratio of at most 1, which avoids any division by zero
     is_below = sine.real <= w.real
     nonzero_w = np.where(w == 0.0, 1.0, w)
     divisor = np.where(is_below, nonzero_w, sine)
@@ -744,19 +744,19 @@ def evaluate_reference(shares: Array, site_pose: Numbers, shared: Sequence[Numbe
 class Following(NamedTuple):
     """Errors and reference motion with which an arm follows other arms.
 
-    Either its n joints follow, or its end effector (tip) along m coordinates. In the first case
-    m is n.
+    Either its n joints follow, or its end effector (tip) along m coordinates. If the joints
+    follow, m is n.
 
     Attributes:
         x: Pose that other arms can follow, shape (m, ...).
         xd: Velocity of x, with an angular velocity for the orientation, shape (m, ...).
-        e: Error of the followed coordinates, x less the desired pose, shape (m, ...).
-        ed: Error of the velocities, xd less the desired velocity, shape (m, ...).
+        e: Error of the followed coordinates, x minus the desired pose, shape (m, ...).
+        ed: Error of the velocities, xd minus the desired velocity, shape (m, ...).
         v: Reference velocity of the joints, shape (n, ...), in rad/s.
         a: Reference acceleration of the joints, the derivative of v, shape (n, ...), in
             rad/s^2.
-        J: Jacobian of the followed axes, shape (m, n, ...). None if joints follow.
-        A: Product J J', with a damping near singular poses, shape (m, m, ...). None if joints
+        J: Jacobian of the followed axes, shape (m, n, ...). `None` if joints follow.
+        A: Product J J', with a damping near singular poses, shape (m, m, ...). `None` if joints
             follow.
         least: Lower bound of the squared least singular value of J before the damping. Infinite
             if joints follow.
@@ -953,7 +953,7 @@ def _subtract_poses(x: Numbers, x_des: Numbers) -> Numbers:
 
 
 def _damp(task: TaskSetup, J: Numbers) -> tuple[Numbers, float]:
-    """Returns J J', damped near singular poses, and the bound that decides about damping.
+    """Returns J J', damped near singular poses, and the bound that determines the damping.
 
     The bound 1 / trace((J J')^-1) is at most the square of the least singular value of J. Below
     the limit sigma^2, it is raised to the limit by adding the difference to the diagonal

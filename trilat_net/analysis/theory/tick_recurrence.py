@@ -1,8 +1,8 @@
 """Compiled inner loop of the linear model in ticks, in which `floquet` spends most of its time.
 
 A linear model of N sites computes the state of each site tick by tick from its own last state
-and from samples of its peers. The matrices have about eight rows, so that calls of a library
-for linear algebra would take ten times as long as the products themselves.
+and from samples of its peers. The matrices have about eight rows. For this size, calls of a
+linear algebra library would take ten times as long as the products themselves.
 """
 
 from ...core import Array, IntArray, leaf
@@ -13,10 +13,11 @@ def add_matrix_products(states: Array, matrix: Array, track: Array, rows: IntArr
     """Adds to the states of consecutive ticks a matrix times earlier states.
 
     It computes states[k] += matrix @ track[rows[k]] for k = 0, 1, .... `states` may be a part
-    of `track`: a tick may then use the states of the tick before, which are complete.
+    of `track`: a tick may then use the states of the previous tick, which are complete.
 
     Args:
-        states: States of K ticks, shape (K, n, columns), with one motion per column. Changed.
+        states: States of K ticks, shape (K, n, columns), with one motion per column. They are
+            changed in place.
         matrix: Matrix, shape (n, m).
         track: States of a site in all ticks, shape (ticks, m, columns).
         rows: Row of the track that each tick uses, shape (K,).

@@ -1,9 +1,10 @@
-"""Decides whether an oscillation grows, decays or stays, over the second half of a run.
+"""Decides whether an oscillation grows, decays or persists, over the second half of a run.
 
 The envelope of a signal is its largest magnitude in each short interval of time. The second
-half of the run is divided into 16 equal windows. If these do not decide, it is divided into 8.
-The maximum of each window, at least `FLOOR_RAD`, is taken. A straight line is fitted to the
-logarithms of these maxima. Its slope has one-sided confidence bounds of 99.5 % (Student's t).
+half of the run is divided into 16 equal windows. If these windows do not decide, the half is
+divided into 8 windows. The maximum of each window, at least `FLOOR_RAD`, is taken. A straight
+line is fitted to the logarithms of these maxima. Its slope has one-sided confidence bounds of
+99.5 % (Student's t).
 
 The classes use the four quarters of the second half, and the three steps between the maxima of
 successive quarters:
@@ -11,8 +12,8 @@ successive quarters:
 - GROWS: the lower bound of the slope is positive, and each step is a rise by 1 % or more. The
   rise does not slow down: in logarithms, the last step is at least 3/4 of the first. If the
   maxima rise by more than a factor of 8/5 in all, 0.45 of the first step suffices, because no
-  saturating response that starts at zero does that. Growth does not count if the first half of
-  the run falls by 1 % or more from each quarter to the next.
+  saturating response that starts at zero rises so much. Growth does not count if the first half
+  of the run falls by 1 % or more from each quarter to the next.
 - DECAYS: the upper bound of the slope is negative, and the line falls by a factor of two or
   more. The last step is a fall of at least half the size that it has in a steady fall by a
   factor of two. An envelope whose last quarter does not exceed `FLOOR_RAD` decays as well.
@@ -39,17 +40,18 @@ FLOOR_RAD = 1e-12
 _T_QUANTILES = {16: 2.977, 8: 3.707}
 """99.5 % quantiles of Student's t with n - 2 degrees of freedom, by the number n of windows.
 
-They have only these digits, because the classes of published runs were made with them.
+No further digits are used, because the classes of published runs were computed with these
+values.
 """
 
 _LEAST_STEP = math.log(1.01)
-"""Least rise of the maxima from quarter to quarter of an envelope that grows: 1 %."""
+"""Smallest rise of the maxima from quarter to quarter in an envelope that grows: 1 %."""
 _DOUBLE = math.log(2.0)
 """Logarithm of a doubling."""
 _LARGEST_CALM_RISE = math.log(1.25)
-"""Largest rise within the half that the upper bound of a calm envelope admits."""
+"""Largest rise within the half that the upper bound of a calm envelope may permit."""
 _LARGEST_CALM_STEP = math.log(1.5)
-"""Largest rise of a calm envelope from the last quarter but one to the last quarter."""
+"""Largest rise of a calm envelope from the third quarter to the last quarter."""
 _LARGEST_RISE_FROM_ZERO = math.log(8.0 / 5.0)
 """Largest rise over the quarters of a response that starts at zero and saturates."""
 
@@ -76,10 +78,10 @@ class EnvelopeFit(NamedTuple):
         trend: Class of the trend, such as growing or decaying.
         rate_per_s: Rate of the envelope, which is proportional to exp(rate t), in 1/s. NaN if
             the record is too short.
-        calm: True if the envelope is not about to grow. Two conditions must hold. First, it
-            falls, or it certainly rises by less than a quarter within the second half of the
-            run. Second, its maximum in the last quarter of this half is at most 1.5 times its
-            maximum in the quarter before.
+        calm: True if the envelope is not about to grow. Two conditions must hold. First, the
+            envelope falls, or its rise within the second half of the run is certainly less than
+            a quarter. Second, its maximum in the last quarter of this half is at most 1.5 times
+            its maximum in the previous quarter.
     """
 
     trend: EnvelopeTrend
@@ -94,7 +96,7 @@ def fit_envelopes(
     *,
     falls_first: bool = False,
 ) -> list[EnvelopeFit]:
-    """Determines whether oscillations grow, decay or stay, over the second half of a run.
+    """Determines whether oscillations grow, decay or persist, over the second half of a run.
 
     The module's docstring defines these classes of the trend.
 
@@ -103,8 +105,8 @@ def fit_envelopes(
         values: The C envelopes, shape (K, C). Each is the largest magnitude of a signal in the
             interval that ends at a time.
         floor: Value below which an envelope counts as zero. It has the unit of `values`.
-        falls_first: True if an envelope that falls and then rises counts as growing too. By
-            default its trend is undecided.
+        falls_first: True if an envelope that first falls and then rises counts as growing. By
+            default the trend of such an envelope is undecided.
 
     Returns:
         The trend of each of the C envelopes.
@@ -128,7 +130,7 @@ def fit_envelopes(
     if falls_first or not growing:
         return fits
 
-    # growth after a fall in the first half is a V; in reversed time the fall is a rise
+    # growth after a fall in the first half is a V shape; in reversed time the fall is a rise
     reversed_t_s = -t_s[::-1]
     reversed_values = values[::-1, growing]
     first_half = _find_window_maxima(reversed_t_s, reversed_values, 4, floor)
@@ -150,8 +152,8 @@ def _find_window_maxima(
 ) -> Array | None:
     """Returns the maximum amplitude in each of several equal windows of time.
 
-    Maxima of windows remove the oscillation. Only the second half of the run counts, after the
-    first transients.
+    Maxima of windows remove the oscillation. Only the second half of the run is considered,
+    after the first transients.
 
     Args:
         t_s: Ascending times, shape (K,), in s.
@@ -160,7 +162,7 @@ def _find_window_maxima(
         floor: Smaller maxima are replaced by this value.
 
     Returns:
-        The maxima, shape (windows, C). None if some window has fewer than two points.
+        The maxima, shape (windows, C). `None` if some window has fewer than two points.
     """
     if not len(t_s):
         return None
@@ -183,7 +185,7 @@ def _fit_maxima(maxima: Array, window_s: float, log_floor: float) -> list[Envelo
     Args:
         maxima: Maxima of n equal windows of C envelopes, shape (n, C).
         window_s: Length of a window, in s.
-        log_floor: Logarithm of the floor. An envelope below it is at rest.
+        log_floor: Logarithm of the floor. An envelope below the floor counts as zero.
     """
     windows = len(maxima)
     log_maxima = np.log(maxima)
@@ -224,7 +226,7 @@ def _classify_trend(
     *,
     dead: bool,
 ) -> EnvelopeTrend:
-    """Returns whether an amplitude grows, decays or stays, from a fitted line and its error.
+    """Returns whether an amplitude grows, decays or persists, from a fitted line and its error.
 
     The docstring of the module defines these classes.
 

@@ -51,14 +51,14 @@ from .envelope_trend import EnvelopeFit, EnvelopeTrend, fit_envelopes
 LEAST_LEFT_S = 5.0
 """Shortest departure from a rest position that counts, in s."""
 DOUBLES = 2.0
-"""Least growth of the speed during a departure from a rest, as a factor.
+"""Smallest factor by which the speed must grow during a departure from rest.
 
-Pushes of runs with random delays must grow by the same factor, to exclude chance.
+If delays are random, the effects of pushes must grow by the same factor, to exclude chance.
 """
 CLEAR_GROWTH = 100.0
-"""Growth of an unstable mode, as a factor, that shows in a push of any direction.
+"""Growth of an unstable mode, as a factor, that a push in any direction reveals.
 
-A push excites all modes. Growth of one of them by this factor outweighs the decay of the rest.
+A push excites all modes. Growth of one mode by this factor outweighs the decay of the others.
 """
 _TRENDS_FROM_BEST = (
     EnvelopeTrend.DECAYS,
@@ -70,13 +70,13 @@ _TRENDS_FROM_BEST = (
 _AMPLITUDE_FLOOR = 1e-300
 """Smallest amplitude in a fit. The amplitudes are scaled and have no unit."""
 SAME_SCALED = math.log(1.1)
-"""Largest difference of the logarithms of two scaled twins that count as equal: 10 %."""
+"""Largest difference between the logarithms of two scaled twins that count as equal: 10 %."""
 MOST_LOG = 700.0
 """Largest argument of the exponential function that certainly does not overflow."""
 
 
 class PushGrowth(NamedTuple):
-    """How the effect of one push developed over the judged part of a run.
+    """Development of the effect of one push over the judged part of a run.
 
     A push is a small disturbance in a repetition of the run, which is called a twin. Its effect
     is the difference between the twin and the run. If some arms of the scenario do not follow
@@ -90,16 +90,16 @@ class PushGrowth(NamedTuple):
         factor: Factor by which the difference changed over the judged part. 0 if it died down
             to the rounding errors.
         joint: Name of the joint with the worst trend: the joint at which the difference is
-            largest at the end, or a joint that grows, or stays, although the largest difference
-            dies away.
+            largest at the end, or a joint whose difference grows or persists although the
+            largest difference dies away.
         group: Index of the group of sites.
         becomes_rad_s: Largest difference in the last second, in rad/s, with all scalings of
             the difference undone.
         ended_s: Time at which the twin ended before the run, in s, because the difference died
-            down to the rounding errors or the twin diverged. None if the twin did not end
+            down to the rounding errors or the twin diverged. `None` if the twin did not end
             early.
-        leads: True if the difference is largest at this joint at the end, or grows also when
-            all joints are taken together.
+        leads: True if the difference at the end is largest at this joint, or if the difference
+            of all joints together grows as well.
     """
 
     push: Push
@@ -128,7 +128,7 @@ class _MissChance(NamedTuple):
 
     @classmethod
     def of_directions(cls, directions: int) -> "_MissChance":
-        """Estimates how likely pushes in random directions miss a mode that grows clearly.
+        """Estimates how likely pushes in random directions are to miss a clearly growing mode.
 
         A mode that grows by `CLEAR_GROWTH` is missed if less than 1 / `CLEAR_GROWTH` of the
         usual share of every push excites it. The share of a mode in a push with many random
@@ -145,10 +145,10 @@ class _MissChance(NamedTuple):
 
 
 class RestDeparture(NamedTuple):
-    """Interval of time in which a run moved away from rest by itself, so that rest is unstable.
+    """Interval of time in which a run moved away from rest by itself: this rest is unstable.
 
-    Its twins, repeated runs with a small push, did the same. Nobody acted on the arms during
-    this time.
+    Its twins, repeated runs with a small push, did the same. No operator or wall acted on the
+    arms during this time.
 
     Attributes:
         from_s: Start, in s.
@@ -170,20 +170,21 @@ class TwinGrowth(NamedTuple):
     the twin and the run is then observed.
 
     Attributes:
-        why: The reason why there are no twins. Empty if there are.
+        why: The reason why there are no twins. Empty if there are twins.
         from_s: Start of the part of the run that is judged, in s.
         to_s: End of this part, in s.
         pushes: Growth of every push, in every group of sites that follow each other.
-        departure: Fastest departure of the run from a rest. None if there was none.
+        departure: Fastest departure of the run from rest. `None` if the run did not leave a
+            position of rest.
         same_platform: False if the run was recorded on another platform. The last bits of the
             repeated run may then differ from the log.
-        links_random: True if some link draws its delays at random. Slow trends may then be
-            chance.
+        links_random: True if some link draws its delays at random. Slow trends may then be due
+            to chance.
         delay_period_s: Time after which delays that vary, and the ticks of all sites, repeat,
-            in s. None if delays are constant, random, or never repeat.
-        burst_interval_s: Mean time from one burst of lost samples to the next one, in s. None
-            if no link loses samples in bursts.
-        twins: The twins themselves, for figures. None if there are none.
+            in s. `None` if delays are constant, random, or never repeat.
+        burst_interval_s: Mean time from one burst of lost samples to the next, in s. `None` if
+            no link loses samples in bursts.
+        twins: The twins themselves, for figures. `None` without twins.
     """
 
     why: str
@@ -199,7 +200,7 @@ class TwinGrowth(NamedTuple):
 
     @property
     def hides_period(self) -> bool:
-        """True if the delays repeat only after more time than the judged part of the run.
+        """True if the period of the delays is longer than the judged part of the run.
 
         Pushes that died away in this part might then grow in the rest of the period. A decision
         without a proof therefore stays open.
@@ -211,8 +212,8 @@ class TwinGrowth(NamedTuple):
     def trend(self) -> EnvelopeTrend:
         """Whether the effect of the worst push grows or dies away, as a class.
 
-        The worst push is the push whose effect grows most or dies away most slowly. Undecided
-        if there are no pushes.
+        The worst push is the push whose effect grows most or dies away most slowly. The trend
+        is undecided if there are no pushes.
         """
         return EnvelopeTrend.UNDECIDED if self.worst is None else self.worst.trend
 
@@ -221,7 +222,7 @@ class TwinGrowth(NamedTuple):
         """The small push whose effect on the run grew most, or died away most slowly.
 
         Each push was made in a repetition of the run. The trend of this push counts as the
-        trend of the whole run. None if there are no pushes.
+        trend of the whole run. `None` if there are no pushes.
         """
         return max(self.pushes, key=_rank_badness, default=None)
 
@@ -231,11 +232,11 @@ class TwinGrowth(NamedTuple):
 
         A push is a small disturbance in a repetition of the run. Arms that follow each other
         form a group. The disturbances of a group grow if the effects of at least half of its
-        pushes grow throughout, from `from_s` to `to_s`. They also grow if the motion of the
-        same joint grows throughout after at least two pushes, and is the fastest motion after
-        one of them: a joint that does not act on the others moves only after the pushes that
-        reach it. If network delays are random, the effects must grow by a factor of two, to
-        exclude chance.
+        pushes grow throughout, from `from_s` to `to_s`. The disturbances also grow if the
+        motion of the same joint grows throughout after at least two pushes, and is the fastest
+        motion after one of these pushes. The reason is that a joint that does not act on the
+        others moves only after the pushes that reach it. If network delays are random, the
+        effects must grow by a factor of two, to exclude chance.
         """
         least_factor = DOUBLES if self.links_random else 1.0
         grown = []
@@ -257,9 +258,9 @@ class TwinGrowth(NamedTuple):
 
     @property
     def miss_chance(self) -> _MissChance | None:
-        """How likely random pushes fail to reveal that a run is unstable.
+        """Probability that random pushes fail to reveal that a run is unstable.
 
-        None if each joint was pushed by itself, because such pushes have no random direction.
+        `None` if each joint was pushed by itself, because such pushes have no random direction.
         """
         directions = {push.push.direction for push in self.pushes if push.push.direction}
         if not directions:
@@ -270,8 +271,9 @@ class TwinGrowth(NamedTuple):
     def judged_bursts(self) -> float:
         """Mean number of bursts of lost messages in the judged part of the run.
 
-        A trend over few bursts says little about a run with more of them. The network link with
-        the fewest bursts counts. Infinite if no link loses messages in bursts.
+        A trend over few bursts says little about a run with more bursts. The number is that of
+        the network link with the fewest bursts. It is infinite if no link loses messages in
+        bursts.
         """
         if self.burst_interval_s is None:
             return math.inf
@@ -281,8 +283,8 @@ class TwinGrowth(NamedTuple):
     def needs_s(self) -> float | None:
         """Length that the run should have to show clearly that small pushes die away, in s.
 
-        This length gives the push that dies away most slowly the time to halve four more times
-        at its present rate. None if the pushes do not die away, or if the run is long enough
+        Within this length, the push that dies away most slowly can halve four more times at its
+        present rate. `None` if the pushes do not die away, or if the run is long enough
         already.
         """
         worst = self.worst
@@ -303,10 +305,10 @@ class TwinGrowth(NamedTuple):
         return math.log(CLEAR_GROWTH) / judged_s if dies else math.inf
 
     def to_json(self) -> dict[str, Any]:
-        """Returns the trend of each push, and of all together, as plain values for JSON.
+        """Converts the trends of each push and of all pushes together to plain JSON values.
 
         The trend of a push states how its effect developed, with its rate in 1/s and the factor
-        by which it grew or fell. Numbers that are not finite become None.
+        by which it grew or fell. Numbers that are not finite become `None`.
         """
         pushes = [
             {
@@ -336,10 +338,10 @@ class TwinGrowth(NamedTuple):
     def text(self) -> str:
         """A sentence for the user that says whether small pushes of the run grow or die away.
 
-        It describes the push that grows most or dies away most slowly. If the arms left a
-        position of rest by themselves, the sentence describes that motion instead. If the run
-        was not repeated with pushes, the sentence gives the reason. The package `presentation`
-        writes it.
+        The sentence describes the push that grows most or dies away most slowly. If the arms
+        left a position of rest by themselves, the sentence describes that motion instead. If
+        the run was not repeated with pushes, the sentence gives the reason. The package
+        `presentation` writes it.
         """
         return str(find_hook("describe a finding")(self))
 
@@ -358,8 +360,8 @@ class TwinGrowth(NamedTuple):
 
         Args:
             log: The log of the run.
-            end: The end of the run, which states from when on the run is judged.
-            count: Number of twins. None for one push of every joint.
+            end: The end of the run, which states the start of the judged part.
+            count: Number of twins. `None` for one push of every joint.
             own_laws: True to run the code of control laws that are not part of this program.
 
         Returns:
@@ -385,13 +387,13 @@ class TwinGrowth(NamedTuple):
     ) -> "TwinGrowth":
         """Simulates a scenario with small pushes, and judges whether their effects grow.
 
-        This needs no log: the run and its repetitions with a push, the twins, are simulated.
+        No log is needed: the run and its repetitions with a push, the twins, are simulated.
 
         Args:
             scenario: The description of the experiment.
-            end: The end of the run, which states from when on the run is judged.
+            end: The end of the run, which states the start of the judged part.
             duration_s: Length of the run, in s.
-            count: Number of twins. None for one push of every joint.
+            count: Number of twins. `None` for one push of every joint.
 
         Raises:
             ScenarioError: The scenario cannot run in virtual time.
@@ -414,10 +416,10 @@ def judge_twins(
     Args:
         scenario: The description of the experiment.
         twins: The twins.
-        counts_from_s: Time from which the run counts, in s. The second half of the time after
-            it is judged.
-        quiet_from_s: Time from which nobody acts on the run, and its control loop does not
-            change, in s. Departures from a rest are searched from there on.
+        counts_from_s: Time after which the run is considered, in s. The second half of the time
+            after it is judged.
+        quiet_from_s: Time after which no operator acts on the run and its control loop does not
+            change, in s. Departures from rest are searched for after this time.
     """
     t_s = twins.paths[0].t_s
     has_motion = twins.speed.any(axis=1) | np.isfinite(twins.paths[0].largest).any(axis=1)
@@ -473,7 +475,7 @@ def _find_varying_period_s(scenario: Scenario) -> float | None:
 
     Pushes are judged over whole periods, because they may grow in one part of a period and die
     away in another. The period is that of all links and of the ticks of all sites. The result
-    is None if all delays are constant, or if some delay never repeats.
+    is `None` if all delays are constant, or if some delay never repeats.
     """
     links = [find_final_link(scenario, name) for name in scenario.links]
     if all(link.to_core_model().kind == DelayKind.CONSTANT for link in links):
@@ -482,14 +484,14 @@ def _find_varying_period_s(scenario: Scenario) -> float | None:
 
 
 def _fit_to_period(counts_from_s: float, end_s: float, period_s: float | None) -> float:
-    """Moves the start of the judged part of a run so that its second half has whole periods.
+    """Moves the start of the judged part such that its second half contains whole periods.
 
     Otherwise the judgement would depend on the part of the period in which the run ends.
 
     Args:
-        counts_from_s: Start of the part that counts, in s.
+        counts_from_s: Start of the part to consider, in s.
         end_s: End of the part, in s.
-        period_s: Period of the delays, in s. None if they are constant or never repeat.
+        period_s: Period of the delays, in s. `None` if they are constant or never repeat.
 
     Returns:
         The later start, in s. It is unchanged if the second half is shorter than a period.
@@ -511,7 +513,7 @@ def measure_amplitude(path: TwinPath, group: Sequence[int]) -> Array:
 
     Args:
         path: The twin's difference from its run at K times.
-        group: Indices of the joints that count.
+        group: Indices of the joints to consider.
 
     Returns:
         log A, shape (K,), with A in rad/s. It is -inf where the difference is zero. It is never
@@ -534,9 +536,9 @@ def measure_amplitude(path: TwinPath, group: Sequence[int]) -> Array:
 def _measure_interval(differences: Array, scale: Array, largest: Array) -> Array:
     """Returns log A between two pushes, where A is the size of the effect of a push.
 
-    The module's docstring defines A. Twins store their differences from the run scaled, because
-    these may become too small or too large for floating-point numbers. Therefore the
-    differences are first scaled by their largest value.
+    The module's docstring defines A. Twins store their differences from the run in scaled form,
+    because the differences may become too small or too large for floating-point numbers.
+    Therefore the differences are first scaled by their largest value.
 
     Args:
         differences: Scaled velocity differences of the joints, shape (K, n).
@@ -585,7 +587,7 @@ def _running_maximum(values: Array) -> Array:
 
 
 def _fit_trend(t_s: Array, amplitude: Array) -> EnvelopeFit:
-    """Returns whether a small difference between two runs grows, decays or stays.
+    """Determines whether a small difference between two runs grows, decays or persists.
 
     Args:
         t_s: Times, shape (K,), in s.
@@ -613,15 +615,16 @@ def _judge_push(
     part: slice,
     joint_names: Sequence[str],
 ) -> PushGrowth:
-    """Returns how the effect of a push developed over the judged part of a run.
+    """Evaluates how the effect of a push developed over the judged part of a run.
 
-    A push whose effect died down to the rounding errors was repeated. It is judged from its
-    last repetition on, if that is long enough ago. The caller sets the group of the result.
+    A push whose effect died down to the rounding errors was repeated. If the last repetition is
+    long enough before the end, the push is judged from that time. The caller sets the group of
+    the result.
 
     Args:
         path: The difference of the pushed repetition (twin) from the run.
         amplitude: Logarithm of the amplitude of the difference, shape (K,).
-        joints: Indices of the joints that count.
+        joints: Indices of the joints to consider.
         part: Rows whose second half is judged.
         joint_names: Names of all joints.
     """
@@ -673,15 +676,15 @@ def _judge_worst_joint(
     part: slice,
     joint_names: Sequence[str],
 ) -> PushGrowth:
-    """Returns how a push developed, at all joints of a group or at the worst of them.
+    """Evaluates the effect of a push at all joints of a group together, or at the worst joint.
 
-    A slow growth at one joint does not show in the amplitude of the group while a faster joint
+    Slow growth at one joint is invisible in the amplitude of the group while a faster joint
     still decays from a larger amplitude. Therefore each joint is judged by itself, too.
 
     Args:
         path: The twin's difference from its run.
         amplitude: Logarithm of the amplitude of the difference of all joints, shape (K,).
-        joints: Indices of the joints that count.
+        joints: Indices of the joints to consider.
         part: Rows of the judged part, and of the part before it.
         joint_names: Names of all joints.
     """
@@ -734,8 +737,8 @@ def _find_departures(
     Args:
         twins: The run and its twins.
         amplitudes: Logarithm of the amplitude of each twin's difference, shape (K,) each.
-        joints: Indices of the joints that count.
-        quiet: Rows in which nobody acts on the run.
+        joints: Indices of the joints to consider.
+        quiet: Rows in which no operator acts on the run.
     """
     t_s = twins.paths[0].t_s
     with np.errstate(divide="ignore"):
@@ -771,10 +774,11 @@ class _NonlinearPush(NamedTuple):
 
     Attributes:
         size: Size of the push.
-        saturates: True if the effect is smaller than a proportional one, and grows.
-        has_wall: True if a wall stands at some site, whose contact makes the run nonlinear.
+        saturates: True if the effect grows with the size, but less than proportionally.
+        has_wall: True if some site has a wall, because contact with a wall makes the run
+            nonlinear.
         ratio: Ratio of the effect to a proportional one at the time of the largest deviation.
-        at_s: This time, in s.
+        at_s: Time of the largest deviation, in s.
     """
 
     size: float
@@ -793,8 +797,9 @@ class _LinearSizes(NamedTuple):
     Attributes:
         smallest: The smallest size of the push in this range.
         largest: The largest size of the push in this range.
-        unit: Unit of the sizes, and what is pushed.
-        beyond: The next larger push. None if the effect of every push is proportional.
+        unit: Unit of the sizes, with the quantity that is pushed.
+        beyond: The next larger push, whose effect is not proportional. `None` if the effect of
+            every push is proportional.
     """
 
     smallest: float
@@ -815,8 +820,8 @@ class PushedTwins(Result):
         log: The log of the run.
         at_s: Time of the pushes, in s.
         growth: Growth of the pushes.
-        linear: Range of sizes for which the effect of a push is proportional to its size. None
-            if the user did not ask for several sizes.
+        linear: Range of sizes for which the effect of a push is proportional to its size.
+            `None` if the user did not ask for several sizes.
     """
 
     log: Log
@@ -838,13 +843,13 @@ class PushedTwins(Result):
         """Returns a sentence for the user on how the pushes develop.
 
         It describes the worst push, which grows most or dies away most slowly. If the user
-        asked for pushes of several sizes, it says instead for which sizes the effect is
+        requested pushes of several sizes, it states instead for which sizes the effect is
         proportional to the size.
         """
         return str(find_hook("describe a finding")(self))
 
     def to_rows(self) -> list[dict[str, Any]]:
-        """Returns a table row for each small push: what was pushed, and how its effect evolves.
+        """Returns a table row for each small push: the pushed quantity and the effect.
 
         Each push was made in a repetition of the run. The keys are those of an entry of
         `pushes` in `trilat twin --json`.
@@ -858,7 +863,7 @@ class PushedTwins(Result):
     def to_dict(self) -> dict[str, Any]:
         """Converts pushes and their effects to plain values, as `trilat twin --json` prints.
 
-        The entry "linear" is None if the growth was not compared with characteristic roots.
+        The entry "linear" is `None` if the growth was not compared with characteristic roots.
         """
         growth = self.growth.to_json()
         text = self.headline()
@@ -899,10 +904,10 @@ def twin(
     Args:
         log: The log, or its path.
         at_s: Time of the pushes, in s.
-        push: Sizes by target, with one twin per push. A target is a joint's angle,
-            `{"m1.q1": 1e-6}`, its speed, `m1.qd1`, an estimate, `m1.theta1`, or many of them
-            in a random direction, `m1.q` or `q`. By default the pushes are those of `certify`,
-            and at 0 s their growth is judged as it judges them.
+        push: Sizes by target, with one twin per push. A target is a joint's angle, `{"m1.q1":
+            1e-6}`, a joint's speed, `m1.qd1`, an estimate, `m1.theta1`, or several quantities
+            in a random direction, `m1.q` or `q`. By default the pushes are those of `certify`.
+            If they are made at 0 s, their growth is judged as in `certify`.
         delta: Sizes of a single push, as in "1e-9:1e-3", with one twin per decade.
 
     Raises:
@@ -916,13 +921,13 @@ def twin(
     end_s = max(len(log[site]) / log[site].rate_hz for site in log.sites)
     if not 0.0 <= at_s < end_s and end_s > 0.0:
         raise UsageError(
-            f"--at {at_s:g}: a push is within the run, from 0 s until before {end_s:g} s"
+            f"--at must be from 0 s to before the end of the run, {end_s:g} s, not {at_s:g} s"
         )
     if delta and len(targets) > 1:
         names = ", ".join(target for target, _ in targets)
-        raise UsageError(f"--delta sweeps the size of one push, not of {names}")
+        raise UsageError(f"--delta varies the size of a single push, but --push names {names}")
 
-    # Without options the twins are those of a certificate, and so is the part that is judged.
+    # Without options, the twins and the judged part are those of a certificate.
     is_of_certificate = not targets and not delta and at_s == 0.0
     counts_from_s = at_s
     quiet_from_s = math.inf
@@ -962,7 +967,7 @@ def _parse_push(text: str) -> tuple[str, float]:
         size_value = float(size) if separator else PUSH_RAD
     except ValueError:
         raise UsageError(
-            f"--push {text}: its size is a number, as in m1.q1=1e-6, not {size!r}"
+            f"the size in --push {text} must be a number, as in m1.q1=1e-6, not {size!r}"
         ) from None
     return target.strip(), size_value
 
@@ -970,7 +975,7 @@ def _parse_push(text: str) -> tuple[str, float]:
 def _parse_sizes(text: str) -> list[float]:
     """Parses a range of push sizes such as "1e-9:1e-3".
 
-    A run is repeated with each size, to see whether the growth depends on it.
+    A run is repeated with each size, to see whether the growth depends on the size.
 
     Args:
         text: The text that the user gave.
@@ -981,7 +986,7 @@ def _parse_sizes(text: str) -> list[float]:
         low = high = math.nan  # refused by the comparison below
     if not LEAST_PUSH <= low < high / 9.99 <= MOST_PUSH / 9.99:
         allowed = f"from {LEAST_PUSH:g} to {MOST_PUSH:g}, a decade apart or more"
-        raise UsageError(f"--delta is two sizes {allowed}, as in 1e-9:1e-3, not {text!r}")
+        raise UsageError(f"--delta must be two sizes {allowed}, as in 1e-9:1e-3, not {text!r}")
     decades = math.floor(math.log10(high / low) + 1e-3)
     return [float(f"{low * 10.0**n:.6g}") for n in range(decades + 1)]
 
@@ -1010,7 +1015,8 @@ def _find_linear_sizes(
     beyond = None
     for n, (smaller, larger) in enumerate(pairwise(envelopes)):
         log_scale = np.full(len(larger), math.log(sizes[n + 1] / sizes[n]))
-        # Rounding errors decide on amplitudes below this limit: they count as proportional.
+        # Amplitudes below this limit are dominated by rounding errors and count as
+        # proportional.
         known = (smaller > math.log(10.0 * SMALLEST)) & np.isfinite(larger)
         log_ratio = np.subtract(larger, smaller, out=log_scale.copy(), where=known)
         deviation = log_ratio - log_scale
@@ -1033,7 +1039,7 @@ def _find_linear_sizes(
 
 
 def _has_wall(scenario: Scenario) -> bool:
-    """Returns True if a wall stands at some site, whose contact makes the run nonlinear."""
+    """Returns True if some site has a wall, because contact makes the run nonlinear."""
     for site in scenario.sites.values():
         for environment in site.environment:
             if environment.actor.kind == TorqueKind.WALL:

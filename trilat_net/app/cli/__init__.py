@@ -69,7 +69,7 @@ _SYNONYMS = {
     "set": {"delay": "link", "alpha": "dominance", "authority": "dominance"},
     "experiment": {"create": "new", "start": "run", "validate": "check", "analyze": "analyse"},
 }  # fmt: skip
-"""For each group of commands: words that a user may enter, and the command for what they mean.
+"""For each group of commands: words that a user may enter, and the command that the user means.
 
 Words that are only misspelt need no entry.
 """
@@ -89,7 +89,7 @@ _SUBJECTS = {
     "gymnasium": _TO_GYMNASIUM,
     "train": f"{_TO_GYMNASIUM}; {_TO_LEROBOT}",
 }
-"""Subjects that have no command with a similar name, and where they are found instead."""
+"""Subjects for which no command has a similar name, and the place where each is found."""
 
 
 class _Group(TyperGroup):
@@ -111,7 +111,7 @@ class _Group(TyperGroup):
         word of another program or a typing error, the nearest command is suggested.
 
         Raises:
-            UsageError: There is no such command. The error suggests one.
+            UsageError: There is no such command. The error suggests a similar command.
         """
         name = args[0] if args else ""
         is_known = name.startswith("-") or self.get_command(ctx, name) is not None
@@ -174,7 +174,7 @@ class _Commands(_Group):
     def invoke(self, ctx: Any) -> Any:
         """Runs a command, and turns Ctrl-C into a line "interrupted" and an exit code.
 
-        The exit code is that of the signal, or 130, so that shell scripts stop as well.
+        The exit code is that of the signal, or 130, so that shell scripts also stop.
         """
         with Interrupt() as interrupt:
             try:
@@ -216,14 +216,14 @@ def _main(
         ),
     ] = False,
 ) -> None:
-    """Declares the options of `trilat` itself, which have their own functions."""
+    """Declares the options of `trilat` itself. Each option has a function that executes it."""
 
 
 def _deferred(read: Callable[[Any], Any]) -> Any:
     """Returns a property that reads a value only when the value is needed.
 
-    Click, the library of the command line, assigns such attributes when it makes a command. The
-    assigned values are ignored.
+    Click, the library of the command line, assigns such attributes when it creates a command.
+    The assigned values are ignored.
 
     Args:
         read: Method that returns the value.
@@ -260,11 +260,11 @@ class _PackageCommand(TyperCommand):
         )
         if not hasattr(command_function, "examples"):
             raise UsageError(
-                f"trilat {self._command_line} is no command: its function lacks the decorator "
-                "trilat_net.extension.command"
+                f"trilat {self._command_line} is not a command: its function lacks the "
+                "decorator trilat_net.extension.command"
             )
 
-        # A group of its own makes Typer build the command, from which it is taken.
+        # Typer builds a command only as part of a group, so a temporary group is made for it.
         group = typer.Typer(rich_markup_mode="rich", pretty_exceptions_enable=False)
         _add_command(group, self._command_line, command_function)
         return typer.main.get_group(group).commands[str(self.name)]
@@ -274,7 +274,7 @@ class _PackageCommand(TyperCommand):
         """The first sentence of the help, which the list of all commands shows.
 
         For known packages it is in a table, because importing every package would make the help
-        slow. If the command cannot be imported, the reason takes its place.
+        slow. If the command cannot be imported, the reason is shown instead.
         """
         package = find_package(COMMANDS, self._entry_name)
         if package:
@@ -421,7 +421,7 @@ def _add_commands() -> None:
     """Adds the commands of all files in this folder to their groups.
 
     A function is a command if `options.command` has declared it. If the first word of its name
-    is that of a group, the command belongs to that group: `log_info_command` is `trilat log
+    is the name of a group, the command belongs to that group: `log_info_command` is `trilat log
     info`.
     """
     groups = {}
@@ -452,8 +452,8 @@ def _add_commands() -> None:
 _add_commands()
 
 _TOO_LITTLE_MEMORY = (
-    "there is too little memory: 3 GiB of addresses suffice (ulimit -v), "
-    "and 1 GiB of memory itself"
+    "there is too little memory: the program needs up to 3 GiB of address space (ulimit -v) "
+    "and 1 GiB of memory"
 )
 _MEMORY_ERRORS = (
     "failed to map segment",
@@ -524,8 +524,8 @@ def _report_system_error(error: Exception) -> int:
         # A bug. An OSError is, for example, a full disk or a folder that was deleted.
         raise error
 
-    # Windows reports an invalid file name and a closed pipe by the same error number. Only the
-    # former comes with a file name.
+    # Windows reports an invalid file name and a closed pipe with the same error number. Only
+    # the former comes with a file name.
     is_invalid = os.name == "nt" and error.errno == errno.EINVAL
     is_closed_pipe = isinstance(error, BrokenPipeError) or (is_invalid and not error.filename)
     if is_closed_pipe:

@@ -75,7 +75,7 @@ def scenario_show_command(
 
         if overrides or duration is not None or seed is not None:
             raise ScenarioError(
-                f"{name}: the scenario of a log is printed as it is; save it by `trilat "
+                f"{name}: the scenario of a log cannot be changed; save it with `trilat "
                 f"scenario show {name} > mine.toml`, and change the file"
             )
         scenario = open_log(Path(name)).scenario
@@ -115,11 +115,11 @@ def scenario_new_command(
     from ...scenario import read_template
 
     write_whole(file, read_template(), force=force)
-    terminal.print_text(f"{file}: a template; check it with: trilat scenario check {file}")
+    terminal.print_text(f"{file} is a template; check it with: trilat scenario check {file}")
 
 
 def _print_skeleton(kind: str, written: list[Path], key: str, checks: Sequence[str]) -> None:
-    """Prints which files were written for a new law, hand or plant, and how to run it.
+    """Prints which files were written for a new law, hand or plant, and how to run them.
 
     A skeleton is a working example that a user changes: a control law, a program that acts as
     an operator (hand), or a model of an arm (plant).
@@ -137,7 +137,7 @@ def _print_skeleton(kind: str, written: list[Path], key: str, checks: Sequence[s
     class_path = f"{file.stem}:{name_skeleton_class(file.stem, kind)}"
     change_folder = "" if file.parent == Path() else f"cd {file.parent}, and "
     terminal.print_text(
-        f"{file}: a {kind} that works; {test_file.name}: its test. "
+        f"{file} contains a working {kind}, and {test_file.name} its test. "
         f"Change the {kind}, {change_folder}run"
     )
 
@@ -157,7 +157,8 @@ def new_law_command(
     """Creates a working, commented control law to start from, and its test."""
     from ...scenario import new_law
 
-    # A law of a user is settled at best, which is exit code 1 unless it is accepted.
+    # A run with a user's law is at best judged settled, which gives exit code 1 without
+    # --accept.
     checks = ("certify {log} --law {file} --accept settled", "report {log} --law {file}")
     _print_skeleton("law", new_law(file, force=force), "control.law={}", checks)
 
@@ -200,7 +201,9 @@ def trace_import_command(
     column: Annotated[str, value("--column", "NAME")] = "",
     every_s: Annotated[
         float,
-        value("--every", "S", "Interval between pings, s, if the output of ping has no times."),
+        value(
+            "--every", "S", "Interval between pings, in s, if the output of ping has no times."
+        ),
     ] = 1.0,
     as_json: options.JsonOption = False,
     force: options.ForceOption = False,
@@ -267,7 +270,7 @@ def keys_new_command(
 
     folders = create_keys(folder, members, hosts or (), days)
     for member_folder in folders:
-        terminal.print_line(f"{member_folder}: for {member_folder.name}")
+        terminal.print_line(f"{member_folder}: keys for {member_folder.name}")
     first = folders[0]
     terminal.print_line(
         f"they are valid for {count_nouns(days, 'day')}; use them as in: "
@@ -303,17 +306,19 @@ def keys_add_command(
 
     The authority in the folder signs the new certificates. Copy each new folder to its member's
     machine. Every other member needs its new file members.json, which lists all members, and a
-    restart before the next session: until then it refuses what the new members send.
+    restart before the next session: until then it rejects messages of the new members.
     """
     from ...net import MEMBERS, add_keys
 
     new_folders = add_keys(folder, members, hosts or (), days)
     for member_folder in new_folders:
-        terminal.print_line(f"{member_folder}: for {member_folder.name}; copy the folder")
+        terminal.print_line(f"{member_folder}: keys for {member_folder.name}; copy the folder")
     # The other members need the new list of all members.
     for path in sorted(folder.glob(f"*/{MEMBERS}")):
         if path.parent not in new_folders:
-            terminal.print_line(f"{path}: for {path.parent.name}; copy this file")
+            terminal.print_line(
+                f"{path}: list of members for {path.parent.name}; copy this file"
+            )
     terminal.print_line(f"the new keys are valid for {count_nouns(days, 'day')}")
 
 
@@ -340,7 +345,9 @@ def keys_renew_command(
     from ...net import renew_keys
 
     for member_folder in renew_keys(folder, members or (), days):
-        terminal.print_line(f"{member_folder}: valid for {count_nouns(days, 'day')} from now")
+        terminal.print_line(
+            f"{member_folder}: keys are valid for {count_nouns(days, 'day')} from now"
+        )
 
 
 @options.command("lab", page="docs/logs/log-checks.md")
@@ -360,8 +367,12 @@ def keys_pair_command(
     from ...log import create_signing_keys
 
     private, public = create_signing_keys(name)
-    terminal.print_text(f"{private}: signs, as in: trilat log sign run.mcap --key {private}")
-    terminal.print_text(f"{public}: checks, as in: trilat log check run.mcap --key {public}")
+    terminal.print_text(
+        f"{private} signs logs, as in: trilat log sign run.mcap --key {private}"
+    )
+    terminal.print_text(
+        f"{public} checks signatures, as in: trilat log check run.mcap --key {public}"
+    )
 
 
 @options.command("keys/m1", page="docs/sessions/keys.md")
@@ -370,7 +381,7 @@ def keys_info_command(
     rules: Annotated[bool, flag("--rules", "Print the Zenoh settings with all rules.")] = False,
     as_json: options.JsonOption = False,
 ) -> None:
-    """Shows whose keys they are, until when and where they hold, and what they permit."""
+    """Shows the owner of the keys, when and where they are valid, and what they permit."""
     from ...net import ROLES, ROUTER, describe_role, read_member_keys
 
     if rules and as_json:

@@ -92,7 +92,7 @@ def log_sign_command(
     if as_json:
         terminal.print_json({"file": file.as_posix(), "signature": signature.as_posix()})
     else:
-        terminal.print_text(f"{signature}: signs {file}")
+        terminal.print_text(f"{signature} contains the signature of {file}")
 
 
 @options.command("run.mcap.active", page="docs/logs/log-checks.md")
@@ -164,7 +164,7 @@ def log_export_command(
     format_settings = {key: value for key, _, value in pairs}
     if actions:
         format_settings["actions"] = actions
-    # Refuses wrong settings and an existing output before the log is read.
+    # Rejects wrong settings and an existing output before the log is read.
     exporter = Exporter(form, output, force=force, log=files[0], settings=format_settings)
 
     with terminal.progress_bar(f"reading {files[0]}") as progress:
@@ -212,7 +212,7 @@ def log_view_command(
         bool,
         typer.Option(
             "--rviz",
-            help="Write a configuration of RViz next to FILE instead, for its ROS 2 topics.",
+            help="Write an RViz configuration for the log's ROS 2 topics next to FILE instead.",
         ),
     ] = False,
     viewer: Annotated[
@@ -305,7 +305,8 @@ def _open_page(files: list[Path]) -> None:
     from ..api import choose_report_folder
 
     terminal.print_note(
-        f"Rerun is not installed ({format_extra_install('view')}); this is the log's page"
+        f"Rerun is not installed ({format_extra_install('view')}); "
+        "the log's page is shown instead"
     )
 
     folder = choose_report_folder(files[0])

@@ -44,7 +44,7 @@ def site_command(
     *,
     ways: options.MemberOptions,
     join_timeout: Annotated[
-        float, seconds("--join-timeout", "Longest wait for the other sites, s.")
+        float, seconds("--join-timeout", "Longest wait for the other sites, in s.")
     ] = 60.0,
     needs_recorder: options.NeedsRecorderOption = False,
     cpu: Annotated[
@@ -69,11 +69,11 @@ def site_command(
     Options:
         name: Name of the site in the scenario.
         scenario: Name of a shipped scenario, or path of a TOML file.
-        stay: Longest wait at the end for the recorder to leave the session, s.
+        stay: Longest wait at the end for the recorder to leave the session, in s.
         without: Begin without SITE, which may join later; repeatable. Only the first site
             accepts this option.
         leave_timeout: Longest time to continue after another site has left, if the arms then
-            glide (on_stale.action = "glide"), s; default: until the end of the run.
+            glide (on_stale.action = "glide"), in s; default: until the end of the run.
     """
     from sites import SiteOptions, run_site
 
@@ -83,7 +83,8 @@ def site_command(
     chosen.find_site(name)
     session_name = options.check_session_name(session or chosen.name)
 
-    # By default each site connects to those before it, so that each pair has one connection.
+    # By default each site connects to the sites before it, so that each pair has one
+    # connection.
     endpoints = default_endpoints(session_name, chosen.names, encrypted=ways.keys is not None)
     earlier_sites = chosen.names[: chosen.names.index(name)]
     earlier_endpoints = [endpoints[site] for site in earlier_sites]
@@ -105,7 +106,7 @@ def site_command(
 
 
 def _check_without(scenario: "Scenario", name: str, without: list[str]) -> tuple[str, ...]:
-    """Checks which arms may be absent at the start of a session, as an option names them.
+    """Checks the sites that --without permits to be absent at the start of a session.
 
     Arms that join later are permitted only if all arms glide back to each other after a break.
     Only the first site (process of an arm) decides about the start of a session.
@@ -166,12 +167,12 @@ def record_command(
     Options:
         output: File of the log; default: SESSION.mcap, or runs/SESSION-N/run.mcap if --conclude
             is used.
-        join_timeout: Longest wait for the session to begin, s; default: no limit.
+        join_timeout: Longest wait for the session to begin, in s; default: no limit.
         concluded: Verify the log at the end, and write a report into its folder.
         include: Record only these channels, for example '**/m1/**'; repeatable.
         exclude: Leave out these channels, for example '**/link'; repeatable.
         split_size: Split the log into parts of at most this size, MiB.
-        split_duration: Split the log into parts of this duration, s.
+        split_duration: Split the log into parts of this duration, in s.
         durable: Sync to the disk at every flush instead of every second.
     """
     from recorder import record_session
@@ -200,7 +201,7 @@ def record_command(
     # Problems of the output are reported now, before the recorder waits for the session.
     storage.find_first_part()
     if not os.access(path.parent, os.W_OK):
-        raise UsageError(f"{path}: cannot be written: {path.parent} is not a writable folder")
+        raise UsageError(f"{path} cannot be written: {path.parent} is not a writable folder")
 
     page = path.parent / "report.html"
     if concluded:
@@ -249,8 +250,8 @@ def _choose_path(output: Path | None, session: str, *, concluded: bool) -> Path:
     """Chooses the file of a session's log, and creates the folder for it and its report.
 
     Args:
-        output: Path from --out. None uses SESSION.mcap, or run.mcap in a new folder if there
-            will be a report.
+        output: Path from --out. If `None`, the log is SESSION.mcap, or run.mcap in a new folder
+            if there will be a report.
         session: Name of the session.
         concluded: True if a report is written into the folder of the log.
     """
@@ -286,12 +287,12 @@ def _conclude(files: list[Path], *, png: bool) -> None:
 
     if conclusion.exit_code == CodeWithheld.exit_code:
         raise CodeWithheld(
-            f"{files[0]}: parts of this log were not checked, because code that the log names "
-            "may not run; check them with: trilat verify --law FILE"
+            f"{files[0]}: parts of this log were not checked, because you have not permitted "
+            "the code that the log names; check them with: trilat verify --law FILE"
         )
 
     if not conclusion.passed:
-        raise RunFailed(f"{files[0]}: failed a check")
+        raise RunFailed(f"the log {files[0]} failed a check")
 
     for event in log.events:
         if event.kind in ("diverged", "failed"):
@@ -305,7 +306,7 @@ def replay_command(
     loop: Annotated[bool, flag("--loop", "Start over at the end, until Ctrl-C.")] = False,
     start: Annotated[float | None, value("--start", "S")] = None,
     stop: Annotated[
-        float | None, value("--stop", "S", "End of the part to play, s since tick 0.")
+        float | None, value("--stop", "S", "End of the part to play, in s after tick 0.")
     ] = None,
     duration: Annotated[float | None, value("--duration", "S")] = None,
     include: Annotated[list[str] | None, value("--include", "KEYEXPR")] = None,
@@ -336,8 +337,8 @@ def replay_command(
     Options:
         files: File of an MCAP log, or the files of all its parts in order.
         rate: Speed relative to the recording, or max for as fast as possible.
-        start: Start of the part to play, s since tick 0.
-        duration: Duration of the part to play, s, instead of --stop.
+        start: Start of the part to play, in s after tick 0.
+        duration: Duration of the part to play, in s, instead of --stop.
         include: Play only these channels, for example '**/m1/*'; repeatable. Default: all
             channels of the sites.
         exclude: Leave out these channels, for example '**/link'; repeatable.
@@ -352,14 +353,14 @@ def replay_command(
     """
     from trilat_net.app.play.play_process import PlayOptions, play_log
     from trilat_net.app.play.player import parse_rate
-    from trilat_net.app.play.session_reader import parse_selection, preload_messages
+    from trilat_net.app.play.session_reader import PlaySelection, preload_messages
 
     from ...net import default_endpoint
 
     if preload < 0:
         raise UsageError(f"--preload must be a number of MiB, at least 0, not {preload}")
 
-    selection = parse_selection(
+    selection = PlaySelection.parse(
         include=include or (),
         exclude=exclude or (),
         start_s=start,
@@ -428,12 +429,13 @@ def _announce_playback(
 ) -> None:
     """Prints which arms of a log are replayed, as which session, and how fast.
 
-    A note warns if the messages have another version than those of this program.
+    A note warns if the version of the messages differs from the version of this program's
+    messages.
 
     Args:
         header: Description of the recorded session.
         name: Name of the session that the replay opens.
-        rate: Speed relative to the recording. Infinity for as fast as possible.
+        rate: Speed relative to the recording. Infinity means as fast as possible.
         print_line: Function that prints a line.
     """
     from ...net import VERSION
@@ -443,9 +445,9 @@ def _announce_playback(
     print_line(f"playing {sites} as session {name}, {speed_text}; Ctrl-C ends it")
     if header.version != VERSION:
         print_line(
-            f"note: these messages are of schema version {header.version}: recorders and sites "
-            f"of today accept {VERSION} and count others as dropped; any other Zenoh "
-            "subscriber receives them"
+            f"note: these messages are of schema version {header.version}: present recorders "
+            f"and sites accept only {VERSION} and drop others; any other Zenoh subscriber "
+            "receives them"
         )
 
 
@@ -499,8 +501,8 @@ def _describe_playback(outcome: "PlaybackSummary", rate: float) -> dict[str, Any
 
     Args:
         outcome: The outcome.
-        rate: Speed relative to the recording. Infinity, which becomes None, for as fast as
-            possible.
+        rate: Speed relative to the recording. Infinity means as fast as possible, and becomes
+            `None`.
 
     Returns:
         The values by key. Comments in the function explain the keys.
@@ -525,7 +527,7 @@ def _describe_playback(outcome: "PlaybackSummary", rate: float) -> dict[str, Any
         "held_s": round(outcome.held_s, 3),
         # How often a receiver was disconnected, because it accepted no message for 5 s.
         "cut": outcome.cut,
-        # Number of messages whose place in the file was too far from their turn.
+        # Number of messages whose position in the file was too far from their turn.
         "strays": outcome.strays,
         # Number of recorders after the last message, and whether they stored all messages.
         "recorders": outcome.recorders,
@@ -578,7 +580,7 @@ def _warn_torn(torn: dict[Path, str]) -> None:
     """Warns the user of log files that were cut off, for example by a power failure.
 
     Args:
-        torn: For each file the problem.
+        torn: Description of the damage, by file.
     """
     for path, text in torn.items():
         terminal.print_note(
@@ -607,8 +609,8 @@ def _warn_about_playback(outcome: "PlaybackSummary", reported: set[Path]) -> Non
         )
     if outcome.strays:
         terminal.print_error(
-            f"{count_nouns(outcome.strays, 'message lies', 'messages lie')} more than a "
-            "minute from their position in the file, and were "
+            f"{count_nouns(outcome.strays, 'message is', 'messages are')} stored more than a "
+            "minute away from their chronological position in the file, and were "
             "played late; with a larger --preload they are played in order"
         )
 
@@ -638,7 +640,7 @@ def router_command(
         float | None,
         seconds(
             "--until-idle",
-            "End after all members have been absent for this long, s; default: never.",
+            "End after all members have been absent for this long, in s; default: never.",
         ),
     ] = None,
 ) -> None:
@@ -704,11 +706,11 @@ def parse_split(option: str, unit: str, number: float | None, scale: int) -> int
     Args:
         option: Name of the option, for the error message.
         unit: Name of the option's unit, for the error message.
-        number: Value of the option. None if the option is absent.
+        number: Value of the option. `None` if the option is absent.
         scale: Bytes or ns per unit.
 
     Returns:
-        The limit in bytes or ns. None if the option is absent.
+        The limit in bytes or ns. `None` if the option is absent.
 
     Raises:
         UsageError: The number is not from 1 to 1e6.

@@ -34,9 +34,9 @@ Runs = TypeVar("Runs", bound=Callable[..., None])
 def check_range(
     low: float, high: float, noun: str
 ) -> Callable[[typer.CallbackParam, float | None], Any]:
-    """Returns a function that refuses the number of an option if it is out of a range.
+    """Returns a function that checks that the number of an option is within a range.
 
-    Typer calls the function, so that the error names the option.
+    Typer calls the function with the option, which the error message can therefore name.
 
     Args:
         low: The smallest number.
@@ -52,7 +52,7 @@ def check_range(
 
         Args:
             param: Declaration of the option, which contains its name.
-            value: The number. None if the option was not given.
+            value: The number. `None` if the option was not given.
 
         Raises:
             UsageError: The number is less than `low` or greater than `high`.
@@ -100,7 +100,7 @@ def seconds(name: str, text: str = "") -> Any:
 
 
 _OPTION_ENTRY = re.compile(r"^    (\w+): (.+(?:\n {8}.+)*)", re.MULTILINE)
-"""An entry in the section `Options` of a docstring after `inspect.cleandoc`."""
+"""Matches an entry in the section `Options` of a docstring after `inspect.cleandoc`."""
 
 
 def command(*examples: str, page: str = "docs/commands.md") -> Callable[[Runs], Runs]:
@@ -143,13 +143,13 @@ def command(*examples: str, page: str = "docs/commands.md") -> Callable[[Runs], 
 
 
 _NO_LAWS = ("conditions", "interface", "sent_vectors")
-"""Modules in the folder of the laws that define no law."""
+"""Modules in the folder of the laws that do not define a law."""
 
 
 def list_laws() -> list[str]:
     """Lists the names of the built-in control laws, for help texts and error messages.
 
-    The names are those of the files, so that no module needs to be imported, which takes long.
+    The names are taken from the file names, because importing all modules would take long.
     """
     folder = str(Path(__file__).parents[2] / "laws")
     return [module.name for module in iter_modules([folder]) if module.name not in _NO_LAWS]
@@ -194,7 +194,7 @@ def complete_sites(context: typer.Context, incomplete: str) -> list[str]:
     """Lists the names of arms that the shell offers when the user presses the tab key.
 
     Args:
-        context: The command line, whose scenario or log has the sites.
+        context: The command line, whose scenario or log names the sites.
         incomplete: The word so far.
 
     Returns:
@@ -239,7 +239,7 @@ SeedOption = Annotated[
     int | None, typer.Option("--seed", help="Override the seed of the scenario.")
 ]
 DurationOption = Annotated[
-    float | None, value("--duration", "S", "Override the duration of the run, s.")
+    float | None, value("--duration", "S", "Override the duration of the run, in s.")
 ]
 ForceOption = Annotated[bool, flag("--force", "Replace existing files.")]
 ListenOption = Annotated[
@@ -284,7 +284,7 @@ InsecureOption = Annotated[
 
 
 _BRACKETS = {"{": "}", "[": "]"}
-"""Closing brackets of tables and lists, by the opening ones."""
+"""Closing brackets of tables and lists, by the opening brackets."""
 
 
 def find_split_setting(args: Sequence[str]) -> str:
@@ -352,13 +352,15 @@ def check_session_name(name: str) -> str:
     return name
 
 
-AnswerOption = Annotated[float, seconds("--timeout", "Longest wait for the first answer, s.")]
+AnswerOption = Annotated[
+    float, seconds("--timeout", "Longest wait for the first answer, in s.")
+]
 ClockOffsetOption = Annotated[
     float,
     value(
         "--clock-offset-s",
         "S",
-        "For tests: offset added to the clock of this machine, s.",
+        "For tests: offset added to the clock of this machine, in s.",
         callback=check_range(-1e6, 1e6, "a number of seconds"),
     ),
 ]
@@ -388,17 +390,15 @@ JobsOption = Annotated[
 ]
 
 
-LogArgument = Annotated[Path, typer.Argument(help="File of an MCAP log.", metavar="FILE")]
+LogArgument = Annotated[Path, typer.Argument(help="MCAP log file.", metavar="FILE")]
 LogsArgument = Annotated[
     list[Path],
-    typer.Argument(
-        help="File of an MCAP log, or the files of all its parts.", metavar="FILE..."
-    ),
+    typer.Argument(help="MCAP log file, or the files of all its parts.", metavar="FILE..."),
 ]
 LogsOrFoldersArgument = Annotated[
     list[Path],
     typer.Argument(
-        help="MCAP logs, or folders with MCAP logs. Files of the same session are one log.",
+        help="MCAP logs, or folders with MCAP logs. Files of one session are read as one log.",
         metavar="FILE...",
     ),
 ]
@@ -429,7 +429,7 @@ MinCoverageOption = Annotated[
     ),
 ]
 MIN_COVERAGE = 0.999
-"""The same number as in `log.accounting`, whose import takes long."""
+"""Equals the value in `log.accounting`, which is not imported because the import takes long."""
 OnOption = Annotated[
     str | None,
     value(
@@ -447,12 +447,12 @@ AllOption = Annotated[
 
 
 def check_picture(path: Path | None, *, force: bool) -> None:
-    """Refuses the path of a figure that cannot be written, before the figure is computed.
+    """Rejects the path of a figure that cannot be written, before the figure is computed.
 
     The computation may take long, and would be lost.
 
     Args:
-        path: Path of the figure. None if no figure was requested.
+        path: Path of the figure. `None` if no figure was requested.
         force: True to replace an existing file.
 
     Raises:
@@ -484,7 +484,7 @@ def print_and_draw(
 
     Args:
         result: The result.
-        picture: Path of the figure. None for no figure.
+        picture: Path of the figure. `None` if no figure was requested.
         figure: Module and function that draw the figure, as in "twin_differences:draw_twins".
         drawn: Argument of that function.
         as_json: True to print the result as JSON.
@@ -510,8 +510,8 @@ def load_chosen_scenario(
     Args:
         source: Name of a shipped scenario, or path of a TOML file.
         overrides: Overrides from --set.
-        duration: Duration in s from --duration. None keeps that of the scenario.
-        seed: Seed from --seed. None keeps that of the scenario.
+        duration: Duration in s from --duration. If `None`, the scenario's duration is kept.
+        seed: Seed from --seed. If `None`, the scenario's seed is kept.
     """
     from ...scenario import load_scenario
 
@@ -528,10 +528,10 @@ def _refuse_double_setting(
     For example, --duration 5 and --set duration_s=10 contradict each other.
 
     Args:
-        overrides: Texts of --set. None if the option is absent.
+        overrides: Texts of --set. `None` if the option is absent.
         key: Key of the scenario.
         option: Another option that sets this key.
-        given: Value of that option. None if the option is absent.
+        given: Value of that option. `None` if the option is absent.
 
     Raises:
         UsageError: The key is set by --set and by the other option.
@@ -551,13 +551,13 @@ def _find_key(override: str) -> str:
 
 
 def list_overrides(overrides: list[str] | None, duration: float | None) -> list[str]:
-    """Returns the changes of a scenario that the options --set and --duration request.
+    """Returns the changes to a scenario that the options --set and --duration request.
 
-    A user can in this way change an experiment for one run without editing its file.
+    With these options a user can change an experiment for one run without editing its file.
 
     Args:
-        overrides: Texts of --set, such as "links.delay_ms=5". None if the option is absent.
-        duration: Value of --duration, in s. It becomes "duration_s=10.0". None if absent.
+        overrides: Texts of --set, such as "links.delay_ms=5". `None` if the option is absent.
+        duration: Value of --duration, in s. It becomes "duration_s=10.0". `None` if absent.
 
     Raises:
         UsageError: Both options set the duration.
@@ -572,7 +572,7 @@ def list_overrides(overrides: list[str] | None, duration: float | None) -> list[
 def split_names(text: str | None) -> list[str]:
     """Splits the names that a user gave in one option: "adaptive, p_d" gives two names.
 
-    None, which stands for an absent option, gives an empty list.
+    `None`, which stands for an absent option, gives an empty list.
     """
     return [] if text is None else [name.strip() for name in text.split(",")]
 
@@ -580,11 +580,11 @@ def split_names(text: str | None) -> list[str]:
 def list_used_options(context: typer.Context) -> list[str]:
     """Lists the options that the user wrote on the command line, without those at defaults.
 
-    Commands use the list to refuse combinations: an option with its default value is no
-    conflict.
+    Commands use the list to reject combinations of options. An option that has its default
+    value does not conflict with others.
 
     Returns:
-        The first name of each, for example "--seed", in the order of declaration.
+        The first name of each option, for example "--seed", in the order of declaration.
     """
     used_options = []
     for param in context.command.params:
@@ -617,8 +617,8 @@ class MemberOptions(NamedTuple):
         "tcp/192.168.0.5:7447".
 
         Args:
-            listen_else: Addresses at which to listen if the options state none.
-            connect_else: Addresses to which to connect if the options state none.
+            listen_else: Addresses at which to listen if the options state no address.
+            connect_else: Addresses to which to connect if the options state no address.
         """
         from ...net import Connection, read_zenoh_file
 
@@ -644,8 +644,8 @@ class MemberOptions(NamedTuple):
         A note for the user is printed if the keys expire soon.
 
         Args:
-            listen_else: Endpoints at which to listen if the options name none.
-            connect_else: Endpoints to which to connect if the options name none.
+            listen_else: Endpoints at which to listen if the options name no endpoint.
+            connect_else: Endpoints to which to connect if the options name no endpoint.
             stops: True if the connection only serves to stop arms. Expired keys are then
                 accepted, and no note is printed.
         """
@@ -681,8 +681,8 @@ class Reach(NamedTuple):
         If the session is encrypted, the option --keys names the keys of the command.
 
         Args:
-            operates: True if only the keys of the operator permit what the command does. Then
-                other keys are refused.
+            operates: True if only the keys of the operator permit the command's requests. Other
+                keys are then rejected.
             stops: True if the command only stops arms. Then expired keys are accepted too.
         """
         from ...net import OPERATOR
@@ -691,7 +691,7 @@ class Reach(NamedTuple):
         return connection.require(OPERATOR) if operates else connection
 
 
-class LawFiles(NamedTuple):
+class LawFileOptions(NamedTuple):
     """Options that permit a log's control laws, written by a user, to be executed.
 
     A log may come from somebody else. Code that it names runs only with the permission of the
@@ -742,8 +742,8 @@ class LawFiles(NamedTuple):
 class RunOptions(NamedTuple):
     """Options of a command that runs a session on this machine and reports on it.
 
-    The options override parts of the scenario (`load`), name the folder of the results, and say
-    what is written and printed.
+    The options override parts of the scenario (`load`), name the folder of the results, and
+    select the files and lines to write.
     """
 
     duration: DurationOption = None
@@ -761,8 +761,8 @@ class RunOptions(NamedTuple):
 
         Args:
             source: Name of a shipped scenario, or path of a TOML file.
-            longest_s: Duration of the run if no option sets it, in s. None uses that of the
-                scenario.
+            longest_s: Duration of the run if no option sets it, in s. If `None`, the scenario's
+                duration is used.
         """
         duration_s = self.duration
         is_duration_overridden = any(
@@ -774,13 +774,13 @@ class RunOptions(NamedTuple):
 
 
 def expand_option_tuples(run: Callable[..., Any]) -> Callable[..., Any]:
-    """Makes a command from a function some of whose parameters are named tuples of options.
+    """Turns a function that has named tuples of options as parameters into a command.
 
     Several commands share options, such as those that name a network connection. These options
     are the fields of one named tuple, such as `Reach`. Typer, the command line library, makes
-    one option of each parameter, and knows no tuples. Therefore the returned function has one
-    parameter per field. When it is called, it puts the fields into their tuples and calls the
-    original function.
+    one option of each parameter, and does not support such tuples. Therefore the returned
+    function has one parameter per field. When it is called, it puts the fields into their
+    tuples and calls the original function.
 
     Args:
         run: Function that executes the command, with groups of options as parameters.

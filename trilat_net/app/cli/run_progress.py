@@ -1,25 +1,16 @@
-"""Shows the progress of commands with many runs, and runs a scenario live for such a command.
+"""Shows the progress of commands with many runs.
 
 A sweep or a tuning may take hours. `show_progress` shows a bar in a terminal. In a file or a
-pipe it prints at most ten lines with the remaining time. If the number of all items grows, as
-in a sweep that is refined, it prints up to ten more.
+pipe it prints at most ten lines with the remaining time. If the total number of items grows, as
+in a sweep that is refined, it prints up to ten more lines.
 """
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from typing import TYPE_CHECKING
-
-import typer
 
 from ...errors import format_wall_time
 from ...net import SystemClock
 from ...presentation import terminal_output as terminal
-
-if TYPE_CHECKING:
-    from trilat_net.app.demo_session import SessionResult
-
-    from ...scenario import Scenario
-
 
 _PROGRESS_LINES = 10
 """Number of lines that show progress if the output is not a terminal."""
@@ -55,9 +46,9 @@ def show_progress(
     def show_line(done: int, total: int) -> None:
         """Prints a line with the remaining time, about once per tenth of the items.
 
-        The remaining time follows from the mean duration of the items since the first call. No
-        line is printed at the first call, where this duration is unknown, nor after the last
-        item.
+        The remaining time is estimated from the mean duration of the items since the first
+        call. No line is printed at the first call, where this duration is unknown, nor after
+        the last item.
 
         Args:
             done: Number of finished items.
@@ -83,29 +74,3 @@ def show_progress(
         print_line(f"  {done} of {total} {items}, about {format_wall_time(remaining_s)} left")
 
     yield show_line
-
-
-def run_in_own_folder(scenario: "Scenario", label: str, folder_name: str) -> "SessionResult":
-    """Runs a scenario live, and stores its results in a new folder.
-
-    Commands that run several scenarios use it, so that results do not replace each other.
-
-    Args:
-        scenario: The scenario.
-        label: Name of the run in the printed line.
-        folder_name: Name of the folder, to which a number is added.
-
-    Raises:
-        typer.Exit: The session was interrupted.
-    """
-    from trilat_net.app.demo_session import run_demo
-
-    from ...files import make_results_folder
-
-    folder = make_results_folder(None, folder_name, force=False)
-    terminal.print_text(f"{label}: {scenario.duration_s:g} s live, into {folder}")
-    outcome = run_demo(scenario, folder, terminal.out)
-    if outcome.interrupted:
-        terminal.err.print("interrupted")
-        raise typer.Exit(128 + outcome.interrupted)
-    return outcome

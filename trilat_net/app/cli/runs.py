@@ -106,7 +106,7 @@ def sim_command(
 
 
 def _describe_length(scenario: "Scenario", path: Path) -> str:
-    """Returns a phrase on how long a simulated run is and which arms it has.
+    """Returns a phrase that states how long a simulated run is and which arms it has.
 
     A run that diverged is shorter than planned, and the phrase says so.
 
@@ -129,7 +129,7 @@ def verify_command(
     virtual: Annotated[bool, flag("--virtual")] = False,
     resume_every: Annotated[int, value("--resume-every", "N", min=0)] = 0,
     *,
-    laws: options.LawFiles,
+    laws: options.LawFileOptions,
     min_coverage: options.MinCoverageOption = options.MIN_COVERAGE,
     as_json: options.JsonOption = False,
 ) -> None:
@@ -208,7 +208,7 @@ def certify_command(
     ] = False,
     everything: options.AllOption = False,
     *,
-    laws: options.LawFiles,
+    laws: options.LawFileOptions,
     as_json: options.JsonOption = False,
 ) -> None:
     """Judges whether a run was stable, and says why.
@@ -260,7 +260,7 @@ _PUSH_HELP = (
 )
 def twin_command(
     files: options.LogsArgument,
-    at_s: Annotated[float, value("--at", "S", "Time of the push, s.")] = 0.0,
+    at_s: Annotated[float, value("--at", "S", "Time of the push, in s.")] = 0.0,
     push: Annotated[
         list[str] | None,
         value("--push", "STATE=SIZE", _PUSH_HELP, autocompletion=options.complete_sites),
@@ -277,7 +277,7 @@ def twin_command(
         Path | None, value("-o --out --output", "FILE", options.FIGURE_HELP)
     ] = None,
     *,
-    laws: options.LawFiles,
+    laws: options.LawFileOptions,
     force: options.ForceOption = False,
     as_json: options.JsonOption = False,
 ) -> None:
@@ -308,9 +308,9 @@ def metrics_command(
     """Computes all metrics that apply to a run.
 
     The ten most important numbers are printed, each with the site, link or wall that has the
-    largest. With --all, tables cover tracking, effort, energies, force sharing, impedance,
-    walls, learning and the network, with a column for each site, link and wall. A dash marks a
-    missing value; if the run could have the value, the reason is given.
+    largest value. With --all, tables cover tracking, effort, energies, force sharing,
+    impedance, walls, learning and the network, with a column for each site, link and wall. A
+    dash marks a missing value; if the run could have the value, the reason is given.
     docs/reference/metrics.md has every formula.
     """
     from ...analysis import compute_log_metrics
@@ -336,7 +336,7 @@ def figure_command(
     folder: Annotated[Path | None, value("--out -o", "DIR")] = None,
     others: Annotated[list[Path] | None, value("--with", "FILE")] = None,
     *,
-    laws: options.LawFiles,
+    laws: options.LawFileOptions,
     listed: Annotated[bool, flag("--list", "Only list the figures.")] = False,
     as_json: Annotated[bool, flag("--json", "Print the list or the paths as JSON.")] = False,
     force: options.ForceOption = False,
@@ -395,7 +395,7 @@ def figure_command(
 def _list_figures(log: "Log", *, as_json: bool) -> None:
     """Prints the names of all figures that a command can draw from a log.
 
-    Figures that the log has no data for follow, with the reason.
+    Figures for which the log has no data follow, with the reason.
 
     Args:
         log: The log.
@@ -432,7 +432,7 @@ def report_command(
         ),
     ] = None,
     *,
-    laws: options.LawFiles,
+    laws: options.LawFileOptions,
     min_coverage: options.MinCoverageOption = options.MIN_COVERAGE,
     force: options.ForceOption = False,
     png: options.PngOption = False,
@@ -478,7 +478,7 @@ def rerun_command(
     ] = False,
     overrides: options.SetOption = None,
     *,
-    laws: options.LawFiles,
+    laws: options.LawFileOptions,
     output: Annotated[
         Path | None, value("-o --out --output", "FILE", "Write the result as a log.")
     ] = None,
@@ -537,7 +537,7 @@ def linear_command(
         value(
             "--pose",
             "Q1,Q2,...",
-            "Pose of all sites, rad; default: the pose at the end of a run of the scenario.",
+            "Pose of all sites, in rad; default: the pose at the end of a run of the scenario.",
         ),
     ] = None,
     roots: Annotated[int, value("--roots", "N", "Number of roots to print.")] = 6,
@@ -609,10 +609,10 @@ def _parse_pose(text: str | None) -> tuple[float, ...] | None:
     """Parses the joint angles that a user gave on the command line, such as "0.1,0.3".
 
     Args:
-        text: The text. None if the user gave no pose.
+        text: The text. `None` if the user gave no pose.
 
     Returns:
-        The angles in rad. None if there is no text.
+        The angles in rad. `None` if there is no text.
 
     Raises:
         UsageError: A part of the text is not a number.

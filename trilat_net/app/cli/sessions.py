@@ -41,7 +41,7 @@ def demo_command(
 class _SessionPage(Protocol):
     """A page in a browser that shows a session, and offers its results afterwards.
 
-    The package trilat-people provides one. The commands use only these two methods, so that
+    The package trilat-people provides such a page. The commands use only these two methods, so
     they also work without this package.
     """
 
@@ -59,7 +59,7 @@ class _SessionPage(Protocol):
 
 
 def _describe_log(path: Path) -> str:
-    """Returns what the log of an interrupted session contains, as the end of a sentence.
+    """Describes the log of an interrupted session in a phrase that ends a sentence.
 
     For example ": 1200 records, 0 missing". The text tells the user whether the log is worth
     keeping.
@@ -89,7 +89,7 @@ def run_and_report(
         chosen: The scenario.
         run: The options of the run.
         page: Page in a browser that shows the session, has a button that ends it, and links to
-            the report. None for no page.
+            the report. `None` if there is no page.
 
     Raises:
         typer.Exit: The session was interrupted or had problems, or the log failed a check.
@@ -186,9 +186,9 @@ def ping_command(
         benchmark: Measure the network to --connect EP for this scenario instead, for several
             message sizes, rates and transports. Without --connect, measure this machine alone.
         ros2: Measure the delay of messages of this ROS 2 topic instead.
-        seconds: Total duration of the benchmark, s; default: 24. With --ros2: duration of the
-            measurement, s; default: 5. With --answer: time after which the command ends, s;
-            default: no limit.
+        seconds: Total duration of the benchmark, in s; default: 24. With --ros2: duration of
+            the measurement, in s; default: 5. With --answer: time after which the command
+            ends, in s; default: no limit.
         picture: File for a figure of the benchmark (.png, .svg or .pdf).
         answer: Answer benchmarks from other machines on this endpoint; repeatable.
     """
@@ -306,9 +306,9 @@ def _benchmark(
     Args:
         scenario: Name of a shipped scenario, or path of a TOML file.
         overrides: Overrides of the scenario.
-        seconds: Duration of all measurements together, in s. None uses the default.
+        seconds: Duration of all measurements together, in s. If `None`, the default is used.
         reach: The options that name the machine at the far end.
-        picture: Path of a figure to draw. None for no figure.
+        picture: Path of a figure to draw. `None` if no figure was requested.
         force: True to replace an existing figure.
         as_json: True to print the result as JSON.
 
@@ -341,7 +341,8 @@ def _ping_topic(
 
     Args:
         topic: Name of the topic.
-        routers: Endpoints of the Zenoh router of ROS. None uses the one on this machine.
+        routers: Endpoints of the Zenoh router of ROS. If `None`, the router on this machine is
+            used.
         domain: Number of the ROS domain.
         lasts_s: Duration of the measurement, in s.
         as_json: True to print the result as JSON.
@@ -363,8 +364,8 @@ def _run_far_end(
 
     Args:
         endpoints: Endpoints at which to listen.
-        keys: Folder of keys. None for unencrypted connections.
-        seconds: Duration, in s. None for no limit.
+        keys: Folder of keys. If `None`, connections are unencrypted.
+        seconds: Duration, in s. If `None`, there is no limit.
         insecure: True to allow unencrypted connections from other machines.
     """
     from math import inf
@@ -448,12 +449,12 @@ def enable_command(
 def reset_command(
     session: SessionOption,
     sites: Annotated[
-        list[str], typer.Argument(metavar="SITE...", help="Sites whose fault is cleared.")
+        list[str], typer.Argument(metavar="SITE...", help="Sites whose faults to clear.")
     ],
     *,
     reach: options.Reach,
 ) -> None:
-    """Clears the faults of sites whose cause is gone.
+    """Clears the faults of sites if the causes have been removed.
 
     The sites then wait for the other sites. Each arm aligns with the other arms before it
     follows them.
@@ -466,7 +467,7 @@ _UNITS = {"us": 1e-3, "ms": 1.0, "s": 1e3}
 
 
 def _parse_milliseconds(text: str) -> float:
-    """Parses a time with its unit, such as 350ms or 0.35s, as a user gives it for a delay.
+    """Parses a time with its unit, such as 350ms or 0.35s, which a user gives for a delay.
 
     Args:
         text: The text that the user gave.
@@ -482,13 +483,13 @@ def _parse_milliseconds(text: str) -> float:
         if match:
             return float(match[1]) * _UNITS[match[2]]
     except ValueError:
-        # The pattern also matches texts such as "..5", which are no numbers.
+        # The pattern also matches texts such as "..5", which are not numbers.
         pass
     raise UsageError(f"a time must be a number with a unit, as in 350ms or 0.35s, not {text!r}")
 
 
 def _parse_share(text: str) -> float:
-    """Parses a number or a percentage, such as 0.05 or 5%, as a user gives it for a loss.
+    """Parses a number or a percentage, such as 0.05 or 5%, which a user gives for a loss.
 
     Args:
         text: The text that the user gave.
@@ -523,7 +524,7 @@ def _parse_pairs(texts: list[str], example: str) -> dict[str, Any]:
         The values by key.
 
     Raises:
-        UsageError: A text is not of that form.
+        UsageError: A text does not have this form.
     """
     from ...scenario import split_assignment
 
@@ -631,7 +632,7 @@ def _send_change(context: typer.Context, site: str, change: dict[str, Any]) -> N
         change: Fields of a `ChangeRequest`.
 
     Raises:
-        UsageError: The session is not named, or the site refuses the change.
+        UsageError: The session is not named, or the site rejects the change.
     """
     from trilat_net.app.running_session import RunningSession
 

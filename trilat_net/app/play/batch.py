@@ -1,9 +1,9 @@
-"""Sorts the messages of a log into the order of playing, and stores them compactly.
+"""Sorts the messages of a log into playback order, and stores them compactly.
 
-A recorder writes messages as they arrive, so that a message that it missed at first comes late
-in the file. Played messages must be in order. A `BatchBuilder` collects messages in the order
-of a file and sorts them into a `MessageBatch`, a table of numbers with a buffer of bytes. A
-minute of 9000 messages/s takes some 100 MiB in this form, a third of its size as Python
+A recorder writes messages as they arrive. A message that it missed at first therefore comes
+late in the file. Played messages must be in order. A `BatchBuilder` collects messages in the
+order of a file and sorts them into a `MessageBatch`, a table of numbers with a buffer of bytes.
+A minute of 9000 messages/s takes about 100 MiB in this form, a third of its size as Python
 objects.
 
 Invariant:
@@ -84,10 +84,10 @@ def order_for_play(times_ns: Ints, channels: Ints, numbers: Ints) -> tuple[Ints,
 
 
 def _limit_by_later(values: Ints) -> Ints:
-    """Returns for each value the smallest of it and all later values, shape (K,).
+    """Returns for each value the minimum of this value and all later values, shape (K,).
 
-    For example, the values 1, 5, 3, 4 give 1, 3, 3, 4. A message must not be played after one
-    with a higher number, even if its time is later.
+    For example, the values 1, 5, 3, 4 give 1, 3, 3, 4. A message must not be played after a
+    message with a higher number, even if its time is later.
     """
     return np.minimum.accumulate(values[::-1])[::-1]
 
@@ -160,7 +160,7 @@ class MessageBatch:
         return bytes(self.data[start:end])
 
     def messages(self) -> Iterator[PlayedMessage]:
-        """Yields each recorded message of this batch as a tuple, in the order of playing.
+        """Yields each recorded message of this batch as a tuple, in playback order.
 
         The tuple `PlayedMessage` contains the time in ns after the start of the session, the
         number of the channel, the number of the message in the channel, and the encoded
@@ -184,7 +184,7 @@ class MessageBatch:
     def pieces(self, size: int = PIECE_BYTES) -> Iterator["MessageBatch"]:
         """Divides the messages into pieces of limited size, without copying their payloads.
 
-        A piece is sent at once, so that its size limits the memory.
+        A piece is sent at once, so its size limits the memory.
 
         Args:
             size: Approximate size of a piece, in bytes. A piece with one message may be larger.
@@ -226,7 +226,8 @@ class BatchBuilder:
 
     Args:
         kept: Messages that were sorted in an earlier step but have not been played yet. They
-            count as if they had been added first. None if there are no such messages.
+            are treated as the first messages that were added. `None` if there are no such
+            messages.
     """
 
     def __init__(self, kept: MessageBatch | None = None) -> None:
@@ -270,7 +271,7 @@ class BatchBuilder:
 
         Returns:
             The sorted messages. The time of each message is its deadline: the time at which it
-            is due, so that no message is later than the next one of its channel.
+            is due, so that no message is later than the next message of its channel.
         """
         rows = np.array(self._rows, dtype=np.int64).reshape(-1, _COLUMNS)
         repeats = self._find_repeats(rows)
@@ -287,7 +288,7 @@ class BatchBuilder:
         return MessageBatch(rows, self._payloads)
 
     def _find_repeats(self, rows: Ints) -> list[int]:
-        """Finds messages that repeat an earlier one, and need not be replayed.
+        """Finds messages that repeat an earlier message and need not be replayed.
 
         Two files of a session may contain the same message.
 
@@ -309,7 +310,7 @@ def _find_equal_numbers(rows: Ints) -> Ints:
     """Finds the messages that have the same channel (topic) and number as another message.
 
     Such messages may be copies of each other. The messages are sorted by channel and number, so
-    that equal ones are neighbours, and each one is compared with the next.
+    that equal messages are neighbours, and each message is compared with the next.
 
     Args:
         rows: Table with a row per message, shape (K, 5), see `MessageBatch.rows`.

@@ -1,12 +1,12 @@
 """Supplies the player of a log with messages, so that it never waits for the disk.
 
 To play a log means to publish its messages again, at the times of the original session. A short
-log is loaded into memory before. A long log is read by a second process, the reader. It reads
-ahead and sends the messages through a pipe, in the order in which they are played.
+log is loaded into memory beforehand. A long log is read by a second process, the reader. It
+reads ahead and sends the messages through a pipe, in the order in which they are played.
 
 Invariant:
-    - The method that returns the next messages never waits. If none are available yet, it says
-      so.
+    - The method that returns the next messages never waits. If no messages are available yet,
+      it returns `None`.
     - The memory of the reader is bounded by two constants. `LIMIT_BYTES` is the largest size of
       the messages that it stores for sorting. `HORIZON_NS` is the largest delay of a message in
       the file, measured in the log, that the reader can correct.
@@ -43,8 +43,8 @@ STEP_NS = 10_000_000_000
 LIMIT_BYTES = 512 * 1024 * 1024
 """Largest memory of the messages that wait for their turn, in bytes."""
 NICENESS = -5
-"""Priority of the reader process, if permitted: below the player, which waits for the reader,
-and above other processes.
+"""Priority of the reader process, if permitted. It is below the priority of the player, which
+waits for the reader, and above that of other processes.
 """
 
 
@@ -54,8 +54,8 @@ class _RoundEnd(NamedTuple):
     A round is one pass through the log. A log that is replayed in a loop has several rounds.
 
     Attributes:
-        strays: Number of messages that could not be played in order, because their place in the
-            file was too far from their turn.
+        strays: Number of messages that could not be played in order, because their position in
+            the file was too far from their turn.
         torn: The damaged files, with the reason.
     """
 
@@ -81,13 +81,13 @@ class _ReadPiece(NamedTuple):
 class MessageSource:
     """Supplies the messages of a log in the order in which they are replayed.
 
-    A log that is replayed in a loop has several rounds, passes through the log. Its messages
-    are supplied round after round.
+    A round is one pass through the log. If the log is replayed in a loop, its messages are
+    supplied round after round.
 
     Args:
         header: Description of the files. The topics and damages that are found during reading
             are added to it.
-        batch: All messages of the log. None if they are too many for the memory. In this case
+        batch: All messages of the log. `None` if they are too many for the memory. In this case
             `start_reader` must be called.
 
     Attributes:
@@ -147,7 +147,8 @@ class MessageSource:
         damaged ("torn") files. `restart` begins the next round.
 
         Returns:
-            The messages. None if none are available now, or if the round has ended (`ended`).
+            The messages. `None` if no messages are available now, or if the round has ended
+            (`ended`).
 
         Raises:
             LogError: A file can no longer be read.
@@ -159,7 +160,7 @@ class MessageSource:
         if isinstance(item, LogError):
             raise item
         if isinstance(item, _ReadPiece):
-            # The list is changed in place, because others refer to the same header.
+            # The list is changed in place, because other objects refer to the same header.
             self._header.topics[:] = item.topics
             self._ahead_bytes -= len(item.batch.data)
             return item.batch
@@ -177,8 +178,8 @@ class MessageSource:
         the pipe and decoded. `poll` then returns the messages.
 
         Returns:
-            True if bytes were read. False if none are available now, or if enough messages have
-            been fetched in advance.
+            True if bytes were read. False if no bytes are available now, or if enough messages
+            have been fetched in advance.
 
         Raises:
             RuntimeFault: The process that reads the log has failed.
@@ -216,7 +217,7 @@ class MessageSource:
                 self._ahead_bytes += len(item.batch.data)
 
     def restart(self) -> None:
-        """Supplies the messages of the log again from the first one, for replaying in a loop.
+        """Supplies the messages of the log again from the start, for replaying in a loop.
 
         A log in memory is queued once more. For a long log, the reader process begins again on
         its own.
@@ -245,9 +246,10 @@ def sort_messages(
     A message may be late in the file, because a site sent it again after a loss. Therefore
     messages are stored for some time before they are yielded. The memory for this is limited.
 
-    A stored message is yielded when a message arrives that is later by the horizon. To sort in
-    larger parts, this happens at most once per step of the log. The first part is yielded when
-    the horizon and one step have been read, and then one part after each further step.
+    A stored message is yielded when a message arrives that is later by the horizon. Messages
+    are yielded at most once per step of the log, so that larger parts are sorted. The first
+    part is yielded when the horizon and one step have been read, and then one part after each
+    further step.
 
     Args:
         messages: The messages, in the order of the file.
@@ -257,8 +259,8 @@ def sort_messages(
             earlier half is yielded at once.
 
     Yields:
-        Messages in the order of playing, and the number of messages among them that were too
-        late in the file to be put in order.
+        Messages in playback order, and the number of messages among them that were too late in
+        the file to be put in order.
     """
     sorter = _MessageSorter()
     before_all_messages_ns = -(2**62)
@@ -283,8 +285,8 @@ def sort_messages(
 class _MessageSorter:
     """Buffer that brings the messages of a log file into the order of their sending times.
 
-    Log files have the order of arrival. A message that comes too late for sorting, after a
-    later one of its channel was released, is a stray and is counted.
+    Log files have the order of arrival. A message is a stray if a later message of its channel
+    was released before it. Strays are counted.
     """
 
     def __init__(self) -> None:
@@ -309,8 +311,7 @@ class _MessageSorter:
     def release_until(self, until_ns: int) -> tuple[MessageBatch, int]:
         """Removes the messages that are due up to a time, so that they can be played.
 
-        They are put in the order in which they are played, which may differ from that of the
-        file.
+        They are put in playback order, which may differ from the order of the file.
 
         Args:
             until_ns: The time, in ns after the start of the session.
@@ -335,7 +336,7 @@ class _MessageSorter:
         return self._release(ordered, (len(ordered) + 1) // 2)
 
     def _release(self, ordered: MessageBatch, count: int) -> tuple[MessageBatch, int]:
-        """Keeps all messages but the first `count`, and returns those with their strays."""
+        """Removes the first `count` messages, and returns them and their number of strays."""
         self._waiting = BatchBuilder(ordered.part(slice(count, None)))
         released = ordered.part(slice(count))
         strays = 0
@@ -369,8 +370,8 @@ def feed_player(
     def send(item: _ReadPiece | _RoundEnd | LogError) -> None:
         """Writes an item to the pipe, and waits until the player has made room.
 
-        The wait limits how far the reader runs ahead, and thus the memory. Each item is
-        preceded by its size, so that the player knows where it ends.
+        The wait limits how far the reader runs ahead, and thus the memory that it needs. Each
+        item is preceded by its size, so that the player knows where it ends.
         """
         pickled = pickle.dumps(item)
         sink.write(SIZE.pack(len(pickled)) + pickled)

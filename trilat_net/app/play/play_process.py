@@ -6,7 +6,7 @@ late they were. To recorders and viewers, it looks like a running session.
 
 Invariant:
     - After the last message, the process stays on the network until its recorders have every
-      message, or send no more requests for missing ones.
+      message, or send no more requests for missing messages.
 """
 
 import math
@@ -46,7 +46,7 @@ PROGRESS_EVERY_NS = 500_000_000
 
 @dataclass(frozen=True, slots=True)
 class PlayOptions:
-    """How a log is replayed over the network, as the options of the command line say.
+    """Settings for replaying a log over the network, from the options of the command line.
 
     Attributes:
         session: Name of the session in which the log is played.
@@ -71,13 +71,13 @@ class PlaybackSummary(NamedTuple):
     Attributes:
         counts: Number of published messages, by the topic in the file.
         rounds: Number of passes through the log that were started.
-        lateness: How late the messages were published after their deadlines. None if they had
+        lateness: How late the messages were published after their deadlines. `None` if they had
             no deadlines.
         took_s: Duration of the playback, in s.
         held_s: Time for which the player waited for slow receivers, in s.
         cut: How often a receiver was disconnected because it accepted no message for 5 s.
-        strays: Number of messages that could not be played in order, because their place in the
-            file was too far from their turn.
+        strays: Number of messages that could not be played in order, because their position in
+            the file was too far from their turn.
         recorders: Number of recorders that were present after the last message.
         stored: True if all these recorders reported that they stored everything.
         refilled: Number of messages that were sent again to recorders that missed them.
@@ -162,14 +162,14 @@ class Playback:
     def play(self, start_ns: int | None) -> PlaybackSummary:
         """Replays the log to its end, and stays until all recorders have every message.
 
-        The process may be asked to end earlier by `stopped`.
+        The method returns earlier if `stopped` returns True.
 
         Args:
             start_ns: Time in the log at which the playback begins, in ns after the start of the
-                recorded session. None begins with the first message.
+                recorded session. If `None`, playback begins with the first message.
 
         Returns:
-            The result of the playback, for the summary that the user gets.
+            The result of the playback, from which the user's summary is composed.
         """
         clock = self.clock
         options = self.options
@@ -209,9 +209,9 @@ class Playback:
     def _wait_for_recorders(self) -> None:
         """Waits until every recorder on the network is ready to receive, at most `LISTEN_NS`.
 
-        Otherwise the first messages could be missing in their logs. A recorder is ready when it
-        has replied to a query. If the options require a recorder, the waiting time begins when
-        one is present.
+        Otherwise the first messages could be missing from their logs. A recorder is ready when
+        it has replied to a query. If the options require a recorder, the waiting time begins
+        when one is present.
         """
         clock = self.clock
         stand_ins = self._stand_ins
@@ -280,7 +280,7 @@ def play_log(
         show: Function that shows the progress to the user.
 
     Returns:
-        The summary. None if the playback was stopped before it began.
+        The summary. `None` if the playback was stopped before it began.
 
     Raises:
         SessionError: A session of that name is running.
@@ -327,8 +327,8 @@ def map_key_to_session(topic: str, recorded_session: str, session: str) -> str:
     """Returns the key under which a channel of the log is published in the playback's session.
 
     The name of the recorded session is replaced. A topic that does not belong to this session
-    is appended to the name of the playback's session as a whole, so that it cannot be the same
-    as another one.
+    is appended in full to the name of the playback's session, so that it cannot equal another
+    topic.
 
     Args:
         topic: Topic of the channel in the log.

@@ -1,10 +1,10 @@
-"""Publishes the messages of a recorded session in order, each one at its time.
+"""Publishes the messages of a recorded session in order, each at its time.
 
-The time at which a message is due, its deadline, follows from its time in the log by a linear
-function, which contains the start time and the speed of playing. The player sleeps until
+The time at which a message is due, its deadline, is a linear function of its time in the log.
+The function contains the start time and the speed of the replay. The player sleeps until
 shortly before a deadline and then polls the clock. It does other work (replies to other
 programs, reading in advance, progress) in the time that is left between deadlines. If no time
-is left, it does some of this work a hundred times a second nevertheless.
+is left, the player still does some of this work a hundred times a second.
 
 Invariant:
     - The deadlines depend only on the times in the log and on one start time, so that a late
@@ -28,13 +28,14 @@ from .message_source import MessageSource
 from .site_stand_ins import PlayedHistory
 
 SPIN_NS = 150_000
-"""Time before a deadline at which the player stops sleeping, in ns. A sleep usually lasts some
-60 us too long.
+"""Time before a deadline at which the player stops sleeping, in ns.
+
+A sleep usually lasts about 60 us too long.
 """
 SLOWEST = 1e-3
 """Smallest rate, in seconds of the log per second."""
 FASTEST = 1e3
-"""Largest rate, except for an unlimited one."""
+"""Largest rate, except for an unlimited rate."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,7 +45,7 @@ class Pace:
     The conversion is a linear function of the start time and the speed of the replay.
 
     Attributes:
-        origin_ns: Deadline of the time `start_ns` on the clock, in ns.
+        origin_ns: Time on the clock at which messages of the time `start_ns` are due, in ns.
         start_ns: Time in the log at which the playback begins, in ns after the start of the
             recorded session.
         rate: Speed of the playback, in seconds of the log per second. With `math.inf`, all
@@ -115,13 +116,13 @@ def parse_rate(text: str) -> float:
 def wait_until(clock: Clock, due_ns: int, spin_ns: int) -> int:
     """Waits until a deadline: sleeps at first, and polls the clock shortly before the deadline.
 
-    Sleeping alone would end some 60 us late, and polling alone would keep a processor busy.
+    Sleeping alone would end about 60 us late, and polling alone would keep a processor busy.
 
     Args:
         clock: The clock.
         due_ns: The deadline. If it has passed, the function returns at once.
-        spin_ns: Time before the deadline from which the clock is polled, in ns. With 0, it is
-            not polled, and the function may return some 60 us late.
+        spin_ns: Time before the deadline from which the clock is polled, in ns. With 0, the
+            clock is not polled, and the function may return about 60 us late.
 
     Returns:
         The time on the clock, in ns.
@@ -134,7 +135,7 @@ def wait_until(clock: Clock, due_ns: int, spin_ns: int) -> int:
 
 
 LATENESS_LIMIT_US = 100_000
-"""Lateness from which all values are counted together. The maximum is exact nevertheless."""
+"""Lateness above which all values are counted in one bin. The maximum is still exact."""
 
 
 class LatenessSummary(NamedTuple):
@@ -150,7 +151,7 @@ class LatenessSummary(NamedTuple):
 
 
 class LatenessHistogram:
-    """Counts the published messages of a replay by their lateness behind the deadline.
+    """Counts the published messages of a replay by their lateness after the deadline.
 
     Percentiles can be computed at any time from the counts, without storing every lateness. The
     width of an interval is 1 us.
@@ -185,7 +186,7 @@ class LatenessHistogram:
         uses integers and is therefore exact.
 
         Returns:
-            Median, 99th percentile and maximum of the lateness, in us. None if no message was
+            Median, 99th percentile and maximum of the lateness, in us. `None` if no message was
             counted.
         """
         # The index of each entry is the lateness in us. The last entry is the overflow bin,
@@ -197,7 +198,7 @@ class LatenessHistogram:
 
         percents = np.array([50, 99])
         percentiles_us = np.searchsorted(100 * counts_up_to, total * percents).tolist()
-        # The overflow bin has no lateness of its own. The maximum stands for it.
+        # The overflow bin has no lateness of its own, and the maximum is used instead.
         p50_us, p99_us = [
             percentile_us if percentile_us < LATENESS_LIMIT_US else self.max_us
             for percentile_us in percentiles_us
@@ -212,7 +213,7 @@ SERVICE_EVERY_NS = 10_000_000
 IDLE_NS = 1_000_000
 """Pause while there is nothing to do, in ns."""
 HELD_NS = 2_000_000
-"""Duration of a publication from which it counts as waiting for a receiver, in ns."""
+"""Duration above which a publication counts as waiting for a receiver, in ns."""
 CUT_NS = 4_900_000_000
 """Duration of a publication after which the receiver that delays it has lost its connection, in
 ns. The messages on this connection are lost, too.
@@ -300,7 +301,7 @@ class Player:
         Messages that are read from the disk or decoded only when they are due would be late.
 
         Returns:
-            The time of the first message, in ns after the start of the recorded session. None
+            The time of the first message, in ns after the start of the recorded session. `None`
             if there is no message, or the playback was stopped.
         """
         self._first_batch = self._wait_for_batch()
@@ -313,16 +314,16 @@ class Player:
         """Plays all messages, until the end of the log or until the playback is stopped.
 
         A round is one pass through the log. The next round begins `LOOP_PAUSE_NS` after the
-        last message of the present one.
+        last message of the present round.
 
         Every message is stored in the history before it is played, because recorders may
         request it again. A log that is entirely in memory is stored once, in the first round.
-        Of a log that is read while it is played, the history holds only recent messages, which
-        differ in each round. Therefore it is cleared before the next round.
+        If the log is read while it is played, the history holds only recent messages, which
+        differ in each round. The history is therefore cleared before the next round.
 
         Args:
-            pace: Start time and speed of the playback, from which the deadlines of the messages
-                follow.
+            pace: Start time and speed of the playback, which determine the deadlines of the
+                messages.
             loop: True to play the log again and again, until the playback is stopped.
         """
         is_log_in_memory = self._source.whole
@@ -347,7 +348,7 @@ class Player:
                 self._history.clear()
 
     def _wait_for_batch(self) -> MessageBatch | None:
-        """Waits for the next messages. None at the end of the round, or if stopped."""
+        """Waits for the next messages. `None` at the end of the round, or if stopped."""
         batch = self._first_batch
         self._first_batch = None
         while batch is None and not (self._source.ended or self._stopped()):
@@ -365,7 +366,7 @@ class Player:
         1. It waits for the deadline, and meanwhile does other work, such as replies to other
            programs. If the playback is late and there is no time left, the other work is done
            every `SERVICE_EVERY_NS` nevertheless.
-        2. It notes by how much the message is late.
+        2. It measures by how much the message is late.
         3. It publishes the message. The network blocks this call while a receiver is slow. If
            it blocks for longer than `HELD_NS`, the duration counts as waiting for a receiver.
            If it blocks for longer than `CUT_NS`, the receiver has been disconnected (a stall).

@@ -52,11 +52,11 @@ class PlaySelection:
     Attributes:
         channels: Filter of the channels. If it includes no channel explicitly, the channels of
             the sites are played.
-        start_ns: Earliest time of a message, in ns after the start of the session. None if
+        start_ns: Earliest time of a message, in ns after the start of the session. `None` if
             there is no limit.
-        stop_ns: Latest time of a message, in ns after the start of the session. None if there
+        stop_ns: Latest time of a message, in ns after the start of the session. `None` if there
             is no limit.
-        time: Which time of a message counts, that of sending or that of arrival.
+        time: Whether the sending time or the arrival time of a message counts.
     """
 
     channels: ChannelFilter = ALL_CHANNELS
@@ -83,7 +83,7 @@ class PlaySelection:
         return is_candidate and self.channels.accepts(key)
 
     def contains(self, t_ns: int) -> bool:
-        """Returns True if a time is in the selected part of the session, such as 5 s to 10 s.
+        """Returns True if a time lies in the selected part of the session, such as 5 s to 10 s.
 
         Args:
             t_ns: The time, for example of a message, in ns after the start of the session.
@@ -92,71 +92,81 @@ class PlaySelection:
         is_after = self.stop_ns is not None and t_ns > self.stop_ns
         return not (is_before or is_after)
 
+    @classmethod
+    def parse(
+        cls,
+        include: Collection[str],
+        exclude: Collection[str],
+        start_s: float | None,
+        stop_s: float | None,
+        duration_s: float | None,
+        time: str,
+    ) -> "PlaySelection":
+        """Parses the options of a command that select which messages of a log are replayed.
 
-def parse_selection(
-    include: Collection[str],
-    exclude: Collection[str],
-    start_s: float | None,
-    stop_s: float | None,
-    duration_s: float | None,
-    time: str,
-) -> PlaySelection:
-    """Parses the options of a command that select which messages of a log are replayed.
+        The user limits the part of the session by `--start`, and by either `--stop` or
+        `--duration`.
 
-    The user limits the part of the session by `--start`, and by either `--stop` or
-    `--duration`.
+        Args:
+            include: Key expressions of `--include`.
+            exclude: Key expressions of `--exclude`.
+            start_s: Value of `--start`, in s after the start of the session. `None` if it is
+                absent.
+            stop_s: Value of `--stop`, in s after the start of the session. `None` if it is
+                absent.
+            duration_s: Value of `--duration`, in s, instead of `stop_s`. `None` if it is
+                absent.
+            time: Value of `--time`, see `PlayTime`.
 
-    Args:
-        include: Key expressions of `--include`.
-        exclude: Key expressions of `--exclude`.
-        start_s: Value of `--start`, in s after the start of the session. None if it is absent.
-        stop_s: Value of `--stop`, likewise.
-        duration_s: Value of `--duration`, in s, instead of `stop_s`. None if it is absent.
-        time: Value of `--time`, see `PlayTime`.
+        Raises:
+            UsageError: The options contradict each other, or an option is not valid.
+        """
+        if time not in get_args(PlayTime):
+            raise UsageError(
+                "--time must be publish (the time at which a message was sent) or log (the "
+                f"time at which it arrived), not {time!r}"
+            )
 
-    Raises:
-        UsageError: The options contradict each other, or an option is not valid.
-    """
-    if time not in get_args(PlayTime):
-        raise UsageError(
-            "--time must be publish (the time at which a message was sent) or log (the time at "
-            f"which it arrived), not {time!r}"
+        for name, seconds in (
+            ("--start", start_s),
+            ("--stop", stop_s),
+            ("--duration", duration_s),
+        ):
+            if seconds is None:
+                continue
+            is_reasonable = math.isfinite(seconds) and abs(seconds) <= 1e9
+            if not is_reasonable:
+                raise UsageError(f"{name} must be a number of seconds, not {seconds:g}")
+
+        if duration_s is not None:
+            if duration_s <= 0:
+                raise UsageError(f"--duration must be more than 0 s, not {duration_s:g}")
+            if stop_s is not None:
+                raise UsageError(
+                    "--stop and --duration set the same limit; give only one of them"
+                )
+            stop_s = (start_s or 0.0) + duration_s
+
+        if start_s is not None and stop_s is not None and stop_s <= start_s:
+            raise UsageError(f"--stop must be after --start ({start_s:g} s), not {stop_s:g} s")
+
+        return cls(
+            channels=ChannelFilter.parse(include, exclude),
+            start_ns=None if start_s is None else round(start_s * NS_PER_S),
+            stop_ns=None if stop_s is None else round(stop_s * NS_PER_S),
+            time=cast(PlayTime, time),
         )
-
-    for name, seconds in (("--start", start_s), ("--stop", stop_s), ("--duration", duration_s)):
-        if seconds is None:
-            continue
-        is_reasonable = math.isfinite(seconds) and abs(seconds) <= 1e9
-        if not is_reasonable:
-            raise UsageError(f"{name} must be a number of seconds, not {seconds:g}")
-
-    if duration_s is not None:
-        if duration_s <= 0:
-            raise UsageError(f"--duration must be more than 0 s, not {duration_s:g}")
-        if stop_s is not None:
-            raise UsageError("--stop and --duration set the same limit; give only one of them")
-        stop_s = (start_s or 0.0) + duration_s
-
-    if start_s is not None and stop_s is not None and stop_s <= start_s:
-        raise UsageError(f"--stop must be after --start ({start_s:g} s), not {stop_s:g} s")
-
-    return PlaySelection(
-        channels=ChannelFilter.parse(include, exclude),
-        start_ns=None if start_s is None else round(start_s * NS_PER_S),
-        stop_ns=None if stop_s is None else round(stop_s * NS_PER_S),
-        time=cast(PlayTime, time),
-    )
 
 
 HORIZON_NS = 70 * NS_PER_S
-"""Largest distance between a message's place in a file and its turn, in ns. Sites keep their
+"""Largest distance between a message's position in a file and its turn, in ns. Sites keep their
 messages for a minute, and send them again to recorders that missed them.
 """
 _LAST = 1 << 61
-"""Bound of times and numbers, so that those of damaged files do not overflow."""
+"""Bound on times and numbers, so that wrong values in damaged files do not overflow."""
 NUMBERS_OF_A_START = 1 << 40
-"""Number that is added to the event numbers of each further start of a site. Without it they
-would repeat, because each start numbers its events from 0.
+"""Number that is added to the event numbers of each further start of a site. Otherwise, the
+numbers would repeat, because each start numbers its events from 0.
 """
 
 
@@ -191,7 +201,7 @@ class SessionHeader:
 
     Attributes:
         session: Name of the recorded session.
-        scenario: Scenario of the session, its description in a TOML file.
+        scenario: Scenario of the session, which describes the arms and the network.
         scenario_text: Text of the scenario, as stored in the log.
         fingerprint: Text that identifies the platform on which the session was recorded.
         version: Version of the messages' format. It is 0 if it is unknown.
@@ -259,17 +269,17 @@ class _PlayedChannel:
     def find_number(self, item: McapMessage, t_ns: int) -> int:
         """Finds the number by which a message is ordered among the messages of its channel.
 
-        The messages of a channel are played in the order of their numbers. There are three
-        kinds of numbers, so that this order is that of the original publication:
+        The messages of a channel are played in the order of their numbers. Three kinds of
+        numbers make this order equal to the order of the original publication:
 
-        - Records and statistics of a site have the number that follows from their control
-          period (tick). A site that was started again continues these numbers.
+        - Records and statistics of a site are numbered by their control period (tick). A site
+          that was started again continues these numbers.
         - Events of a site are numbered from 0 in each start of the site. To distinguish the
           starts, a multiple of `NUMBERS_OF_A_START` is added.
-        - Other messages have no number. Their time takes its place.
+        - Other messages have no number. Their time is used instead.
 
         The method must be called once for each message of the file, in the order of the file,
-        because it counts the events and notes each new start.
+        because it counts the events and the starts of the site.
 
         Args:
             item: The message, as the file contains it.
@@ -308,7 +318,7 @@ class SessionReader:
             total.
 
     Attributes:
-        header: Description of the session. None before the first message.
+        header: Description of the session. `None` before the first message.
     """
 
     def __init__(
@@ -323,8 +333,8 @@ class SessionReader:
         """Yields the messages to replay from all files of a log, in the order of each file.
 
         Raises:
-            LogError: A file is missing, is no log of trilat-net, or belongs to another session
-                than the first file.
+            LogError: A file is missing, is not a log of trilat-net, or belongs to a different
+                session from the first file.
         """
         for path in self._paths:
             with reading(path) as stream:
@@ -342,7 +352,7 @@ class SessionReader:
             reader: Reader of the file.
 
         Raises:
-            LogError: The file is no log of trilat-net, or belongs to another session.
+            LogError: The file is not a log of trilat-net, or belongs to another session.
         """
         epoch_ns: int | None = None
         channels: dict[str, _PlayedChannel] = {}
@@ -365,7 +375,8 @@ class SessionReader:
             header.first_ns = min(header.first_ns, t_ns)
             header.last_ns = max(header.last_ns, t_ns)
 
-            # The first message of a site tells the boot, the random number of the site's start.
+            # The first message of a site contains the boot, the random number of the site's
+            # start.
             if channel.site and channel.site not in header.boots:
                 boot = _decode_header(item.payload).boot
                 if boot >= 0:
@@ -385,8 +396,8 @@ class SessionReader:
     def _find_time_ns(self, item: McapMessage, epoch_ns: int) -> int:
         """Returns the time at which a message is played, in ns after the start of the session.
 
-        A message was sent at one time and arrived at a later one. The user chooses which of the
-        two counts.
+        A message was sent at one time and arrived at a later time. The user chooses which of
+        the two times is used.
 
         Args:
             item: The message.
@@ -402,18 +413,18 @@ class SessionReader:
     def _read_session(self, path: Path, reader: McapReader) -> tuple[int, SessionHeader]:
         """Reads the metadata of a file's session, and creates the header for the first file.
 
-        All files must belong to the same session, because they are played as one.
+        All files must belong to the same session, because they are played as one session.
 
         Returns:
             The start of the session in Unix time, in ns, and the header.
 
         Raises:
-            LogError: The file is no log of trilat-net, or belongs to another session than the
-                previous files.
+            LogError: The file is not a log of trilat-net, or belongs to a different session
+                from the previous files.
         """
         metadata = reader.metadata.get(SESSION, {})
         if "session" not in metadata or SCENARIO not in reader.attachments:
-            raise LogError(f"{path}: is an MCAP file, but not a trilat-net log")
+            raise LogError(f"{path} is an MCAP file, but not a trilat-net log")
 
         try:
             text = reader.attachments[SCENARIO].decode()
@@ -435,14 +446,15 @@ class SessionReader:
         )
         if not is_same_session:
             raise LogError(
-                f"{path}: belongs to a different session from {self._paths[0]}; the files of "
+                f"{path} belongs to a different session from {self._paths[0]}; the files of "
                 "one replay must be parts of the same log"
             )
         return epoch_ns, self.header
 
 
 SEARCH_LIMIT = 100_000
-"""Number of messages, after those that fit into memory, that are searched for starts of sites.
+"""Number of further messages, beyond those that fit into memory, that are searched for starts
+of sites.
 """
 
 
@@ -465,11 +477,11 @@ def preload_messages(
             total.
 
     Returns:
-        The description of the session, and the messages in play order. None instead of the
-        messages if they need more memory.
+        The description of the session, and the messages in play order. `None` takes the place
+        of the messages if they need more memory.
 
     Raises:
-        LogError: A file is missing, or is no log of trilat-net.
+        LogError: A file is missing, or is not a log of trilat-net.
         UsageError: No message is selected.
     """
     reader = SessionReader(paths, selection, progress)
@@ -482,7 +494,7 @@ def preload_messages(
                 break
         else:  # the end of the files was reached
             if reader.header is None:
-                raise LogError(f"{paths[0]}: contains nothing")
+                raise LogError(f"{paths[0]} is empty")
             if not waiting.memory:
                 raise UsageError(_describe_empty_selection(paths[0], selection, reader.header))
             return reader.header, waiting.ordered()
@@ -503,18 +515,18 @@ def _describe_empty_selection(
     A wrong start or end is named. Otherwise the filter of the channels is the reason.
     """
     if header.last_ns < header.first_ns:
-        return f"{path}: contains no message"
+        return f"{path} contains no messages"
 
     span = f"from {header.first_ns / NS_PER_S:.3f} s to {header.last_ns / NS_PER_S:.3f} s"
 
     if selection.start_ns is not None and selection.start_ns > header.last_ns:
         option = f"--start {selection.start_ns / NS_PER_S:g} s"
-        return f"{option}: is after the end; the log lasts {span}"
+        return f"{option} is after the end; the log lasts {span}"
     if selection.stop_ns is not None and selection.stop_ns < header.first_ns:
         option = f"--stop {selection.stop_ns / NS_PER_S:g} s"
-        return f"{option}: is before the beginning; the log lasts {span}"
+        return f"{option} is before the beginning; the log lasts {span}"
 
     return (
-        f"{path}: has no message for this selection; the topics of the log have the form "
+        f"{path} has no message for this selection; the topics of the log have the form "
         f"trilat/{header.session}/{header.scenario.names[0]}/state, and the log lasts {span}"
     )

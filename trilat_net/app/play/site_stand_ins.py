@@ -12,9 +12,9 @@ Invariant:
       session that they join late.
     - Identities are sent for all sites. Other messages of a site are sent only if the log
       contains them.
-    - Recorders can request messages again that were played. If the log is in memory, these are
-      all messages of the present round. If it is read while it is played, they are those of the
-      last minute, which bounds the memory.
+    - Recorders can request played messages again. If the log is in memory, all messages of the
+      present round are available. If the log is read while it is played, the messages of the
+      last minute are available, which bounds the memory.
 """
 
 from bisect import bisect_left
@@ -67,7 +67,7 @@ class _ChannelMessages(NamedTuple):
         Returns:
             The number of each message in its channel, and its index in the batch, in ascending
             order. The list has at most one entry more than a reply may contain, so that the
-            caller notices if the reply is full.
+            caller can detect a full reply.
         """
         start = int(np.searchsorted(self.numbers, number))
         selected = slice(start, start + BACKFILL_MESSAGES + 1)
@@ -82,11 +82,11 @@ class PlayedHistory:
     Recorders request lost messages of a real session in the same way.
 
     Args:
-        kept_ns: Duration of the log for which messages are stored, in ns. None to store all
-            messages.
+        kept_ns: Duration of the log for which messages are stored, in ns. If `None`, all
+            messages are stored.
 
     Attributes:
-        next_numbers: Number after that of the last played message, by channel.
+        next_numbers: Number that follows the last played message, by channel.
     """
 
     def __init__(self, kept_ns: int | None = None) -> None:
@@ -179,7 +179,7 @@ _MAX_RECORDER_EVENTS = 256
 
 
 class SiteStandIns:
-    """Takes the place of all arms' processes of a recorded session while it is replayed.
+    """Replies in place of the sites of a recorded session while the session is replayed.
 
     To other programs, a log that is replayed thus looks like a running session: its arms
     announce themselves, reply to queries, and send messages again that a recorder missed.
@@ -192,8 +192,8 @@ class SiteStandIns:
         history: The messages that were played.
 
     Attributes:
-        recorders: Identifiers of the starts of the recorders that are present, as text. Each
-            start of a process has its own random number.
+        recorders: Identifiers of the recorders that are present, as text. A recorder gets a new
+            random identifier at each start.
         refilled: Number of messages that were sent again to recorders.
     """
 
@@ -236,8 +236,8 @@ class SiteStandIns:
     def start_session(self, epoch_mono_ns: int) -> None:
         """Announces the session as running, so that recorders and viewers join it.
 
-        A site is the process that ran an arm when the log was recorded. Its identity now names
-        the time at which the playback starts.
+        A site is the process that ran an arm when the log was recorded. During a playback, the
+        identity of the site states the start time of the playback.
 
         Args:
             epoch_mono_ns: Start time of the session (tick 0) on the monotonic clock, in ns.
@@ -251,8 +251,8 @@ class SiteStandIns:
         """Replies to waiting requests of other programs in the name of the original sites.
 
         It replies to all queries for identities, but to at most one request of a recorder for
-        missing messages, so that the call is short. It also notes which recorders are present,
-        and what they report.
+        missing messages, to keep the call short. It also updates which recorders are present,
+        and which messages they have stored.
 
         Returns:
             True if a request of a recorder was processed. More requests may be waiting then.
@@ -269,7 +269,7 @@ class SiteStandIns:
         return False
 
     def _receive_recorders(self) -> None:
-        """Notes which recorders are present, and which sites they have stored completely."""
+        """Updates which recorders are present, and which sites they have stored completely."""
         for token, is_alive in topics.read_presence(self._presence):
             if is_alive:
                 self.recorders.add(token.boot)
@@ -328,16 +328,16 @@ class SiteStandIns:
         the number of an event for each earlier start. Hence the number of the newest played
         event, divided by `NUMBERS_OF_A_START` and rounded down, is the index of its start.
 
-        The boot of the first start is known in advance. That of a later start is read from the
-        newest event when it is needed first, and is then stored in `_boots`.
+        The boot of the first start is known in advance. The boot of a later start is read from
+        the newest event when it is first needed, and is then stored in `_boots`.
 
         Args:
             site: Name of the site.
 
         Returns:
             The index of the start, which is 0 for the first one, and its boot. If the newest
-            event is no longer stored or cannot be decoded, they are those that were found
-            before.
+            event is no longer stored or cannot be decoded, the values that were found before
+            are returned.
         """
         channel = self._find_channel(site, topics.EVENT)
         # It is -1 if no event of the site was played yet.
@@ -358,7 +358,7 @@ class SiteStandIns:
         return self._boots.get(site, first_start)
 
     def _find_boot(self, site: str) -> int:
-        """Returns the random number that identifies the start of a site that is being played.
+        """Sends messages that a recorder has missed again, in the name of the original site.
 
         Recorders accept only replies of that start.
         """

@@ -69,10 +69,10 @@ Spatial = tuple[Three, Three]
 class ChainJoint(NamedTuple):
     """Geometry, drive, friction and stops of one joint of an arm.
 
-    Mass and inertia of the link that it moves are not here, but in the parameters theta.
+    The mass and inertia of the link that the joint moves are not included; they are in theta.
 
     Attributes:
-        prismatic: True: the joint slides (m, N); false: it turns (rad, N m).
+        prismatic: True if the joint slides (m, N), False if it turns (rad, N m).
         axis: Axis of motion in the link's frame, length 1.
         rotation: Orientation of the link's frame in the previous link's frame at position 0,
             three rows.
@@ -130,7 +130,7 @@ def chain_dtype(joints: int) -> np.dtype[np.void]:
       in the frame of the base.
     - Motion, as spatial vectors: the velocity V of the link, its velocity W and acceleration A
       in the reference motion of a control law, and the force f on the link.
-    - Dynamics: `bias`, the torque C qd + G with friction, less the torque of the stops;
+    - Dynamics: `bias`, the torque C qd + G with friction, minus the torque of the stops;
       `composite`, the ten inertial parameters of the link and all links after it as one rigid
       body; and M, the row of the inertia matrix.
     - End effector: `J_lin` and `J_ang`, the column of its Jacobian.
@@ -209,7 +209,8 @@ def three(a: Vector) -> Three:
 def put_three(a: Array, values: Three) -> None:
     """Writes a vector, given as a tuple of three numbers, into an array of length 3.
 
-    The array is overwritten in place, because compiled code of the control loop allocates none.
+    The array is overwritten in place, because compiled code in the control loop must not
+    allocate memory.
 
     Args:
         a: The array, which is changed.
@@ -288,7 +289,7 @@ def rotate(R: Array, a: Three) -> Three:
 def _rotate_back(R: Array, a: Three) -> Three:
     """Returns the product R' a: a 3D vector rotated by the inverse of a rotation matrix R.
 
-    The inverse of a rotation matrix is its transpose, so that no equations are solved.
+    The inverse of a rotation matrix is its transpose, so no equations need to be solved.
 
     Args:
         R: Rotation matrix, shape (3, 3).
@@ -579,9 +580,9 @@ def inverse_dynamics(
 
     M is the inertia matrix of the links, C the Coriolis matrix, G the gravity torque and
     `armature` the inertia of the drives. The friction is taken at the reference velocity v and
-    not at qd. With r = qd - v, then r' (friction(qd) - friction(v)) >= 0: the difference to
-    the real friction can only dissipate energy. `propagate_motion` must have been called for
-    the same motion.
+    not at qd. With r = qd - v, this gives r' (friction(qd) - friction(v)) >= 0, so the
+    difference from the real friction can only dissipate energy. `propagate_motion` must have
+    been called for the same motion.
 
     Args:
         chain: Data of the joints, one row per joint.
@@ -649,7 +650,7 @@ def _add_products(factor: float, x: Spatial, y: Spatial, first: int, gradient: A
                + x_ang' J y_ang
 
     The factors of the parameters in this sum are the derivatives with respect to them. J is
-    symmetric. Therefore Ixy, Ixz and Iyz stand in two elements each, and have two products.
+    symmetric. Therefore Ixy, Ixz and Iyz appear in two elements each, and have two products.
 
     Args:
         factor: Factor of the term.
@@ -814,9 +815,9 @@ def _add_composite(row: Row, before: Row) -> None:
 def mass_matrix(chain: RowArray, theta: Vector) -> None:
     """Computes the inertia matrix M(q) of the arm, with the inertia of its drives.
 
-    M is written into the field `M` of the rows, the lower triangle only, because M is
-    symmetric. The method is that of composite rigid bodies (Featherstone). `place_joints` must
-    have been called for the same positions.
+    Only the lower triangle of M is written into the field `M` of the rows, because M is
+    symmetric. The method uses composite rigid bodies (Featherstone). `place_joints` must have
+    been called for the same positions.
 
     Args:
         chain: Data of the joints, one row per joint; written.
@@ -858,7 +859,7 @@ def _stop_torque(row: Row, q: float, qd: float) -> float:
     """Returns the torque of the mechanical stops at the ends of a joint's range, N m.
 
     A stop acts only beyond the end of the range: a spring and a damper push the joint back, and
-    never pull. Within the range the torque is 0. For a joint that slides it is a force, N.
+    never pull. Within the range the torque is 0. For a sliding joint, it is a force, N.
 
     Args:
         row: Data of the joint.
@@ -870,14 +871,15 @@ def _stop_torque(row: Row, q: float, qd: float) -> float:
     upper_spring = row.stop_stiffness * (row.upper - q)
     lower_push: float = max(lower_spring - damper, 0.0)
     upper_push: float = min(upper_spring - damper, 0.0)
-    # Selections in place of branches: this code is also compiled for several runs at once.
+    # `choose` takes the place of branches, because this code is also compiled for several runs
+    # at once.
     upper_or_none = choose(q > row.upper, upper_push, 0.0)
     return choose(q < row.lower, lower_push, upper_or_none)
 
 
 @leaf
 def _bias(chain: RowArray, theta: Vector, gravity: Vector, q: Vector, qd: Vector) -> None:
-    """Computes the joint torques that act besides those of the accelerations: the bias torque.
+    """Computes the bias torque, which the motion of the joints requires without acceleration.
 
         bias = C qd + G + friction - stops
 
@@ -950,7 +952,7 @@ def put_model(
     """Computes the inertia matrix and the bias torque, for a control law that needs them.
 
     The bias torque is C qd + G + friction - stops: Coriolis torque, gravity torque and joint
-    friction, less the torque of the stops. `place_joints` must have been called for the same
+    friction, minus the torque of the stops. `place_joints` must have been called for the same
     positions.
 
     Args:
@@ -995,7 +997,7 @@ def find_acceleration(
         gravity: Gravitational acceleration in the base's frame, m/s^2, shape (3,).
         q: Joint positions, shape (n,), rad or m.
         qd: Joint velocities, shape (n,), rad/s or m/s.
-        torque: The whole torque on the joints, shape (n,), N m or N.
+        torque: Total torque on the joints, shape (n,), N m or N.
         qdd: Receives the accelerations, shape (n,), rad/s^2 or m/s^2.
     """
     n = chain.shape[0]

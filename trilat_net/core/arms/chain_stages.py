@@ -162,7 +162,7 @@ def update_torque(s: Row, chain: RowArray) -> None:
 def put_gravity(s: Row, chain: RowArray, theta: Array, torque: Array) -> None:
     """Computes the torque that holds the chain against gravity, for the given parameters.
 
-    It is the torque of the inverse dynamics without motion. `place_joints` must have been
+    This is the torque of the inverse dynamics without motion. `place_joints` must have been
     called for the present positions.
 
     Args:
@@ -227,8 +227,9 @@ def put_source_torque(
     """Computes the joint torque that operators and environments exert on an arm.
 
     An operator is a model of a person who moves the arm, and an environment a wall or a damper.
-    Some are sampled: their torque is evaluated once per period of the control loop and constant
-    until the next period. All others act continuously. One call covers one of the two groups.
+    Some of them are sampled: their torque is evaluated once per period of the control loop, and
+    is constant until the next period. All others act continuously. One call covers one of the
+    two groups.
 
     Args:
         t_s: Time since the start of the session, s.
@@ -236,7 +237,7 @@ def put_source_torque(
         chain: Data of the n joints, one row per joint; their frames are updated.
         state: Joint positions, followed by joint velocities, shape (2 n,).
         actors: Operators and environments, one row for each.
-        table: Numbers of all operators and environments, for example recorded torques.
+        table: Numerical data of all operators and environments, for example recorded torques.
         sampled: 1 for the torque of the sampled operators and environments, 0 for all others.
         torque: Receives the torque on the arm, shape (n,), N m.
     """
@@ -262,15 +263,15 @@ def update_external_torque(
     """Computes the torque that operators and environments exert on the arm at time t.
 
     An operator is a model of a person who moves the arm, and an environment a wall or a damper.
-    The row `s` of the arm receives the whole torque, the part that stays constant until the
-    next period of the control loop, and the largest force of a wall.
+    The row `s` of the arm receives the total torque, the part of it that stays constant until
+    the next period of the control loop, and the largest force of a wall.
 
     Args:
         t_s: Time since the start of the session, s.
         s: State of the site (the process that runs the arm); written.
         chain: Data of the joints, one row per joint; their frames are updated.
         actors: Operators and environments, one row for each.
-        table: Numbers of all operators and environments, for example recorded torques.
+        table: Numerical data of all operators and environments, for example recorded torques.
     """
     place_joints(chain, s.q)
     held_n = put_torque_on_chain(
@@ -319,7 +320,7 @@ def put_stage_torque(
             velocities `stage_qd` of the stage; `stage_torque` is written.
         chain: Data of the joints, one row per joint, placed at the angles `stage_q`.
         actors: Operators and environments, one row for each.
-        table: Their numbers, for example recorded torques.
+        table: Numerical data of all operators and environments, for example recorded torques.
     """
     put_torque_on_chain(
         t_s=t_s,
@@ -376,9 +377,9 @@ def _put_acceleration(
             velocities `stage_qd` of the stage. The accelerations are written into `stage_qdd`.
         chain: Data of the joints, one row per joint.
         actors: Operators and environments, one row for each.
-        table: Their numbers, for example recorded torques.
+        table: Numerical data of all operators and environments, for example recorded torques.
     """
-    # The torques and the dynamics depend on where the links are.
+    # The torques and the dynamics depend on the positions of the links.
     place_joints(chain, s.stage_q)
     put_stage_torque(t_s=t_s, s=s, chain=chain, actors=actors, table=table)
     put_stage_acceleration(s, chain)
@@ -394,8 +395,8 @@ def use_stage(s: Row, joints: int, weight: float, ahead_s: float) -> None:
         q(t + h) = q(t) + h/6 (qd_1 + 2 qd_2 + 2 qd_3 + qd_4)        and the same for qd, qdd
         q_{n+1}  = q(t) + ahead_s qd_n                               and the same for qd, qdd
 
-    The first line is the result, of which this function adds up the sum in brackets. The second
-    line is the state at which stage n + 1 evaluates the derivatives.
+    The first line is the result. This function adds up the sum in its brackets. The second line
+    is the state at which stage n + 1 evaluates the derivatives.
 
     Args:
         s: State of the site (the process that runs the arm). `q` and `qd` are the state at the
@@ -486,7 +487,7 @@ def advance_arm(
             written.
         chain: Data of the joints, one row per joint.
         actors: Operators and environments, one row for each.
-        table: Numbers of all operators and environments, for example recorded torques.
+        table: Numerical data of all operators and environments, for example recorded torques.
 
     Returns:
         True if the result is finite. Otherwise False, and positions and velocities are

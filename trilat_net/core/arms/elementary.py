@@ -1,8 +1,8 @@
 """Computes sine, cosine and hyperbolic tangent with the same bits on every machine.
 
 The functions of the C library differ in the last bit from one platform to the next. A run that
-is executed again from its log on another machine would then differ, too. The functions of this
-module do not.
+is executed again from its log on another machine would then differ too. The functions of this
+module give the same bits everywhere.
 
 - The angle is reduced by multiples of pi/2, which is stored in three parts (Cody and Waite,
   "Software Manual for the Elementary Functions", 1980).
@@ -25,7 +25,7 @@ _PART_1 = 1.5707963267341256
 _PART_2 = 6.077100506303966e-11
 _PART_3 = 2.0222662487959506e-21
 LARGEST_RAD = 2.0**30
-"""Largest angle, rad: beyond it a double resolves angles to only a tenth of a microradian."""
+"""Largest angle, rad. Above it, a double resolves angles to only a tenth of a microradian."""
 
 
 @leaf
@@ -36,8 +36,8 @@ def sincos(x: float) -> tuple[float, float]:
     itself causes an error of similar size. Both results are NaN if the angle is not finite or
     is beyond `LARGEST_RAD`.
     """
-    # The nearest quarter turn, and the angle y from there. `round_down` returns a float: the
-    # angle y need not wait for conversions to an integer and back.
+    # The nearest quarter turn, and the angle y from there. `round_down` returns a float, so
+    # that computing y need not wait for conversions to an integer and back.
     quarter = round_down(x * _QUARTERS_PER_RAD + 0.5)
     y = ((x - quarter * _PART_1) - quarter * _PART_2) - quarter * _PART_3
     z = y * y
@@ -56,8 +56,8 @@ def sincos(x: float) -> tuple[float, float]:
     c = c * z - 1.38888888888730564116e-3
     c = c * z + 4.16666666666665929218e-2
     c = 1.0 - 0.5 * z + z * z * c
-    # After n quarter turns: (s, c), (c, -s), (-s, -c) or (-c, s) for n modulo 4. Selections in
-    # place of branches let a loop over several angles use vector instructions.
+    # After n quarter turns: (s, c), (c, -s), (-s, -c) or (-c, s) for n modulo 4. `choose` in
+    # place of branches lets a loop over several angles use vector instructions.
     is_in_range = abs(x) <= LARGEST_RAD
     turn = whole(choose(is_in_range, quarter, 0.0))
     is_odd = turn & 1 != 0
@@ -70,11 +70,11 @@ def sincos(x: float) -> tuple[float, float]:
 
 _LOG_2_HIGH = 6.93145751953125e-1
 _LOG_2_LOW = 1.42860682030941723212e-6
-"""The natural logarithm of 2 in two parts, of which the first has few bits."""
+"""The natural logarithm of 2 in two parts. The first part has few bits."""
 _LOG_2_OF_E = 1.4426950408889634
 _SMALL = 0.625
 _LARGE = 20.0
-"""From this number on the hyperbolic tangent is 1 to the last bit."""
+"""For arguments from this value on, the hyperbolic tangent is 1 to the last bit."""
 
 
 @leaf
@@ -106,7 +106,7 @@ def tanh(x: float) -> float:
         return x + x * square * (P / Q)
     if magnitude >= _LARGE:
         return 1.0 if x > 0.0 else -1.0
-    # NaN fails both this comparison and the previous one.
+    # NaN fails both this comparison and the previous comparison.
     is_nan = not magnitude < _LARGE
     if is_nan:
         return math.nan

@@ -66,8 +66,10 @@ class TorqueKind(IntEnum):
 SCRIPTED_KINDS = (TorqueKind.PULSE, TorqueKind.RECORDED, TorqueKind.CHIRP, TorqueKind.MULTISINE)
 """The kinds whose torque is a function of time alone."""
 LIVE_KINDS = (TorqueKind.LIVE_TIP, TorqueKind.LIVE_FORCE, TorqueKind.LIVE_JOINT)
-"""The kinds that act only while a hand holds the arm. Their numbers are the largest, and leaves
-test for them by `>=`.
+"""The kinds that act only while a hand holds the arm.
+
+Their numbers are the largest, so
+compiled functions can recognise them by `>=`.
 """
 OWN_KINDS = (TorqueKind.OWN_JOINTS, TorqueKind.OWN_TIP)
 """The kinds that call a user's function."""
@@ -95,13 +97,15 @@ class TorqueSource(NamedTuple):
         K: Stiffness: HAND N m/rad, TASK_HAND N/m per axis, WALL N/m (first number).
         B: Damping: HAND and VISCOUS N m s/rad, TASK_HAND N s/m per axis, WALL N s/m (first
             number).
-        sampled: True: evaluated once per tick (period of the control loop) and held.
+        sampled: True if the torque is evaluated once per tick (period of the control loop), and
+            constant until the next tick.
         table: RECORDED: rows of time, s, and torque ON each joint, N m, shape (rows, 1 + n).
             MULTISINE: Rows of frequency, Hz, and phase at the start, turns; further columns are
             not used.
         limit: Live hand: the largest norm of its force, N, or torque, N m.
-        grip: Live hand: part of its force that acts, 0 to 1.
-        model: User's kind: the object with its numbers and its function `act`, see `plugged`.
+        grip: Live hand: factor of its force, 0 to 1.
+        model: User's kind: the object with its parameters and its function `act`, see
+            `plugged`.
     """
 
     kind: TorqueKind
@@ -133,10 +137,10 @@ def torque_source_dtype(width: int) -> np.dtype[np.void]:
 
     - `table_first` and `table_count` select the rows of the common table that belong to this
       operator or environment: recorded torques, sines, or parameters of a user's function.
-    - The other additional fields serve a function that a user wrote. `call` is its address. It
-      reads its input from `t_s` (time since the start of the session, s), `coordinates` (their
-      number), `at` (position of the arm, rad or m) and `speed` (derivative of `at`), and writes
-      the force or torque into `effort`, N or N m.
+    - The other additional fields serve a function that a user wrote. `call` is its address. The
+      function reads its input from `t_s` (time since the start of the session, s),
+      `coordinates` (their number), `at` (position of the arm, rad or m) and `speed` (derivative
+      of `at`), and writes the force or torque into `effort`, N or N m.
 
     Args:
         width: Largest length of the vectors of all operators and environments.
@@ -144,7 +148,8 @@ def torque_source_dtype(width: int) -> np.dtype[np.void]:
     integers = ("kind", "sampled", "table_first", "table_count", "call", "coordinates")
     scalars = (*_SCALARS, "t_s")
     vectors = (*_NUMBERS, "at", "speed", "effort")
-    # Integers, scalars and vectors follow one another, all of 64 bits: the row has no gaps.
+    # Integers, scalars and vectors follow one another. All have 64 bits, so the row has no
+    # gaps.
     fields: list[Any] = [(name, "i8") for name in integers]
     fields += [(name, "f8") for name in scalars]
     fields += [(name, "f8", (width,)) for name in vectors]
@@ -154,7 +159,7 @@ def torque_source_dtype(width: int) -> np.dtype[np.void]:
 TorqueSourceRows = NDArray[np.void]
 TorqueTable = Array
 SourceTorque = tuple[float, float, float]
-"""Torque ON each joint, N m, and the largest force of a wall in it, N."""
+"""Torque ON each joint, N m, and the largest force of a wall that contributes to it, N."""
 NO_TORQUE: SourceTorque = (0.0, 0.0, 0.0)
 """The torque on an arm without operators and environments."""
 
@@ -175,7 +180,7 @@ def torque_source_rows(
     """Converts operators and environments to two NumPy arrays, which compiled code can read.
 
     An operator is a model of a person who moves an arm, and an environment a wall or a damper.
-    Compiled code cannot read Python objects, and lists of different lengths, such as recorded
+    Compiled code cannot read Python objects. Lists of different lengths, such as recorded
     torques, are joined into one table.
 
     Args:
@@ -205,7 +210,7 @@ def torque_source_rows(
         row.coordinates = axes if actor.kind is TorqueKind.OWN_TIP else joints
         content = actor.table
         if actor.kind in OWN_KINDS:
-            # The numbers of the user's model are stored in rows of the table.
+            # The parameters of the user's model are stored in rows of the table.
             row.call = compile_to_address(actor.model, "act", rows.dtype)
             numbers = list_numbers(actor.model)
             row_count = math.ceil(len(numbers) / width)
@@ -308,8 +313,8 @@ def _target_progress(actor: Row, t_s: float) -> Pair:
 def _live_share(actor: Row, square: float) -> float:
     """Returns the factor that reduces the force of a person who moves the arm (live hand).
 
-    The norm of the force is first limited, as a human hand is. Then it is multiplied by the
-    grip: 1 for a firm grip, 0 after the hand has let go.
+    The norm of the force is first limited, because a human hand has limited strength. Then the
+    force is multiplied by the grip: 1 for a firm grip, 0 after the hand has let go.
 
     Args:
         actor: Data of the live hand, with `grip`, 0 to 1, and `limit`, N or N m.
@@ -360,13 +365,13 @@ def _find_table_rows(actor: Row, t_s: float, table: TorqueTable) -> tuple[int, i
     The recording is a table with a row per time, in which a bisection finds the neighbours.
 
     Args:
-        actor: Data of the operator, with the place of its rows in the common table.
+        actor: Data of the operator, with the position of its rows in the common table.
         t_s: Time since the start of the session, s.
         table: Tables of all operators and environments. Column 0 is the time of a row, s.
 
     Returns:
-        The indices of the rows before and after the time, and where the time lies between
-        them, from 0 to 1. The indices are -1 if the time is outside of the recording.
+        The indices of the rows before and after the time, and the position of the time between
+        these rows, from 0 to 1. The indices are -1 if the time is outside the recording.
     """
     first = actor.table_first
     count = actor.table_count
@@ -422,7 +427,7 @@ def _chirp_size(actor: Row, t_s: float) -> float:
 
     Such a torque excites the arm at all frequencies of a range, one after another, in repeated
     sweeps. With the frequencies f0 and f1 at the start and the end of a sweep, the duration
-    span of a sweep, and the time x since the present sweep began, the value is
+    `span` of a sweep, and the time x since the present sweep began, the value is
 
         sin(2 pi x (f0 + (f1 - f0) x / (2 span)))
 
@@ -472,8 +477,8 @@ def _scripted_size(actor: Row, t_s: float, table: TorqueTable) -> float:
 
         sin^2(pi (t - start) / (end - start))
 
-    which is smooth at both ends as in Fig. 3 of the paper. The paper does not print the numbers
-    of its pulses.
+    which is smooth at both ends as in Fig. 3 of the paper. The paper does not give the
+    parameters of its pulses.
 
     Args:
         actor: Data of the operator.
@@ -532,15 +537,15 @@ def _call_user_function(actor: Row, t_s: float, table: TorqueTable) -> None:
     """Calls the compiled function of an operator or environment that a user wrote.
 
     An operator is a model of a person who moves an arm, and an environment a wall or a damper.
-    Function and program exchange numbers through the fields of the row `actor`: before the call
-    the program has written position (`at`) and velocity (`speed`), and the function writes the
-    resulting torque or force into `effort`, which is zero before the call.
+    The program and the function exchange values through the fields of the row `actor`. The
+    program has written the position (`at`) and the velocity (`speed`) before the call, and has
+    set `effort` to zero. The function writes the resulting torque or force into `effort`.
 
     Args:
         actor: Data of the operator or environment. `call` is the address of the function.
         t_s: Time since the epoch (the common start of the session), s.
         table: Tables of all actors. The rows `table_first` to `table_first + table_count` hold
-            the numbers of the user's model.
+            the parameters of the user's model.
     """
     actor.t_s = t_s
     for i in range(actor.coordinates):
@@ -555,7 +560,7 @@ def _call_user_function(actor: Row, t_s: float, table: TorqueTable) -> None:
 def _user_effort(actor: Row, t_s: float, at: Vector, speed: Vector, table: TorqueTable) -> Pair:
     """Returns the torque or force of an operator or environment that a user programmed.
 
-    It acts along the two joints of the planar arm, N m, or along two axes, N.
+    The result acts on the two joints of the planar arm, N m, or along two axes, N.
 
     Args:
         actor: Data of the operator or environment.
@@ -679,7 +684,7 @@ def add_source_torque(
             to add it only if it acts continuously.
 
     Returns:
-        The new total. It is `total` if the actor is not of the requested sort.
+        The new total. It equals `total` if `sampled` excludes the actor.
     """
     if actor.sampled != sampled:
         return total
@@ -737,8 +742,8 @@ def _force_in_space(
 ) -> Three:
     """Returns the force of an operator or environment on the end effector of a chain, N.
 
-    The force is that of a user's function, of an operator, who pulls the end effector by a
-    spring, or of a wall, which pushes it.
+    The force comes from a user's function, from an operator who pulls the end effector by a
+    spring, or from a wall that pushes the end effector.
 
     Args:
         actor: Data of the operator or environment.

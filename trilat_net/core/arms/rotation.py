@@ -1,8 +1,8 @@
-"""Computes with rotation vectors (axis times angle, rad), with equal bits on any machine.
+"""Converts and combines rotation vectors (axis times angle, rad), bit for bit alike anywhere.
 
 The angular velocity of a changing rotation vector u is J(u) u', where J is the left Jacobian of
 the rotation group (J. Sola, J. Deray and D. Atchuthan, "A micro Lie theory for state estimation
-in robotics", arXiv 1812.01537, Eq. 145, 146). The arc tangent is that of S. Moshier's Cephes
+in robotics", arXiv 1812.01537, Eq. 145, 146). The arc tangent is from S. Moshier's Cephes
 library.
 
 Invariant:
@@ -31,8 +31,8 @@ def arctan(x: float) -> float:
     """Returns the arc tangent of a number from 0 to 1, rad, with equal bits on every machine.
 
     The standard library is not used, because its last bit differs between platforms. The method
-    is that of Cephes (`atan`): a rational function P / Q of x^2, after a transformation of
-    numbers above 0.66.
+    is from Cephes (`atan`): a rational function P / Q of x^2, after a transformation of numbers
+    above 0.66.
     """
     # arctan(x) = pi / 4 + arctan((x - 1) / (x + 1))
     is_large = x > 0.66
@@ -57,7 +57,7 @@ def rotation_matrix(vector: Three) -> Matrix:
     """Returns the rotation matrix of a rotation vector, three rows.
 
     A rotation vector has the direction of the axis, and its length is the angle in rad. The
-    formula is that of Rodrigues, with limits for small angles.
+    formula is due to Rodrigues, with limits for small angles.
     """
     x, y, z = vector
     angle = math.sqrt(x * x + y * y + z * z)

@@ -13,9 +13,9 @@ The control law needs a reference velocity v of the joints and its derivative a:
     a = dpsi/dt + d(J' y)/dt      J J' dy/dt = -Lambda de/dt - Jd psi - J dpsi/dt
                                                - (Jd J' + J Jd') y
 
-Here psi = -k (q - q_posture) pulls the joints to a preferred posture with the rate k, in 1/s,
-as far as this does not move the end effector. The second equation defines y. For the filtered
-error r = qd - v it follows that J r = dx/dt + Lambda e.
+Here psi = -k (q - q_posture) pulls the joints to a preferred posture with the rate k, in 1/s.
+Only its part that does not move the end effector has an effect. The second equation defines y.
+For the filtered error r = qd - v it follows that J r = dx/dt + Lambda e.
 
 Near singular poses, J J' is damped. The damping is zero while 1 / trace((J J')^-1) is above the
 square of `singular_value`. This number is a lower bound of the square of the least singular
@@ -42,7 +42,7 @@ POSITION = 3
 POSE = 6
 """Number of a task's coordinates with an orientation."""
 TINY = 1e-12
-"""Below this pivot of J J', the end effector cannot move along the axis at all."""
+"""For a pivot of J J' below this value, the end effector cannot move along the axis at all."""
 
 
 @leaf
@@ -171,7 +171,7 @@ def _update_jacobian_rate(s: Row, chain: RowArray, tip: Three) -> None:
 def update_orientation_reference(s: Row, links: RowArray) -> None:
     """Computes the orientation that the end effector should reach, and its angular velocity.
 
-    The reference results from the own orientation R_i by a rotation towards the other arms. The
+    The reference is the orientation R_i of this arm, rotated towards the other arms. The
     rotation vector is
 
         -sum_j alpha_ij Log(R_i R_j')
@@ -182,7 +182,7 @@ def update_orientation_reference(s: Row, links: RowArray) -> None:
 
         sum_j (alpha_ij w_j - alpha_ij' Log(R_i R_j'))
 
-    It is exact only if the orientations agree.
+    This velocity is exact only if the orientations agree.
 
     Args:
         s: State of the site (the process that runs this arm); the reference is written into it.
@@ -231,9 +231,9 @@ def _factor(s: Row, damping: float) -> None:
         L_jk D_k = B_jk - sum_{p < k} L_jp L_kp D_p    for k < j
         D_j      = B_jj - sum_{p < j} L_jp^2 D_p
 
-    J has a row of zeros for each axis that is not followed. There 1 is added to the diagonal of
-    B, so that its pivot D_j is not zero. If another pivot vanishes, the arm cannot move along
-    the axis, and L is zero in its column.
+    J has a row of zeros for each axis that is not followed. For such an axis, 1 is added to the
+    diagonal of B, so that its pivot D_j is not zero. If another pivot vanishes, the arm cannot
+    move along the axis, and L is zero in its column.
 
     Args:
         s: State of the site (the process that runs the arm). `axes` is 1 for each axis that is
@@ -244,7 +244,7 @@ def _factor(s: Row, damping: float) -> None:
     A = s.A
     for j in range(s.shared):
         for k in range(j + 1):
-            entry = 0.0  # of B, then of L or D
+            entry = 0.0  # an entry of B, then of L or D
             if k == j:
                 entry = damping + 1.0 - s.axes[j]
             for i in range(s.joints):
@@ -289,10 +289,10 @@ def _factor_damped(s: Row) -> None:
     """Factors J J', with a damping near singular poses, where the arm can hardly move.
 
     J is the Jacobian of the end effector. The number 1 / trace((J J')^-1) is a lower bound of
-    the square of the least singular value of J. The damping is the amount by which it is below
-    the square of `s.singular_value`, and zero otherwise. The trace is that of the axes that are
-    followed. It is computed from the factors without damping, by solving for each column of the
-    inverse.
+    the square of the least singular value of J. If this number is below the square of
+    `s.singular_value`, the damping is the difference, otherwise zero. The trace covers the axes
+    that are followed. It is computed from the factors without damping, by solving for each
+    column of the inverse.
 
     Args:
         s: State of the site (the process that runs the arm). J and its derivative Jd get rows
@@ -307,7 +307,7 @@ def _factor_damped(s: Row) -> None:
 
     _factor(s, 0.0)
     limit = s.singular_value * s.singular_value
-    trace = 0.0 * limit  # zero, also as one number for each of several runs
+    trace = 0.0 * limit  # zero, or one zero for each of several runs side by side
     for j in range(s.shared):
         # With a pivot that vanishes or is NaN, the true trace is infinite. This value makes the
         # lower bound practically zero.

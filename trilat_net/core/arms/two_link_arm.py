@@ -99,7 +99,7 @@ def inertia(theta: Vector, q: Vector) -> tuple[Pair, Pair]:
 
 @leaf
 def gravity(theta: Vector, g: float, q: Vector) -> Pair:
-    """Returns the gravity torque G(q) of the planar arm, which holds the arm, N m per joint.
+    """Returns the torque G(q) that holds the planar arm against gravity, N m per joint.
 
         G = g | theta_4 cos(q1) + theta_5 cos(q1 + q2) |
               | theta_5 cos(q1 + q2)                   |

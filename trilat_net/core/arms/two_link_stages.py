@@ -181,17 +181,17 @@ def put_source_torque(
     sampled: int,
     torque: Array,
 ) -> None:
-    """Computes the torque with which some operators and environments act on the planar arm.
+    """Computes the torque that the sampled or the other operators and environments exert.
 
-    A sampled operator or environment is evaluated once per period of the control loop, and its
-    torque is constant until the next period. All others act continuously.
+    A sampled operator or environment of the planar arm is evaluated once per period of the
+    control loop, and its torque is constant until the next period. All others act continuously.
 
     Args:
         t_s: Time since the start of the session, s.
         s: Settings of the site (the process that runs the arm).
         state: Two joint angles in rad, followed by two joint velocities in rad/s.
         actors: Operators and environments, one row for each.
-        table: Numeric data of all operators and environments, for example recorded torques.
+        table: Numerical data of all operators and environments, for example recorded torques.
         sampled: 1 for the torque of the sampled operators and environments, 0 for all others.
         torque: Receives the torque on the arm, shape (2,), N m.
     """
@@ -229,7 +229,7 @@ def update_external_torque(
             whole torque and `held` the first part, N m. `wall_n` receives the largest force of
             a wall, N. `sensed` is the measured torque, N m.
         actors: Operators and environments, one row for each.
-        table: Numeric data of all operators and environments, for example recorded torques.
+        table: Numerical data of all operators and environments, for example recorded torques.
     """
     q = pair(s.q)
     qd = pair(s.qd)
@@ -253,7 +253,7 @@ def update_external_torque(
 
 @leaf
 def _add_scaled(x: Vector, step_s: float, rate: Vector) -> Pair:
-    """Returns x + step_s * rate: two joint values after a time at constant rates."""
+    """Returns x + step_s * rate: two joint values after the time `step_s` at constant rates."""
     first = x[0] + step_s * rate[0]
     second = x[1] + step_s * rate[1]
     return first, second
@@ -285,7 +285,7 @@ def find_stage_acceleration(
         g: Gravitational acceleration, m/s^2.
         lengths: Lengths of the two links, m.
         actors: Operators and environments, one row for each.
-        table: Their numbers, for example recorded torques.
+        table: Numerical data of all operators and environments, for example recorded torques.
     """
     on_arm = torque_on_arm(
         t_s=t_s, q=q, qd=qd, lengths=lengths, actors=actors, table=table, sampled=0
@@ -320,14 +320,14 @@ def advance_stage(
         ahead_s: Time of the stage after the beginning of the period, s.
         q: Joint angles at the beginning of the period, rad.
         qd: Joint velocities at the beginning of the period, rad/s.
-        qd_before: Joint velocities at the stage before, rad/s.
-        qdd_before: Joint accelerations at the stage before, rad/s^2.
+        qd_before: Joint velocities at the previous stage, rad/s.
+        qdd_before: Joint accelerations at the previous stage, rad/s^2.
         u: Held torque, shape (2,), N m.
         theta: Parameters of the arm, shape (5,).
         g: Gravitational acceleration, m/s^2.
         lengths: Lengths of the two links, m.
         actors: Operators and environments, one row for each.
-        table: Their numbers, for example recorded torques.
+        table: Numerical data of all operators and environments, for example recorded torques.
 
     Returns:
         Joint velocities and joint accelerations at the stage.
@@ -416,7 +416,7 @@ def rk4_step(
         g: Gravitational acceleration, m/s^2.
         lengths: Lengths of the two links, m.
         actors: Operators and environments, one row for each.
-        table: Numeric data of all operators and environments, for example recorded torques.
+        table: Numerical data of all operators and environments, for example recorded torques.
 
     Returns:
         Joint angles and joint velocities at the end of the period.
@@ -491,7 +491,7 @@ def move_arm(s: Row, q: Pair, qd: Pair) -> bool:
     filling the log with NaN.
 
     Returns:
-        False if a number is not finite. Then the state is unchanged.
+        True if all numbers are finite. Otherwise False, and the state is unchanged.
     """
     is_finite = isfinite(q[0]) and isfinite(q[1]) and isfinite(qd[0]) and isfinite(qd[1])
     if not is_finite:
@@ -515,10 +515,10 @@ def advance_arm(
         h_s: The period, s.
         s: State of the site (the process that runs the arm); written.
         actors: Operators and environments, one row for each.
-        table: Their numbers, for example recorded torques.
+        table: Numerical data of all operators and environments, for example recorded torques.
 
     Returns:
-        False if the result is not finite. Then q and qd are unchanged.
+        True if the result is finite. Otherwise False, and q and qd are unchanged.
     """
     q, qd = rk4_step(
         t_s=t_s,

@@ -45,14 +45,14 @@ _GLIDE = int(StaleAction.GLIDE)
 
 
 def _place_nothing(_chain: Any, _q: Any) -> None:
-    """Does nothing: the version of `place_joints` for a single run of several.
+    """Does nothing. This is the version of `place_joints` for one lane.
 
     The frames of the joints of all runs have been computed before, eight runs at a time.
     """
 
 
 def _put_no_gravity(_s: Any, _chain: Any, _q: Any, _torque: Any) -> None:
-    """Does nothing: the version of `put_gravity_torque` for a single run of several.
+    """Does nothing. This is the version of `put_gravity_torque` for one lane.
 
     The torques of all runs have been computed before, eight runs at a time.
     """
@@ -61,8 +61,8 @@ def _put_no_gravity(_s: Any, _chain: Any, _q: Any, _torque: Any) -> None:
 def _choose_place(argument_types: tuple[Any, ...]) -> Callable[..., None]:
     """Returns the version of `place_joints` for a single simulation or for eight at once.
 
-    The function computes where the joints of an arm are. Numba calls this choice with the types
-    of the arguments, from which the number of simulations is known.
+    `place_joints` computes the positions of the joints of an arm. Numba calls this function
+    with the types of the arguments, which tell the number of simulations.
     """
     dispatcher: Any = place_joints
     is_one_lane = isinstance(argument_types[0], RowsInLane)
@@ -72,8 +72,8 @@ def _choose_place(argument_types: tuple[Any, ...]) -> Callable[..., None]:
 def _choose_gravity(argument_types: tuple[Any, ...]) -> Callable[..., None]:
     """Returns the version of `put_gravity_torque` for a single simulation or for eight at once.
 
-    Numba calls this choice with the types of the arguments, from which the number of
-    simulations is known.
+    Numba calls this function with the types of the arguments, which tell the number of
+    simulations.
     """
     dispatcher: Any = chain_stages.put_gravity_torque
     is_one_lane = isinstance(argument_types[0], LaneRow)
@@ -93,9 +93,10 @@ def _skip_task_torque(_s: Any, _gains: Any, _values: Any, _factor: float, _torqu
 
 
 def _skip_without_task(function: Any, skipped: Callable[..., None]) -> None:
-    """Leaves out a function of task space if runs have none, as Numba types all branches.
+    """Lets Numba leave out a function of task space if the runs have no task space.
 
-    Functions of task space are called for eight runs only.
+    Without this, Numba would compile the function, because it compiles all branches. Functions
+    of task space are called for eight runs only.
 
     Args:
         function: The function, whose first argument is the state of a site (arm controller).
@@ -166,11 +167,11 @@ def advance_chain_site(
     """Computes one control period of an arm for several simulations that run side by side.
 
     The arm is a chain of joints, see `advance_site`. All arrays have a place (lane) for each
-    simulation. No two of them overlap in memory.
+    simulation. No two arrays overlap in memory.
 
     Args:
         k: The tick.
-        t_ns: Its nominal time, ns since the epoch.
+        t_ns: Nominal time of the tick, ns since the epoch.
         lanes: Number of lanes to compute, at most `LANES`.
         settled_rad: Position error below which an arm counts as settled, rad.
         i: Index of the site.
@@ -181,20 +182,20 @@ def advance_chain_site(
         site: Row of the site.
         links: Rows of its links.
         actors: Rows of its operators and environments.
-        environments: The rows of its environments among them.
+        environments: Rows of the environments alone.
         ramps: Row with the changes of its dominance factors.
         record: Rows with the floats of its latest records; one is written.
         peaks: Peaks of the site, one row per bucket, see `update_peaks`.
         sums: Sums of the site.
         progress: Progress of the site.
-        law: Row with the numbers of the site's compiled law.
-        received: Rows with the numbers that the peers' laws sent.
-        sent: Row with the numbers that the law sends.
-        code: Stands for the code of the law, see `LawCode`.
+        law: Row with the gains and memory of the site's compiled law.
+        received: Rows with the values that the peers' laws sent.
+        sent: Row with the values that the law sends.
+        code: Selects the code of the law, see `LawCode`.
         chain: Rows of the joints.
         states: The latest states of all sites, see `advance_site`.
-        used: Sample in use by peer, lane and tick of a block; -1: none yet.
-        columns: Indices of the received numbers, see `LaneLaw`, shape (P, C).
+        used: Sample in use by peer, lane and tick of a block; -1 before the first.
+        columns: Indices of the received values, see `LaneLaw`, shape (P, C).
         table: Tables of the operators and environments of all sites, equal in all runs.
     """
     groups = (lanes + GROUP - 1) // GROUP
@@ -230,7 +231,7 @@ def advance_chain_site(
     for lane in range(lanes):
         guard_reference(k, t_ns, in_lane(site, lane)[0], in_lane(links, lane))
 
-    # 4 errors, 5 estimate. A run of which an arm has left its limits has ended.
+    # 4 errors, 5 estimate. A run has ended if one of its arms has left its limits.
     for group in range(groups):
         group_site = in_group(site, group)[0]
         chain_stages.update_errors(group_site, in_group(chain, group))

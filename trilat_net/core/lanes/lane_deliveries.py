@@ -83,11 +83,11 @@ class LinkStates(NamedTuple):
         releases: For each tick the newest sample that is released then, or -1, shape (L, N, P,
             R), a ring buffer. R is a power of two.
         newest: Sample in use at the last tick, or -1, shape (L, N, P).
-        uniforms: Room for two random numbers of each sample of a block.
-        delays_us: Room for the delay of each sample of a block, us.
-        stamps_ns: Room for the stamp of each sample of a block, ns.
-        times_ns: Room for the nominal time of each tick of a block, ns.
-        sample_counts: Room for the number of samples that a peer has sent before the end of
+        uniforms: Buffer for two random numbers of each sample of a block.
+        delays_us: Buffer for the delay of each sample of a block, us.
+        stamps_ns: Buffer for the stamp of each sample of a block, ns.
+        times_ns: Buffer for the nominal time of each tick of a block, ns.
+        sample_counts: Buffer for the number of samples that a peer has sent before the end of
             each tick of a block.
     """
 
@@ -141,7 +141,7 @@ def keep_link_states(states: LinkStates, lanes: Sequence[int]) -> LinkStates:
     """Returns the states of the simulated network links of those runs that continue.
 
     Several runs are simulated side by side, each at one index (lane). A search drops runs that
-    it needs no longer, so that no time is spent on them.
+    it no longer needs, so that no time is spent on these runs.
 
     Args:
         states: State of all runs that have been simulated together.
@@ -159,7 +159,7 @@ def keep_link_states(states: LinkStates, lanes: Sequence[int]) -> LinkStates:
 
 @leaf
 def _constant_delay_ns(model: Row) -> int:
-    """Returns the delay of a simulated link on which all messages take equally long, in ns.
+    """Returns the delay of a simulated link with a constant delay, in ns.
 
     The delay is the time from the stamp of a sample (sent state) to its use. It is at least 1
     ns, because a sample is never used at the time at which it was sent.
@@ -182,11 +182,12 @@ def _is_constant(link: LinkRow, model: Row) -> bool:
 def _use_after_constant_delay(
     first: int, count: int, rate_hz: int, model: Row, used: IntArray
 ) -> int:
-    """Finds which received state an arm uses in each tick, if the delay is constant.
+    """Finds the received state that an arm uses in each tick, if the delay is constant.
 
     Sample m is the state that the sender computed in tick (control period) m. It is used from
     tick m + w on. The number w of ticks is the same for all samples if the period of the
-    control loop is a whole number of nanoseconds. Otherwise this function must not be called.
+    control loop is a whole number of nanoseconds. This function must only be called in this
+    case.
 
     Args:
         first: First tick of a block of ticks.
@@ -256,7 +257,7 @@ def find_draw_addresses() -> DrawAddresses:
     """Returns the addresses of compiled functions that draw random network delays and losses.
 
     Each call draws the numbers of many messages, which is faster than one call per message. The
-    functions are compiled if their machine code is not stored on the disk.
+    functions are compiled if their machine code is not stored on disk.
     """
     integer = types.int64
     number = types.float64
@@ -286,7 +287,7 @@ def _release_samples(
     states: LinkStates,
     draws: DrawAddresses,
 ) -> None:
-    """Computes at which ticks messages of a simulated link may be used, for one delay model.
+    """Computes the ticks at which messages may be used, for one delay model of a link.
 
     The random numbers of all messages (samples) are drawn first, in loops that use vector
     instructions. A tick is a control period of the receiver.
@@ -296,13 +297,13 @@ def _release_samples(
         count: Number of samples.
         rate_hz: Tick rate of the receiver, Hz.
         least_release: First tick that can still use a sample.
-        fresh: True if the first sample is the first one of the model.
+        fresh: True if the first sample is also the first sample of the model.
         stamps_ns: Stamps of the samples, ns since the epoch.
         link: Row of the link; changed.
         model: Model of the link.
         points: Traces and outages.
         releases: Newest sample that each tick releases, a ring buffer; changed.
-        states: Provides room for the random numbers.
+        states: Provides buffers for the random numbers.
         draws: Functions that draw them.
     """
     mask = releases.shape[0] - 1
@@ -325,7 +326,7 @@ def _release_samples(
     loses = loses_samples(model)
     if loses:
         call_address(draws.losses, (first, count, link.key, uniform_numbers))
-    # Neither a copy of a sample nor an outage: the general function is slower.
+    # Without copies of samples and outages, the slower general function is not needed.
     is_plain = model.duplicate == 0.0 and link.outage_count == 0
     for index in range(count):
         sample = first + index
@@ -375,10 +376,10 @@ def _release_all_samples(
     states: LinkStates,
     draws: DrawAddresses,
 ) -> None:
-    """Computes at which ticks the messages of a simulated network link may be used.
+    """Computes the ticks at which the messages of a simulated network link may be used.
 
-    Each message (sample) is delayed by the delay model that holds at its time. A tick is a
-    control period of the receiver.
+    Each message (sample) is delayed by the delay model in force at the time of sending. A tick
+    is a control period of the receiver.
 
     Args:
         first_sample: Index of the first sample, whose stamp is `states.stamps_ns[0]`.
@@ -389,7 +390,7 @@ def _release_all_samples(
         models: Models of the link.
         points: Traces and outages.
         releases: Newest sample that each tick releases, a ring buffer; changed.
-        states: Contains the stamps, and provides room for random numbers.
+        states: Contains the stamps, and provides buffers for random numbers.
         draws: Functions that draw random numbers.
     """
     sample = first_sample
@@ -424,7 +425,7 @@ def _release_all_samples(
 def _use_released_samples(
     first: int, count: int, newest: int, releases: IntArray, used: IntArray
 ) -> int:
-    """Finds the newest received state that may be used, for each of some control periods.
+    """Finds the newest received state that may be used in each control period of a block.
 
     The states (samples) have been released before, each for a control period (tick).
 
@@ -433,7 +434,7 @@ def _use_released_samples(
         count: Number of ticks.
         newest: Sample in use before the block, or -1.
         releases: Newest sample that each tick releases, a ring buffer; the ticks are emptied.
-        used: Written, one entry per tick.
+        used: Receives the sample in use, one entry per tick.
 
     Returns:
         The sample in use at the end of the block.
@@ -461,7 +462,7 @@ def _use_samples_of_link(
     draws: DrawAddresses,
     used: IntArray,
 ) -> int:
-    """Finds which received state (sample) an arm uses in each tick, on a link of any kind.
+    """Finds the received state (sample) that an arm uses in each tick, on a link of any kind.
 
     The link is a simulated network connection with delays and losses. A tick is a control
     period.
@@ -475,9 +476,9 @@ def _use_samples_of_link(
         points: Traces and outages.
         releases: Newest sample that each tick releases, a ring buffer; changed.
         newest: Sample in use before the block, or -1.
-        states: Provides room for random numbers.
+        states: Provides buffers for random numbers.
         draws: Functions that draw random numbers.
-        used: Written, one entry per tick.
+        used: Receives the sample in use, one entry per tick.
 
     Returns:
         The sample in use at the end of the block.
@@ -508,7 +509,7 @@ def use_samples(
     draws: DrawAddresses,
     used: IntArray,
 ) -> int:
-    """Finds which received state each arm uses in a block of control periods.
+    """Finds the received state that each arm uses in each tick of a block of control periods.
 
     This is done for several simulations at once. A received state (sample) comes from a peer,
     another arm, and is delayed by the simulated network.
@@ -520,8 +521,8 @@ def use_samples(
         ended: For each lane the number of ticks of a run that has ended, else -1.
         states: State of the links of the runs; changed.
         draws: Functions that draw random numbers.
-        used: Receives the index of the sample, or -1 before the first one, shape (N, P, LANES,
-            ticks).
+        used: Receives the index of the sample in use, or -1 before the first sample, shape (N,
+            P, LANES, ticks).
 
     Returns:
         The largest age of a sample in use, ticks. Before the first sample, it is the age that
@@ -568,7 +569,7 @@ def use_samples(
 def _use_after_delay(
     count: int, delay_ns: int, rate_hz: int, newest: int, states: LinkStates, used: IntArray
 ) -> int:
-    """Finds which received state an arm uses if its peer has another control rate.
+    """Finds the received state that an arm uses if its peer has another control rate.
 
     The delay of the network link is constant.
 
@@ -579,7 +580,7 @@ def _use_after_delay(
         newest: Sample in use before the block, or -1.
         states: Contains for each tick its time and the number of samples that the peer has
             sent.
-        used: Written, one entry per tick.
+        used: Receives the sample in use, one entry per tick.
 
     Returns:
         The sample in use at the end of the block.
@@ -604,10 +605,10 @@ def use_samples_of_rates(
     draws: DrawAddresses,
     used: IntArray,
 ) -> int:
-    """Computes the same as `use_samples` for arms whose control loops have different rates.
+    """Does the work of `use_samples` for arms whose control loops have different rates.
 
     The block contains the control periods (ticks) of all arms in an interval of time. An arm
-    makes its tick before a later tick of another arm.
+    executes its tick before a later tick of another arm.
 
     Args:
         first: First tick of each site in the block, shape (N,).
@@ -626,7 +627,7 @@ def use_samples_of_rates(
     for i in range(states.links.shape[1]):
         count = end[i] - first[i]
         if count == 0:
-            # The peers go on, and all samples since the one in use are kept.
+            # The peers continue, and all samples since the sample in use are kept.
             for p in range(states.links.shape[2]):
                 j = p if p < i else p + 1
                 for lane in range(states.links.shape[0]):
@@ -687,7 +688,7 @@ def use_samples_of_rates(
                         first[i], count, newest, releases, used[i, p, lane]
                     )
                 states.newest[lane, i, p] = newest
-                # Before the next tick of the site, the peer goes on to the end of the block.
+                # Before the next tick of the site, the peer continues to the end of the block.
                 largest_age = max(largest_age, end[j] - 1 - newest)
                 for index in range(count):
                     age = states.sample_counts[index] - 1 - used[i, p, lane, index]
@@ -706,7 +707,7 @@ def _select_link(
     points: Points,
     channel: ChannelArrays | None,
 ) -> LinkArrays:
-    """Returns the arrays of one link out of those of all links of a run.
+    """Selects the arrays of one link from the arrays of all links of a run.
 
     Args:
         i: Index of the receiving site.
@@ -716,7 +717,7 @@ def _select_link(
         dues: Due times, shape (N, P, D).
         calendars: Calendars of the links, shape (N, P, pages).
         points: Traces and outages.
-        channel: Numbers that laws receive, or None.
+        channel: Values that laws receive, or None.
     """
     return LinkArrays(
         state=links[i, p : p + 1],
@@ -743,7 +744,7 @@ def use_recorded_samples(
     state: Array,
     used: IntArray,
 ) -> int:
-    """Finds which received state each arm uses, when a run from a log is repeated.
+    """Finds the received state that each arm uses when a run from a log is repeated.
 
     All arrivals are known from the log. The results have the form of `use_samples`.
 
@@ -758,7 +759,7 @@ def use_recorded_samples(
         calendars: Calendars of the links, shape (N, P, pages); changed. Their samples have the
             right index, but no content.
         points: Traces and outages.
-        channel: Numbers that laws receive, or None; changed.
+        channel: Values that laws receive, or None; changed.
         state: Any numbers, at least as many as a site sends.
         used: Receives the samples in use in lane 0, shape (N, P, LANES, ticks). The ticks are
             counted from `first`.
@@ -790,7 +791,7 @@ def use_recorded_samples(
                 sample_count = first_tick_at(tick_ns(k, rate_hz) + 1, rates_hz[peer])
                 sample_count = max(min(sample_count, end[peer]), first[peer])
                 largest_age = max(largest_age, sample_count - 1 - sample)
-            # Before the next tick of the site, the peer goes on to the end of the block.
+            # Before the next tick of the site, the peer continues to the end of the block.
             largest_age = max(largest_age, end[peer] - 1 - links[i, p].used)
     return largest_age
 
@@ -810,7 +811,7 @@ def repeat_deliveries(
     joints: int,
     states: Array,
 ) -> None:
-    """Brings the simulated network links of one run up to date, so that it can continue alone.
+    """Updates the simulated network links of one run, so that the run can continue alone.
 
     Runs that are simulated side by side (in lanes) compute the deliveries without the state of
     the links (`use_samples`). The links are therefore executed again for the past ticks
@@ -827,9 +828,9 @@ def repeat_deliveries(
         dues: Due times, shape (N, P, D); changed.
         calendars: Calendars of the links, shape (N, P, pages); changed.
         points: Traces and outages.
-        channel: Numbers that laws receive, or None.
+        channel: Values that laws receive, or None.
         joints: Number of joints.
-        states: The latest states of the sites, q, qd, tau_x and the numbers that the law sent,
+        states: The latest states of the sites (q, qd, tau_x and the values that the law sent),
             shape (N, R + 1, width). The state of tick k is at k modulo R. R is a power of two.
     """
     mask = states.shape[1] - 2

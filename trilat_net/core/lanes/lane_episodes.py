@@ -1,9 +1,9 @@
 """Simulates several episodes at once that begin and end at different times.
 
 A training environment with many copies uses this module: when the episode of one copy has
-ended, a new one takes its lane (position in the vector registers), while the others continue.
-Therefore each lane has a clock of its own. In each run, a program may move one arm. The caller
-provides the actions of all programs as an array.
+ended, a new episode takes its lane (position in the vector registers), while the others
+continue. Therefore each lane has a clock of its own. In each run, a program may move one arm.
+The caller provides the actions of all programs as an array.
 
 Invariant:
     - After each call of `advance`, a run has the state that `CompiledRun.step_to` gives it with
@@ -45,9 +45,9 @@ def _use_samples_of_lanes(
     draws: DrawAddresses,
     used: IntArray,
 ) -> int:
-    """Finds which received states the arms of all runs use in their next control periods.
+    """Finds the received states that the arms of all runs use in their next control periods.
 
-    The runs are simulated side by side (in lanes), and each is at a control period of its own.
+    The runs are simulated side by side (in lanes), and each run is at its own control period.
 
     Args:
         runs: Number of runs.
@@ -138,9 +138,9 @@ def _run_span(
     present: EndedRuns,
     ended: EndedRuns,
 ) -> int:
-    """Simulates several runs side by side for some control periods, each at its own time.
+    """Simulates several runs side by side for several ticks, each run at its own time.
 
-    `run_block` does the same for runs that all are at the same time.
+    `run_block` does the same for runs that are all at the same time.
 
     Args:
         first: First tick of each run, shape (LANES,).
@@ -152,23 +152,23 @@ def _run_span(
         mode_word: Index of the mode among the words of a site's row.
         addresses: Addresses of the code, see `run_block`.
         tables: Addresses of the tables, see `run_block`.
-        clock: Room for the tick of each lane and its nominal time, shape (2, 1, LANES).
+        clock: Buffer for the tick of each lane and its nominal time, shape (2, 1, LANES).
         clock_addresses: Addresses of both rows of `clock`.
         actions: Actions of the programs, shape (ticks, 5, LANES).
-        hand_row: Row of the operator whose place the programs take.
+        hand_row: Row of the operator that the programs replace.
         columns: Words of an action in this row.
         actors: Rows of operators and environments; changed.
         states: The latest states of all sites, see `advance_site`.
         used: Samples in use, see `use_samples`.
-        received_columns: Indices of the numbers that laws receive, shape (N, P, C).
+        received_columns: Indices of the values that laws receive, shape (N, P, C).
         table: Tables of the operators and environments.
         latest: Zeros, shape (3, N), see `keep_ended_runs`: there is one bucket and one record.
-        peaks: Room for the peaks of all sites in one bucket, which are not used.
+        peaks: Buffer for the peaks of all sites in one bucket, which are not used.
         present: The numbers of all runs.
-        ended: Numbers of the runs of which an arm left its limits; changed.
+        ended: Numbers of the runs in which an arm left its limits; changed.
 
     Returns:
-        The number of runs that have not ended in this way.
+        The number of runs in which no arm has left its limits.
     """
     running = runs
     lanes = (runs + 7) // 8 * 8
@@ -229,7 +229,7 @@ class LaneEpisodes(LaneRun):
         period_ticks: Time from one decision of the program to the next, ticks.
 
     Attributes:
-        ticks: Number of ticks that each run has made, shape (LANES,).
+        ticks: Number of ticks that each run has executed, shape (LANES,).
         hands: The program's hand in each lane.
         structure: The structure, see `find_structure`.
         most_runs: Largest number of lanes with a run.
@@ -246,7 +246,7 @@ class LaneEpisodes(LaneRun):
         """Allocates the arrays for several episodes that are simulated side by side.
 
         An episode is one simulated run in which a program, for example a learning policy, moves
-        an arm. All places (lanes) first hold copies of the same run, until `load` replaces
+        an arm. All places (lanes) initially hold copies of the same run, until `load` replaces
         them.
         """
         super().__init__([run] * count)
@@ -273,7 +273,7 @@ class LaneEpisodes(LaneRun):
         """Returns the properties in which runs must agree to be simulated side by side.
 
         Examples are the number of joints and the control laws. Durations may differ, because an
-        episode (simulated run) that ends is replaced by a new one.
+        episode (simulated run) that ends is replaced by a new episode.
         """
         return find_structure(run)._replace(duration_s=0.0)
 
@@ -287,7 +287,7 @@ class LaneEpisodes(LaneRun):
         Args:
             rules: Limits of the program's hand.
             period_ticks: Number of ticks of a step.
-            largest_action: Largest absolute value of a number of an action.
+            largest_action: Largest absolute value of any component of an action.
         """
         if period_ticks > BLOCK_TICKS:
             return f"steps of more than {BLOCK_TICKS} ticks"
@@ -295,7 +295,7 @@ class LaneEpisodes(LaneRun):
 
     @staticmethod
     def explain_run(run: CompiledRun, hand_site: int) -> str:
-        """Explains why a run cannot be simulated side by side with others; "" if it can.
+        """Explains why a run cannot be simulated side by side with others. "" if it can.
 
         The function finds the answer by compiling the code of the simulation, which can take
         seconds.
@@ -310,7 +310,7 @@ class LaneEpisodes(LaneRun):
         return obstacle or explain_uncompilable(run, _CLOCK)
 
     def load(self, lane: int, run: CompiledRun, rules: HandRules) -> None:
-        """Starts a new episode of reinforcement learning in place of one that has ended.
+        """Starts a new episode of reinforcement learning in place of an ended episode.
 
         Several episodes (simulated runs) advance side by side, and each has a place in common
         arrays (its lane). The function copies the initial state of the new run into the place.
@@ -399,17 +399,17 @@ class LaneEpisodes(LaneRun):
         goals: Array,
         locate: Callable[[Array], Array],
     ) -> None:
-        """Simulates all episodes for some ticks, with the decisions of their programs.
+        """Simulates all episodes for a number of ticks, with the decisions of their programs.
 
         A run ends if one of its arms leaves its limits.
 
         Args:
             count: Number of ticks, at most `BLOCK_TICKS`.
-            is_idle: True for runs that are not advanced, shape (runs,). Their numbers have no
-                meaning afterwards, unless they have ended.
+            is_idle: True for runs that are not advanced, shape (runs,). Unless these runs have
+                ended, their numbers have no meaning afterwards.
             acts: True for runs in which a decision of the program begins to act at the first
                 tick, shape (runs,).
-            goals: These decisions, shape (runs, 2).
+            goals: The decisions that begin to act, shape (runs, 2).
             locate: Function that returns the poses of the arm, shape (runs, 2), from its joint
                 angles, shape (runs, 2), in the coordinates of the program.
         """
@@ -436,7 +436,7 @@ class LaneEpisodes(LaneRun):
         self._step_span(count, idle)
 
     def _step_span(self, count: int, idle: IntArray) -> None:
-        """Simulates all runs for some control periods, with the actions of their programs.
+        """Simulates all runs for several control periods, with the actions of their programs.
 
         Args:
             count: Number of ticks.
@@ -505,7 +505,7 @@ class LaneEpisodes(LaneRun):
 
     @property
     def has_ended(self) -> NDArray[np.bool_]:
-        """Tells which of the simulated runs ended early because an arm left its safety limits.
+        """States which of the simulated runs ended early because an arm left its safety limits.
 
         The array has the shape (runs,), with True for a run that ended.
         """
@@ -546,10 +546,10 @@ class LaneEpisodes(LaneRun):
         """Returns one field of the state of all sites (arm controllers) or links, for each run.
 
         Several runs are stored side by side, each in a lane. The state of a run that has ended
-        is read from `ended`, because its lane contains no valid numbers any more.
+        is read from `ended`, because its lane no longer contains valid numbers.
 
         Args:
-            present: Present rows of all lanes, shape (rows, numbers of a row, LANES).
+            present: Present rows of all lanes, shape (rows, values per row, LANES).
             ended: The same rows at the end of each run that has ended.
             layout: Data type of a row.
             name: Name of the field.
@@ -566,10 +566,10 @@ class LaneEpisodes(LaneRun):
         return in_order.view(dtype.base)
 
     def read_new(self, i: int) -> NDArray[np.bool_]:
-        """Returns from which sites site `i` has used a new sample in its latest tick.
+        """Returns True for each peer whose new sample site `i` used in its latest tick.
 
-        A sample is the state that one of P other sites (arm controllers) sent. The shape is (P,
-        runs).
+        A sample is the state that a peer, one of P other sites (arm controllers), sent. The
+        shape is (P, runs).
         """
         runs = len(self.runs)
         lanes = np.arange(runs)
@@ -584,8 +584,8 @@ class LaneEpisodes(LaneRun):
     def write_back(self, lane: int) -> None:
         """Copies the present state of a run into its `CompiledRun`, where callers read it.
 
-        The run cannot continue alone from there, because its simulated network links still have
-        their initial state.
+        The run cannot continue alone from this state, because its simulated network links still
+        have their initial state.
 
         Args:
             lane: Index of the run among the runs that are simulated together.

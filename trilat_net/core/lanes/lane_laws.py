@@ -5,11 +5,11 @@
 Laws such as `tdpa`, and those that users write, are classes with a method `torque`. In a single
 run, the simulation calls the compiled method by its address. For several runs, each in one lane
 of the vector registers, the method is compiled as a part of the control period instead. This
-saves the call, and the checks of the lengths of all vectors, which are constants here.
+saves the call and the checks of the vector lengths, which are constants in this case.
 
 Invariant:
     - The method is not changed. It raises the same errors, and reads and writes the same
-      numbers, as in a run of its own.
+      numbers, as in a run that is computed alone.
     - A user's law is compiled in each process, because the other files that it uses are
       unknown. The code of a built-in law is stored under a hash of its sources.
 """
@@ -47,11 +47,11 @@ class LaneLaw(NamedTuple):
     Attributes:
         name: Name that identifies the code of the law. `NO_LAW` for laws of the kernel.
         is_stored: True if the compiled code may be stored on disk.
-        size: Count of numbers (gains and memory) of the law.
+        size: Number of gains and memory values of the law.
         constants: Names and values of flags among these numbers: integers that are 0 or 1 and
             do not change. They are equal in all runs.
-        columns: For each other site (peer), the indices of the numbers that the law receives
-            among the numbers that the peer sends. -1 for a number that the peer does not send.
+        columns: For each other site (peer), the indices of the values that the law receives
+            among the values that the peer sends. -1 for a value that the peer does not send.
     """
 
     name: str
@@ -78,7 +78,7 @@ def _name_law(torque: Callable[..., Any], form: LawForm) -> tuple[str, bool]:
     """Returns a name that identifies the code of a law, and whether it may be stored on disk.
 
     Compiled code is stored under the name. Code of users is not stored, because it may use
-    other files, of which a change would remain unnoticed.
+    other files, whose changes would not be noticed.
     """
     sources = digest_sibling_sources(torque)
     text = f"{sources} {torque.__module__} {torque.__qualname__} {form}"
@@ -97,7 +97,7 @@ def describe_lane_law(law: CompiledLaw | None, columns: Any) -> LaneLaw:
 
     Args:
         law: The law. None if the law of the site (arm controller) is a part of the kernel.
-        columns: Indices of the C numbers that the law receives from each of P peers (other
+        columns: Indices of the C values that the law receives from each of P peers (other
             sites), shape (P, C).
     """
     if law is None:
@@ -108,7 +108,7 @@ def describe_lane_law(law: CompiledLaw | None, columns: Any) -> LaneLaw:
     row = law.row[:size].view(form.law)[0]
     constants = []
     for field, (dtype, *_) in (form.law.fields or {}).items():
-        # Other integers may be an axis of a study, whose runs then still have one structure.
+        # Other integers are not constants, because a study may vary them within one structure.
         if dtype.kind == "i" and not dtype.shape and row[field] in (0, 1):
             constants.append((field, int(row[field])))
     return LaneLaw(
@@ -155,10 +155,10 @@ class _CodeModel(models.PrimitiveModel):
 def _make_view(
     dtype: np.dtype[Any] | None, rows: int, first_word: int, constants: Constants = ()
 ) -> Any:
-    """Returns a compiled function that gives a vector of plain numbers named fields.
+    """Returns a compiled function that views a vector of plain numbers as named fields.
 
     A control law declares the names of its gains and of the numbers that it sends. The arrays
-    of the simulation store them as plain numbers. The function converts no number: it only
+    of the simulation store them as plain numbers. The function converts no numbers. It only
     views the same memory with another type.
 
     Args:
@@ -189,19 +189,19 @@ def _make_view(
 
 @register_jitable
 def _no_rows(_numbers: Any) -> tuple[()]:
-    """Returns nothing, in place of the vectors that a law of this kind does not exchange."""
+    """Returns an empty tuple, in place of vectors that a law does not exchange."""
     return ()
 
 
 @register_jitable
 def _first_row(rows: Any) -> Any:
-    """Returns the only row."""
+    """Returns the first row, which is the only one."""
     return rows[0]
 
 
 @register_jitable
 def _no_row(_rows: Any) -> None:
-    """Returns no row."""
+    """Returns None, in place of a row that does not exist."""
 
 
 @leaf
@@ -216,7 +216,7 @@ def compute_law(
     received: RowArray,
     sent: RowArray,
 ) -> None:
-    """Computes the torque of a compiled control law in one tick of one of several runs.
+    """Computes the torque of a compiled control law in one tick, for one of several runs.
 
     Nothing happens if the law of the site is a part of the kernel, which computes such laws
     itself. The function body is only a placeholder: the compiler replaces it by the version of
@@ -230,14 +230,14 @@ def compute_law(
         links: Rows of the site's links.
         chain: Rows of the chain of joints, or None for the planar arm. Its model is
             in the row of the site already.
-        law: Row with the numbers of the law; changed.
-        received: Rows with the numbers that the peers' laws sent.
-        sent: Row with the numbers that this law sends; written.
+        law: Row with the gains and memory of the law; changed.
+        received: Rows with the values that the peers' laws sent.
+        sent: Row with the values that this law sends; written.
 
     Raises:
         FloatingPointError: A result is not finite.
     """
-    raise NotImplementedError  # each law has a form of its own, see `set_lane_form`
+    raise NotImplementedError  # each law has its own version, see `set_lane_form`
 
 
 def _compute_nothing(
@@ -251,14 +251,14 @@ def _compute_nothing(
     _received: Any,
     _sent: Any,
 ) -> None:
-    """Does nothing: the version of `compute_law` for laws that the kernel computes itself."""
+    """Does nothing. This is the version of `compute_law` for laws of the kernel."""
 
 
 def _choose_law(argument_types: tuple[Any, ...]) -> Callable[..., None]:
     """Returns the version of `compute_law` that calls the control law of a site.
 
-    The compiler calls this function with the types of the arguments, of which the first one
-    names the law.
+    The compiler calls this function with the types of the arguments, the first of which names
+    the law.
     """
     code = argument_types[0]
     if code.law_name == NO_LAW:

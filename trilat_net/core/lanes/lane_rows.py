@@ -2,13 +2,13 @@
 # mypy: disable-error-code="no-any-return, override"
 """Stores the states of several runs side by side, so that loops use vector instructions.
 
-The state of an arm in one run is a row of numbers (`row_fields`). Here each number becomes
+The state of an arm in one run is a row of numbers (`row_fields`). In lanes, each number becomes
 `LANES` numbers that are adjacent in memory, one for each run. For example, the first joint
 angles of all runs follow each other, so one instruction loads several of them. The position of
 a run among the others is called its lane.
 
-The functions of a control period get an object that stands for the row of one lane, with the
-same fields as the row of a single run. No function needs a second version.
+The functions of a control period get an object that represents the row of one lane and has the
+same fields as the row of a single run. Therefore no function needs a second version.
 
 Fields that are equal in all lanes, such as the kind of control law, can be constants. The
 compiler then removes the branches for other values.
@@ -39,8 +39,10 @@ from numba.np import arrayobj
 from numpy.typing import NDArray
 
 LANES = 64
-"""Number of lanes: room for as many runs. A vector register holds at most eight numbers. With
-several registers per quantity, the processor computes one while it waits for the others.
+"""Number of lanes, the largest number of runs that are computed together.
+
+A vector register holds at most eight numbers. With several registers per quantity, the
+processor computes one while it waits for the others.
 """
 _WORD = 8
 """Size of each number of a row, bytes."""
@@ -49,7 +51,7 @@ _ALIGNMENT = 64
 _NUMBA_KINDS = {"i8": types.int64, "f8": types.float64, "u8": types.uint64}
 
 Words = NDArray[np.int64]
-"""Rows in lanes as 64-bit words, shape (rows, words of a row, LANES)."""
+"""Rows in lanes as 64-bit words, shape (rows, words per row, LANES)."""
 Constants = tuple[tuple[str, int], ...]
 """Names and values of the fields that are equal in all lanes."""
 
@@ -57,7 +59,7 @@ Constants = tuple[tuple[str, int], ...]
 class LaneField(NamedTuple):
     """One field of a row, the state of one arm in one run, with its position in the row.
 
-    All numbers of a row have eight bytes.
+    All values per row have eight bytes.
 
     Attributes:
         name: Name of the field.
@@ -81,7 +83,7 @@ class LaneTable(types.Type):
 
     Args:
         dtype: Data type of a row of one run. All its numbers have 64 bits.
-        constants: For each row the fields that are equal in all lanes.
+        constants: For each row, the fields that are equal in all lanes.
     """
 
     in_lanes = True
@@ -108,7 +110,7 @@ class LaneTable(types.Type):
 
     @property
     def count(self) -> int:
-        """Number of records whose constant fields the compiler knows one by one.
+        """Number of records with constant fields of their own, which the compiler knows.
 
         A field is constant if it is the same in all simulated runs (lanes), for example the
         kind of a network link.
@@ -131,7 +133,7 @@ class RowType(types.Type):
 
     Attributes:
         fields: Fields of the record.
-        constants: The fields that are equal in all lanes, as the only entry.
+        constants: Tuple whose only entry contains the fields that are equal in all lanes.
     """
 
     fields: tuple[LaneField, ...]
@@ -208,12 +210,12 @@ class _RowModel(models.StructModel):
 
 
 def _offset_pointer(builder: Any, pointer: Any, offset: Any) -> Any:
-    """Generates LLVM code for an address that lies a number of bytes behind a pointer."""
+    """Generates LLVM code for an address that is a number of bytes after a pointer."""
     return builder.gep(pointer, [offset], source_etype=ir.IntType(8))
 
 
 def offset_rows(builder: Any, pointer: Any, word_count: int) -> Any:
-    """Generates LLVM code for an address that lies some numbers of a row behind a pointer.
+    """Generates LLVM code for the address a given number of words after a pointer.
 
     The rows of several runs are stored side by side, so that each number of a row occupies
     `LANES` numbers in memory.
@@ -221,7 +223,7 @@ def offset_rows(builder: Any, pointer: Any, word_count: int) -> Any:
     Args:
         builder: Appends LLVM instructions.
         pointer: The pointer.
-        word_count: Count of numbers (64-bit words) in a row of one run.
+        word_count: Distance in 64-bit words of a row of one run.
     """
     word = ir.IntType(64)
     return _offset_pointer(builder, pointer, ir.Constant(word, word_count * LANES * _WORD))
@@ -433,8 +435,8 @@ def _in_lane(_context: Any, table: Any, _lane: Any) -> Any:
 def _select_row(_context: Any, rows: Any, index: Any) -> Any:
     """Generates LLVM code for `rows[index]` with a constant index.
 
-    Only then does the compiler know the constant fields of this record (row), such as the kind
-    of an operator, and can remove the branches for other kinds.
+    With a constant index, the compiler knows the constant fields of this record (row), such as
+    the kind of an operator, and can remove the branches for other kinds.
     """
     if not isinstance(index, types.IntegerLiteral):
         return None
@@ -480,7 +482,7 @@ def _pointer_to(_context: Any, address: Any) -> Any:
     return types.voidptr(address), generate
 
 
-# Compiled code calls these functions with one argument less than their definitions have.
+# Compiled code calls these functions without the first argument of their definitions.
 in_lane: Any = _in_lane
 """Returns the rows of a table in one lane: `in_lane(table, lane)`."""
 select_row: Any = _select_row
@@ -490,18 +492,18 @@ number_of: Any = _number_of
 array with one entry per lane, or one integer that all lanes share.
 """
 pointer_to: Any = _pointer_to
-"""Converts the address of a table to a pointer, which stands for the table in calls."""
+"""Converts the address of a table to a pointer, which represents the table in calls."""
 
 
 def allocate_words(rows: int, row_length: int) -> Words:
     """Returns an array of zeros for the states of several runs side by side.
 
-    The shape is (rows, numbers of a row, LANES), and each run has one of the lanes. The array
+    The shape is (rows, values per row, LANES), and each run has one of the lanes. The array
     is aligned to a cache line, because vector instructions read an aligned array faster.
 
     Args:
         rows: Number of rows.
-        row_length: Count of numbers in a row of one run.
+        row_length: Number of values in a row of one run.
     """
     count = rows * row_length * LANES
     room = np.zeros(count + _ALIGNMENT // _WORD, np.int64)
@@ -510,10 +512,9 @@ def allocate_words(rows: int, row_length: int) -> Words:
 
 
 def read_words(rows: NDArray[Any]) -> Words:
-    """Returns the numbers of structured records as integers with the same bits ("words").
+    """Returns the values of structured records as integers with the same bits ("words").
 
-    Numbers of all types can then be copied by the same code. The shape is (rows, numbers of a
-    row).
+    The same code can then copy values of all types. The shape is (rows, words per row).
 
     Args:
         rows: Structured array of the rows, shape (rows,).

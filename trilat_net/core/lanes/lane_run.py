@@ -5,8 +5,8 @@ advances them to a time. It is the counterpart of `CompiledRun`, which simulates
 
 Invariant:
     - After `advance_to`, each run has the numbers that `CompiledRun.advance_to` would give it,
-      bit for bit. Only intermediate results of a tick ("scratch" in `row_fields`), and entries
-      of ring buffers that are not used any more, may differ.
+      bit for bit. Only intermediate results of a tick ("scratch" in `row_fields`), and obsolete
+      entries of ring buffers, may differ.
     - The arrays of the lanes do not overlap in memory, as `advance_site` requires.
 """
 
@@ -43,7 +43,7 @@ from .lane_stages import STAGES_DTYPE, EndedRuns, RecordedHands, advance_site, r
 from .lane_structure import RunStructure, SiteStructure, find_structure
 
 _FIRST_PAGES = 256
-"""Number of ticks whose states are kept at first, a power of two."""
+"""Initial number of ticks whose states are kept, a power of two."""
 _REFERENCE_FIELDS = ("alpha", "alpha_rate", "gone")
 """Fields of a link's row that stage 3 of a tick writes."""
 _STATE_FIELDS = ("q", "qd", "tau_x")
@@ -67,11 +67,11 @@ class _SiteTables(NamedTuple):
         record: Row with the results of a tick (control period), which a log would contain.
         peaks: Largest values, one row per interval of 50 ms (bucket).
         sums: Row with sums over the run.
-        progress: Row that states how far the run is.
+        progress: Row with the progress of the run.
         scratch: Row with intermediate results of the integrator.
-        law: Row with the numbers of a compiled control law.
-        received: Rows with the numbers that the laws of other sites sent.
-        sent: Row with the numbers that this law sends.
+        law: Row with the gains and memory of a compiled control law.
+        received: Rows with the values that the laws of other sites sent.
+        sent: Row with the values that this law sends.
         code: Tells the compiler which law to call. The array itself is not used.
         chain: Rows of the joints, if the arm is a chain.
     """
@@ -109,9 +109,9 @@ class _LaneLayout(NamedTuple):
         ramps: Shape of the table of dominance factors.
         chain: Data type of a joint. None for planar arms.
         joints: Number of joints whose angles the sites exchange.
-        law: Largest count of numbers of a compiled control law.
-        received: Largest count of numbers that a law receives from another site (peer).
-        sent: Largest count of numbers that a law sends.
+        law: Largest number of gains and memory values of a compiled control law.
+        received: Largest number of values that a law receives from another site (peer).
+        sent: Largest number of values that a law sends.
     """
 
     site: np.dtype[Any]
@@ -132,7 +132,7 @@ class _LaneLayout(NamedTuple):
 def _find_layout(run: CompiledRun) -> _LaneLayout:
     """Returns the data types and lengths of all arrays of a run, on which its code depends.
 
-    A run without compiled control laws has arrays of length 0 in their place.
+    Without compiled control laws, the arrays for laws have the length 0.
     """
     memory = run.memory
     tables = memory.tables
@@ -212,7 +212,7 @@ def _type_numbers(count: int, rows: int) -> LaneTable:
     Compiled code addresses this vector as the field `numbers` of a row.
 
     Args:
-        count: Count of numbers.
+        count: Number of values in each row.
         rows: Number of rows.
     """
     return LaneTable(np.dtype([("numbers", "f8", (count,))]), ((),) * rows)
@@ -231,7 +231,7 @@ def _find_addresses(run: CompiledRun, structure: RunStructure, clock: types.Type
     """Returns the address of the compiled code that computes a tick of each site.
 
     The code computes a tick (period of the control loop) for several runs at once. It is
-    compiled if it has not been stored on the disk before.
+    compiled if it is not stored on disk yet.
 
     Args:
         run: One of the runs.
@@ -239,7 +239,7 @@ def _find_addresses(run: CompiledRun, structure: RunStructure, clock: types.Type
         clock: Numba's type of the ticks, see `_list_argument_types`.
 
     Raises:
-        NumbaError: A law of a user cannot be compiled for several runs at once.
+        NumbaError: A user's law cannot be compiled for several runs at once.
     """
     layout = _find_layout(run)
     addresses = []
@@ -256,12 +256,12 @@ def explain_uncompilable(run: CompiledRun, clock: types.Type = types.int64) -> s
     compiling the code.
 
     Args:
-        run: The run before its first tick (control period). There must be no obstacle, see
-            `find_obstacle`.
+        run: The run before its first tick (control period). `find_obstacle` must find no reason
+            against computing it in a lane.
         clock: Type of the ticks, see `_list_argument_types`.
 
     Returns:
-        The reason. Empty if there is none.
+        The reason. Empty if all laws can be compiled.
     """
     try:
         _find_addresses(run, find_structure(run), clock)
@@ -271,9 +271,10 @@ def explain_uncompilable(run: CompiledRun, clock: types.Type = types.int64) -> s
 
 
 def read_assembly(run: CompiledRun, i: int) -> str:
-    """Returns the machine code for one arm as text, in which tests look for vectors.
+    """Returns the machine code for one arm as text, for tests.
 
-    Vector instructions must be found there, because the simulation is slow without them.
+    The tests check that it contains vector instructions, because the simulation is slow without
+    them.
 
     Args:
         run: The run.
@@ -287,15 +288,15 @@ def read_assembly(run: CompiledRun, i: int) -> str:
 
 @leaf
 def _copy_records(first: IntArray, kept: Array, records: Array) -> None:
-    """Copies the results of several simulations from common arrays to an array of each.
+    """Copies the results of several simulations from common arrays to one array per run.
 
     Args:
         first: First tick of each site, shape (N,).
         kept: Latest records of all sites, shape (N, rows, floats, LANES). The record of tick k
             is in row k modulo the number of rows.
-        records: Written, shape (runs, N, ticks, floats).
+        records: Receives the results, shape (runs, N, ticks, floats).
     """
-    # The numbers of all lanes in a record lie in few cache lines.
+    # The numbers of all lanes in a record are in few cache lines.
     for i in range(records.shape[1]):
         for tick in range(records.shape[2]):
             row = (first[i] + tick) & (kept.shape[1] - 1)
@@ -305,13 +306,13 @@ def _copy_records(first: IntArray, kept: Array, records: Array) -> None:
 
 
 def has_lane_code(run: CompiledRun) -> bool:
-    """Returns True if the code that simulates a run in lanes is stored on the disk already.
+    """Returns True if the code that simulates a run in lanes is already stored on disk.
 
     A lane is the position of one of several runs that are simulated at once. Without stored
     code, the compilation takes some time before the runs can start.
 
     Args:
-        run: The run. There must be no obstacle, see `find_obstacle`.
+        run: The run. `find_obstacle` must find no reason against computing it in a lane.
     """
     structure = find_structure(run)
     layout = _find_layout(run)
@@ -322,10 +323,11 @@ def has_lane_code(run: CompiledRun) -> bool:
 
 
 class _LinksOfRun:
-    """Brings the simulated network links of a run up to date, but only if this is needed.
+    """Updates the simulated network links of a run, but only if this is needed.
 
     While several runs are simulated together, their deliveries are computed in another way,
-    which leaves the state of the links behind. Only a run that then continues alone needs it.
+    which does not update the state of the links. Only a run that then continues alone needs
+    this state.
 
     Args:
         run: The run before its first tick (control period).
@@ -334,7 +336,7 @@ class _LinksOfRun:
     def __init__(self, run: CompiledRun) -> None:
         self._run = run
         self._ticks: IntArray = np.zeros_like(run.memory.progress["tick"])
-        # A sample of a tick that was planned late arrives at a later tick of the receiver.
+        # If a tick was planned late, its sample arrives at a later tick of the receiver.
         self._ends: list[IntArray] = []
 
     def set_pending(
@@ -343,17 +345,17 @@ class _LinksOfRun:
         """Stores the latest results of a simulation, to update its network links later.
 
         Args:
-            ticks: Number of ticks that each site has made.
+            ticks: Number of ticks that each site has executed.
             links: Rows of its links after these ticks. Only fields of the sample in use, and
                 fields that stage 3 of a tick writes, are up to date.
             states: The latest states of its sites, see `repeat_deliveries`.
-            received: Numbers of laws that came with the samples in use, shape (N P, C).
+            received: Values from laws that arrived with the samples in use, shape (N P, C).
         """
         self._ends.append(ticks.copy())
         self._run.pending_deliveries = partial(self._update, links, states, received)
 
     def _update(self, links: NDArray[Any], states: Array, received: Array) -> None:
-        """Computes the state of the links up to the ticks that `set_pending` noted."""
+        """Computes the state of the links up to the ticks that `set_pending` stored."""
         memory = self._run.memory
         tables = memory.tables
         for ticks in self._ends:
@@ -386,7 +388,7 @@ def _pack_tables(tables_of_runs: Sequence[NDArray[Any]]) -> Words:
         tables_of_runs: The same array of each run.
 
     Returns:
-        The numbers of all runs, shape (rows, numbers of a row, LANES).
+        The numbers of all runs, shape (rows, values per row, LANES).
     """
     tables_of_lanes = [read_words(table.reshape(-1)) for table in tables_of_runs]
     rows, row_length = tables_of_lanes[0].shape
@@ -441,7 +443,7 @@ class LaneRun:
         self._links_of_runs = [_LinksOfRun(run) for run in runs]
 
         self._pages = _FIRST_PAGES
-        # A state occupies whole cache lines, because each lane needs that of another tick.
+        # A state occupies whole cache lines, because each lane needs the state of another tick.
         width = -(-(3 * layout.joints + layout.sent) // 8) * 8
         self._states = np.zeros((self._sites, self._pages + 1, LANES, width))
         self._scratch = allocate_words(1, STAGES_DTYPE.itemsize // 8)
@@ -451,7 +453,7 @@ class LaneRun:
         self._site = _pack_tables([arrays.site for arrays in tables])
         self._links = _pack_tables([arrays.links for arrays in tables])
         self._actors = _pack_tables([arrays.actors for arrays in tables])
-        # The environments have a table of their own, because arguments must not overlap.
+        # The environments have their own table, because arguments must not overlap.
         self._environments = self._actors.copy()
         self._sums = _pack_tables([memory.sums for memory in memories])
         self._progress = _pack_tables([memory.progress for memory in memories])
@@ -592,9 +594,9 @@ class LaneRun:
             self._write_back(lane, self.runs[lane], until_s)
 
     def _use_samples(self, end: IntArray) -> int:
-        """Finds which received state of its peers each site uses, in some control periods.
+        """Finds the peers' states that each site uses in a block of control periods.
 
-        The delays of the network decide this. A site is the controller of one arm, a peer is
+        They depend on the delays of the network. A site is the controller of one arm, a peer is
         another site, and a tick is a control period; see `use_samples`.
 
         Args:
@@ -626,7 +628,7 @@ class LaneRun:
         )
 
     def _find_block_end(self, ticks: IntArray) -> IntArray:
-        """Returns the control period (tick) at which each site is at the end of the next block.
+        """Returns the control period (tick) of each site at the end of the next block.
 
         The sites (controllers of one arm each) may have different rates. A block is an interval
         of time that all sites simulate before samples are exchanged.
@@ -646,7 +648,7 @@ class LaneRun:
         return np.clip(end, self._ticks, ticks)
 
     def _step_to(self, ticks: IntArray) -> None:
-        """Continues all simulations to a number of control periods, or until all have ended.
+        """Continues all simulations up to a number of control periods, or until all have ended.
 
         Args:
             ticks: Number of ticks of each site since the start of the runs, shape (N,).
@@ -706,13 +708,13 @@ class LaneRun:
     def _keep_states(self, ticks: int) -> None:
         """Enlarges the memory for past states of the sites (arm controllers), if necessary.
 
-        A site uses a past state of another site, its sample, because the network delays it.
-        Samples that are older than the sample in use are never used any more. Therefore far
-        fewer states are needed than a link could delay.
+        A site uses a past state (sample) of another site, because the network delays samples.
+        Samples that are older than the sample in use are never used again. Therefore far fewer
+        states are needed than the longest delay of a link would require.
 
         Args:
-            ticks: Number of ticks (control periods) before the present one for which the states
-                are needed.
+            ticks: Number of ticks (control periods) before the present tick for which the
+                states are needed.
         """
         while self._pages <= ticks:
             old_pages = self._pages
@@ -727,11 +729,11 @@ class LaneRun:
     def keep(self, chosen: Sequence[int]) -> None:
         """Continues with some of the runs only, so that no time is spent on the others.
 
-        A search, for example, drops runs that cannot be the best any more.
+        A search, for example, drops runs that can no longer be the best.
 
         Args:
-            chosen: Indices in `runs` of the runs that continue, in ascending order. None of
-                them may have ended.
+            chosen: Indices in `runs` of the runs that continue, in ascending order. No run
+                among them may have ended.
         """
         assert all(self._ended.ticks[lane] < 0 for lane in chosen)
         lanes = list(chosen)
@@ -843,7 +845,7 @@ class LaneRun:
             )
 
     def _write_sent(self, lane: int, run: CompiledRun) -> None:
-        """Copies the latest sent states of one run from common arrays into its own records.
+        """Copies the latest sent states of one run from common arrays into its records.
 
         Several runs are simulated side by side, each in one lane. A slow site (arm controller)
         accepts several samples (sent states) of a faster peer at once. A run that continues
@@ -898,7 +900,7 @@ def _find_recorded_hands(
 
 
 def view_rows(table: NDArray[np.float64]) -> NDArray[Any]:
-    """Returns an array of floats as structured records whose fields have names.
+    """Returns an array of floats as structured records with named fields.
 
     The array has the shape (N, rows, columns) for N sites. The records share its memory, so
     that assigning to a field changes the array.
@@ -907,7 +909,7 @@ def view_rows(table: NDArray[np.float64]) -> NDArray[Any]:
 
 
 def _share(table: Words, i: int, sites: int) -> Words:
-    """Returns the part of an array that belongs to one site (controller of one arm).
+    """Returns the rows of an array that belong to one site (controller of one arm).
 
     The array contains the rows of all sites one after another, equally many for each site. For
     example, site 1 of 3 has the rows 2 and 3 of 6.
@@ -917,7 +919,7 @@ def _share(table: Words, i: int, sites: int) -> Words:
 
 
 def _check_distinct(tables: _SiteTables) -> None:
-    """Asserts that no two tables overlap: the compiled code of `advance_site` relies on it."""
+    """Asserts that no two tables overlap, as the compiled `advance_site` requires."""
     filled = [table for table in tables if table.size]
     ranges = sorted((table.ctypes.data, table.ctypes.data + table.nbytes) for table in filled)
     for (_, end), (start, _) in pairwise(ranges):
@@ -925,11 +927,11 @@ def _check_distinct(tables: _SiteTables) -> None:
 
 
 def put_rows(rows: NDArray[Any], numbers: Words) -> None:
-    """Overwrites structured records by numbers given as integers with the same bits.
+    """Overwrites structured records with values given as integers with the same bits.
 
     Args:
         rows: The rows; written.
-        numbers: The numbers, shape (rows, numbers of a row).
+        numbers: The values, shape (rows, words per row).
     """
     new_rows = np.ascontiguousarray(numbers).view(rows.dtype)
     rows[...] = new_rows.reshape(rows.shape)
@@ -955,9 +957,9 @@ def _write_progress(progress: Any, ticks: IntArray, rates_hz: IntArray) -> None:
 
 
 def find_words(layout: np.dtype[Any], name: str) -> range:
-    """Returns where the numbers of a field, such as "q", lie in a record.
+    """Returns the positions of the numbers of a field, such as "q", in a record.
 
-    They are given as indices among all numbers of the record (row).
+    The positions are indices among all numbers of the record (row).
 
     Args:
         layout: Data type of the row.

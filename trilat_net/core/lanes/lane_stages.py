@@ -66,7 +66,7 @@ def _no_torque(
     _table: TorqueTable,
     _sampled: int,
 ) -> SourceTorque:
-    """Returns no torque: the version of `torque_on_arm` for an arm that nothing acts on."""
+    """Returns no torque. This is the version of `torque_on_arm` for an arm without contacts."""
     return NO_TORQUE
 
 
@@ -75,7 +75,8 @@ def _unroll_sources(count: int) -> Callable[..., SourceTorque]:
 
     It replaces the loop in `torque_on_arm`. The compiler knows the kind of each operator and
     environment only if its index is a constant and not the variable of a loop. Therefore the
-    loop is unrolled: the function for n of them calls that for n - 1.
+    loop is unrolled: the function for n torque sources calls the function for n - 1 torque
+    sources.
 
     Args:
         count: Number of operators and environments that act on the arm.
@@ -125,14 +126,14 @@ def _advance_stage(
 ) -> Any:
     """Evaluates one stage of the Runge-Kutta step of a planar arm in one of several runs.
 
-    It calls `two_link_stages.advance_stage` with the numbers of the run.
+    The function calls `two_link_stages.advance_stage` with the numbers of the run.
 
     Args:
         t_s: Time at the beginning of the period, s.
         ahead_s: Time of the stage after the beginning of the period, s.
         s: State of the site, the arm with its controller.
-        qd_before: Joint velocities at the stage before, rad/s.
-        qdd_before: Joint accelerations at the stage before, rad/s^2.
+        qd_before: Joint velocities at the previous stage, rad/s.
+        qdd_before: Joint accelerations at the previous stage, rad/s^2.
         actors: Rows of the operators and environments that act on the arm.
         table: Tables of numbers to which these rows refer.
     """
@@ -167,7 +168,7 @@ def use_states(
     used: IntArray,
     columns: IntArray,
 ) -> None:
-    """Copies the state of each peer that is in use to the links of an arm: stage 2, release.
+    """Copies the peers' states in use to the links of an arm (stage 2 of a tick, release).
 
     Args:
         t_ns: Nominal time of the tick, ns since the epoch, see `number_of`.
@@ -178,10 +179,10 @@ def use_states(
         shared: Number of coordinates that sites share.
         site: Row of the site.
         links: Rows of its links; changed.
-        received: Rows with the numbers that the peers' laws sent; changed.
+        received: Rows with the values that the peers' laws sent; changed.
         states: The latest states of all sites, see `advance_site`.
-        used: Sample in use by peer, lane and tick of a block; -1: none yet.
-        columns: Indices of the received numbers, see `LaneLaw`, shape (P, C).
+        used: Sample in use by peer, lane and tick of a block; -1 before the first.
+        columns: Indices of the received values, see `LaneLaw`, shape (P, C).
     """
     for lane in range(lanes):
         rows = in_lane(links, lane)
@@ -227,7 +228,7 @@ def put_sent_numbers(
     sent: Any,
     states: Array,
 ) -> None:
-    """Copies the numbers that the law of an arm sends to its record and its latest state.
+    """Copies the values that the law of an arm sends to the arm's record and latest state.
 
     Args:
         k: The tick, see `number_of`.
@@ -238,7 +239,7 @@ def put_sent_numbers(
         shared: Number of coordinates that sites share.
         site: Row of the site.
         record: Rows with the floats of its latest records; one is changed.
-        sent: Row with the numbers that the law sends.
+        sent: Row with the values that the law sends.
         states: The latest states of all sites, see `advance_site`; changed.
     """
     for c in range(in_lane(site, 0)[0].sent):
@@ -282,11 +283,11 @@ def advance_site(
 ) -> None:
     """Computes one control period of an arm for several simulations that run side by side.
 
-    All arrays have a place (lane) for each simulation. No two of them overlap in memory.
+    All arrays have a place (lane) for each simulation. No two arrays overlap in memory.
 
     Args:
         k: The tick, of all lanes or of each lane, see `number_of`.
-        t_ns: Its nominal time, ns since the epoch, of all lanes or of each lane.
+        t_ns: Nominal time of the tick, ns since the epoch, of all lanes or of each lane.
         lanes: Number of lanes to compute, at most `LANES`.
         settled_rad: Position error below which an arm counts as settled, rad.
         i: Index of the site.
@@ -297,22 +298,22 @@ def advance_site(
         site: Row of the site.
         links: Rows of its links.
         actors: Rows of its operators and environments.
-        environments: The rows of its environments among them.
+        environments: Rows of the environments alone.
         ramps: Row with the changes of its dominance factors.
         record: Rows with the floats of its latest records; one is written.
         peaks: Peaks of the site, one row per bucket, see `update_peaks`.
         sums: Sums of the site.
         progress: Progress of the site.
-        scratch: Row with room for the stages of the integrator, see `STAGES_DTYPE`.
-        law: Row with the numbers of the site's compiled law.
-        received: Rows with the numbers that the peers' laws sent.
-        sent: Row with the numbers that the law sends.
-        code: Stands for the code of the law, see `LawCode`.
-        states: The latest states of all sites, q, qd, tau_x and the numbers that the law sent,
+        scratch: Row that buffers the stages of the integrator, see `STAGES_DTYPE`.
+        law: Row with the gains and memory of the site's compiled law.
+        received: Rows with the values that the peers' laws sent.
+        sent: Row with the values that the law sends.
+        code: Selects the code of the law, see `LawCode`.
+        states: The latest states of all sites (q, qd, tau_x and the values that the law sent),
             shape (N, pages + 1, LANES, width). The last page holds the state before the first
             tick.
-        used: Sample in use by peer, lane and tick of a block; -1: none yet.
-        columns: Indices of the received numbers, see `LaneLaw`, shape (P, C).
+        used: Sample in use by peer, lane and tick of a block; -1 before the first.
+        columns: Indices of the received values, see `LaneLaw`, shape (P, C).
         table: Tables of the operators and environments of all sites, equal in all runs.
     """
     use_states(
@@ -330,8 +331,8 @@ def advance_site(
         columns=columns,
     )
 
-    # 3 reference, 4 errors, 5 estimate. The branches of the rule `glide` have loops of their
-    # own, because a loop with branches does not use vector instructions.
+    # 3 reference, 4 errors, 5 estimate. The branches of the rule `glide` have their own loops,
+    # because a loop with branches does not use vector instructions.
     glides = in_lane(site, 0)[0].on_stale == _GLIDE
     if glides:
         for lane in range(lanes):
@@ -409,8 +410,8 @@ def advance_site(
         states=states,
     )
 
-    # 8 advance. Each stage of the integrator has a loop of its own: in a short loop the
-    # processor begins with the next lanes while it waits for results of the previous ones.
+    # 8 advance. Each stage of the integrator has its own loop: in a short loop, the processor
+    # begins with the next lanes while it waits for the results of the previous lanes.
     for lane in range(lanes):
         s = in_lane(site, lane)[0]
         if s.mode != _DIVERGED:
@@ -514,25 +515,25 @@ def advance_site(
 
 
 class EndedRuns(NamedTuple):
-    """States of runs that have ended, at the time at which one of their arms left its limits.
+    """States of ended runs, at the time at which one of their arms left its limits.
 
     Several runs are simulated side by side, each in a lane. A run that has ended stays in its
     lane, but its later numbers have no meaning. Therefore its last valid state is copied here.
     N is the number of sites (arm controllers), and the last axis of each array is the lane.
 
     Attributes:
-        ticks: Number of ticks that the first site of each run has made, shape (LANES,). -1: the
-            run has not ended.
-        site_ticks: Number of ticks that each site has made, shape (N, LANES).
-        site_rows: Rows of the sites, shape (N, words of a row, LANES).
-        links: Rows of the links, shape (N P, words of a row, LANES). Only `LaneEpisodes` keeps
-            them: in `keep_ended_runs` their copy makes all ticks slower by half.
+        ticks: Number of ticks that the first site of each run has executed, shape (LANES,). -1
+            if the run has not ended.
+        site_ticks: Number of ticks that each site has executed, shape (N, LANES).
+        site_rows: Rows of the sites, shape (N, words per row, LANES).
+        links: Rows of the links, shape (N P, words per row, LANES). Only `LaneEpisodes` keeps
+            them, because copying them in `keep_ended_runs` makes all ticks slower by half.
         records: Records, shape (N, floats, LANES).
-        sums: Rows of the sums, shape (N, words of a row, LANES).
-        progress: Rows of the progress, shape (N, words of a row, LANES).
-        laws: Numbers of compiled laws, shape (N, numbers, LANES).
-        sent: Numbers that these laws send, shape (N, numbers, LANES).
-        peaks: Peaks in the bucket of the instant, shape (N, 3 n, LANES).
+        sums: Rows of the sums, shape (N, words per row, LANES).
+        progress: Rows of the progress, shape (N, words per row, LANES).
+        laws: Gains and memory of compiled laws, shape (N, numbers, LANES).
+        sent: Values that these laws send, shape (N, numbers, LANES).
+        peaks: Peaks in the bucket of this time, shape (N, 3 n, LANES).
     """
 
     ticks: IntArray
@@ -576,15 +577,16 @@ def keep_ended_runs(
     The other runs continue, so the numbers in the lane of an ended run are overwritten later.
 
     Args:
-        ticks: Number of ticks that the first site has made, of all runs or of each run.
+        ticks: Number of ticks that the first site has executed: one number for all runs, or one
+            per run.
         runs: Number of runs.
         mode_word: Index of the mode among the words of a site's row.
-        latest: For each site the number of its ticks, the bucket of the latest tick and the row
-            of its record, shape (3, N).
+        latest: For each site, the number of its ticks, the bucket of its latest tick, and the
+            row of the record of this tick, shape (3, N).
         peaks: Peaks of all sites, shape (N, buckets, 3 n, LANES).
         present: Numbers of all runs now, with several rows of records per site. Its peaks are
             not used.
-        ended: Written.
+        ended: Receives the numbers of runs that end in this tick.
 
     Returns:
         The number of runs that have not ended.
@@ -620,9 +622,10 @@ class RecordedHands(NamedTuple):
 
     Attributes:
         actions: Numbers of the operators, shape (N, ticks, C).
-        rows: Row of the operator of each site among all operators and environments; -1: none.
-        row_words: Words of the row that the numbers replace.
-        columns: Index of the number for each of these words.
+        rows: Row of the operator of each site among all operators and environments. -1 without
+            an operator.
+        row_words: Words of the row that the actions replace.
+        columns: Index of the action's number for each of these words.
     """
 
     actions: Array
@@ -635,7 +638,7 @@ class RecordedHands(NamedTuple):
 def _apply_recorded_hand(
     i: int, k: int, lanes: int, hands: RecordedHands, actors: Array
 ) -> None:
-    """Moves an arm as its operator did in a recorded run, in a control period of all copies.
+    """Repeats an operator's action from a recorded run, in one control period of all copies.
 
     The copies of the run are simulated side by side (in lanes).
 
@@ -643,7 +646,7 @@ def _apply_recorded_hand(
         i: Index of the site.
         k: The tick.
         lanes: Number of lanes.
-        hands: What the operators did.
+        hands: Actions of the operators.
         actors: Rows of operators and environments, seen as floats; written.
     """
     if hands.rows[i] < 0 or k >= hands.actions.shape[1]:
@@ -674,13 +677,13 @@ def call_site(
 ) -> None:
     """Calls the compiled code that computes one control period of an arm for several runs.
 
-    The arguments after `address` are those of `advance_site`. Instead of its tables, from
-    `site` to `_chain`, `tables` has their addresses in the same order.
+    The arguments after `address` are those of `advance_site`. In place of the tables of that
+    function, from `site` to `_chain`, `tables` contains their addresses in the same order.
 
     Args:
         address: Address of the code of `advance_site` or `advance_chain_site`.
-        k: The tick, of all lanes or as a pointer to those of the lanes.
-        t_ns: Its nominal time, ns since the epoch, in the same form.
+        k: The tick of all lanes, or a pointer to the ticks of the lanes.
+        t_ns: Nominal time of the tick, ns since the epoch, in the same form.
         lanes: Number of lanes to compute.
         settled_rad: Position error below which an arm counts as settled, rad.
         i: Index of the site.
@@ -691,7 +694,7 @@ def call_site(
         tables: Addresses of the tables of the site, shape (15,).
         states: The latest states of all sites.
         used: Samples in use of the site.
-        columns: Indices of the numbers that its law receives.
+        columns: Indices of the values that the site's law receives.
         table: Tables of the operators and environments.
     """
     call_address(
@@ -754,15 +757,15 @@ def run_block(
     present: EndedRuns,
     ended: EndedRuns,
 ) -> int:
-    """Simulates several runs side by side for some control periods, or until all end.
+    """Simulates several runs side by side for a number of control periods, or until all end.
 
     Args:
         first: First tick of each site in the block, shape (N,).
-        ticks: Number of ticks that each site has made, shape (N,); changed.
+        ticks: Number of ticks that each site has executed, shape (N,); changed.
         end: Tick of each site after the block, shape (N,).
         rates_hz: Tick rates, Hz, shape (N,).
-        next_ns: Room for the time of the next tick of each site, ns, shape (N,).
-        latest: Room for the numbers of the latest tick, see `keep_ended_runs`.
+        next_ns: Buffer for the time of the next tick of each site, ns, shape (N,).
+        latest: Buffer for the numbers of the latest tick, see `keep_ended_runs`.
         runs: Number of runs.
         settled_rad: Position error below which an arm counts as settled, rad.
         pages: Number of latest states of each site, a power of two.
@@ -774,9 +777,9 @@ def run_block(
             `advance_site`, shape (N, 15).
         states: The latest states of all sites, see `advance_site`.
         used: Samples in use, shape (N, P, LANES, ticks), see `use_samples`.
-        columns: Indices of the numbers that laws receive, shape (N, P, C).
+        columns: Indices of the values that laws receive, shape (N, P, C).
         table: Tables of the operators and environments.
-        hands: What live operators did in a recorded run.
+        hands: Actions of live operators in a recorded run.
         actors: Rows of operators and environments, seen as floats.
         peaks: Peaks of all sites, shape (N, buckets, 3 n, LANES).
         present: The numbers of all runs.
@@ -786,13 +789,13 @@ def run_block(
         The number of runs that have not ended.
     """
     running = runs
-    # Whole vector registers: the numbers of lanes without a run have no meaning. One or two
-    # lanes more are faster without vectors.
+    # Compute whole vector registers: the numbers of lanes without a run have no meaning. One or
+    # two additional lanes are faster without vectors.
     lanes = runs if 0 < runs % 8 <= 2 else (runs + 7) // 8 * 8
     for i in range(addresses.shape[0]):
         next_ns[i] = tick_ns(ticks[i], rates_hz[i]) if ticks[i] < end[i] else NEVER_NS
     while True:
-        # As `run_until`: by nominal time, and at equal times in the order of the sites.
+        # As in `run_until`: by nominal time, and at equal times in the order of the sites.
         t_ns = NEVER_NS
         for i in range(addresses.shape[0]):
             t_ns = min(t_ns, next_ns[i])

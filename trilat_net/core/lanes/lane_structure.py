@@ -3,7 +3,7 @@
 Vector instructions evaluate the same equations for several runs. Runs can therefore be computed
 together if they differ in numbers only, such as gains or start poses. Properties that select
 the equations, for example the kind of control law, form the structure of a run. `find_obstacle`
-tells why a run must be computed alone.
+explains why a run must be computed alone.
 
 Invariant:
     - Two runs with the same structure use the same compiled code and the same number tables.
@@ -41,9 +41,9 @@ class SiteStructure(NamedTuple):
     Attributes:
         constants: Constants of the site.
         actors: Constants of each operator and environment, the operators first.
-        first_environment: Index of the first environment; -1: none.
+        first_environment: Index of the first environment. -1 if there is no environment.
         law: Compiled law of the site.
-        prismatic: For each joint of a chain 1 for a prismatic joint, else 0.
+        prismatic: For each joint of a chain, 1 if it is prismatic, 0 if it is revolute.
     """
 
     constants: Constants
@@ -91,10 +91,10 @@ def find_obstacle(run: CompiledRun, *, hand_site: int = -1) -> str:
     Args:
         run: The run before its first tick (control period).
         hand_site: Index of a site (arm controller) whose live operator the caller replaces,
-            because it knows the actions of this operator. -1: there is none.
+            because it knows the actions of this operator. -1 if there is no such site.
 
     Returns:
-        The property of the run that lanes do not support. Empty if there is none.
+        The property of the run that lanes do not support. Empty if lanes support the run.
     """
     config: Any = numba.config
     tables = run.memory.tables
@@ -112,7 +112,7 @@ def find_obstacle(run: CompiledRun, *, hand_site: int = -1) -> str:
 
 
 def _list_prismatic(chain: Any, i: int, joints: int) -> tuple[int, ...]:
-    """Returns for each joint of a site 1 for a prismatic joint; nothing for planar arms."""
+    """Returns 1 for each prismatic joint of a site and 0 for others; () for planar arms."""
     return () if chain is None else tuple(chain["prismatic"][i, :joints].tolist())
 
 
@@ -122,7 +122,7 @@ def find_structure(run: CompiledRun) -> RunStructure:
     For example, two runs with the same control laws but different gains have the same result.
 
     Args:
-        run: The run. There must be no obstacle, see `find_obstacle`.
+        run: The run. `find_obstacle` must find no reason against computing it in a lane.
     """
     memory = run.memory
     tables = memory.tables
@@ -161,7 +161,6 @@ def describe_structure(run: CompiledRun) -> Hashable:
         run: The run before its first tick.
 
     Returns:
-        The obstacle to computing the run together with others. Without an obstacle, its
-        structure.
+        The structure of the run. If the run must be computed alone, the reason for this.
     """
     return find_obstacle(run) or find_structure(run)

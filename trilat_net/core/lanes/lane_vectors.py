@@ -1,6 +1,6 @@
 # mypy: disallow-untyped-calls=False, disallow-untyped-decorators=False
 # mypy: disable-error-code="no-any-return, override"
-"""Lets a function that computes one run compute eight runs, by a vector type for its numbers.
+"""Lets a function for one run compute eight runs, by a vector type for its numbers.
 
 A loop over runs becomes vector instructions if the loop over runs is the innermost one. In the
 dynamics of a chain of joints, the innermost loops go from joint to joint. The compiler would
@@ -9,12 +9,12 @@ defines a type of Numba for a value that consists of eight numbers, one for each
 function that is compiled for this type, `a + b` adds eight pairs of numbers by one instruction.
 The source of the function is not changed.
 
-A function that branches on such a value is refused when it is compiled, because the eight runs
-may disagree. It must use `choose` instead.
+A function that branches on such a value is rejected when it is compiled, because the eight runs
+may need different branches. The function must use `choose` instead.
 
 Invariant:
-    - Each number of a result depends on the same numbers, by the same operations, as in a run
-      of its own.
+    - Each number of a result is computed by the same operations from the same numbers as in a
+      run that is computed alone.
 """
 
 import hashlib
@@ -73,7 +73,7 @@ class LaneVector(types.Type):
         return "LaneVector", (self.kind,)
 
     def can_convert_from(self, _context: Any, other: Any) -> Any:
-        """Tells Numba that one number may stand where a vector of eight floats is needed.
+        """Tells Numba that one number may be used where a vector of eight floats is needed.
 
         The number is then repeated eight times. Returns None, which forbids the conversion, for
         vectors of integers or conditions, and for values that are not numbers.
@@ -82,7 +82,7 @@ class LaneVector(types.Type):
         return Conversion.safe if is_number and self.kind == "f8" else None
 
     def unify(self, _context: Any, other: Any) -> Any:
-        """Returns the type of a variable that gets a vector in one branch, else a number.
+        """Returns the type of a variable that is a vector or a number, depending on the branch.
 
         Numba requires a single type per variable. It is this vector type, so that the number is
         repeated for all eight runs. Returns None, which is an error of compilation, if the
@@ -130,7 +130,7 @@ def _is_number(numba_type: Any) -> bool:
 def _define_binary(function: Any, result: LaneVector, generate: Callable[..., Any]) -> None:
     """Tells Numba how to compute an operation such as `a + b` with vectors of eight numbers.
 
-    One of the operands may be a single number, which is then used for all eight.
+    One of the operands may be a single number, which is then used for all eight runs.
 
     Args:
         function: The operation as a function, such as `operator.add`.
@@ -212,7 +212,7 @@ for _operator, _symbol in (
 _define_binary(
     operator.ne, CONDITIONS, lambda builder, a, b: builder.fcmp_unordered("!=", a, b)
 )
-# As Numba's `min` and `max` of two numbers.
+# The same as Numba's `min` and `max` of two numbers.
 _define_binary(min, FLOATS, _least)
 _define_binary(max, FLOATS, _largest)
 _define_unary(operator.neg, lambda builder, a: builder.fneg(a))
@@ -274,7 +274,7 @@ def _truncate(_context: Any, number: Any) -> Any:
 
 @intrinsic
 def _reduce_or(_context: Any, conditions: Any) -> Any:
-    """Generates LLVM code that tells whether one of eight conditions holds."""
+    """Generates LLVM code that determines whether any of eight conditions holds."""
 
     def generate(_target: Any, builder: Any, _signature: Any, args: Any) -> Any:
         bits = builder.bitcast(args[0], ir.IntType(GROUP))
@@ -346,8 +346,8 @@ class _RowsInGroup(_GroupType):
 class _RowInGroup(RowType, _GroupType):
     """Numba type of one record of eight simulations at once, for SIMD vector instructions.
 
-    A record (row) holds for example the state of one arm. Eight runs (lanes) are simulated side
-    by side, so that a field of the row, such as an angle, is a vector of eight numbers
+    A record (row) contains, for example, the state of one arm. Eight runs (lanes) are simulated
+    side by side, so that a field of the row, such as an angle, is a vector of eight numbers
     (`LaneVector`), one per run.
     """
 

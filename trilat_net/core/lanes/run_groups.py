@@ -25,7 +25,7 @@ LEAST_RUNS = 4
 LANE_SITE_TICKS = 100_000_000
 """Number of site ticks from which a study compiles the code for several runs side by side.
 
-The compilation takes some ten seconds per kind of site. The code then saves about 0.4 us per
+The compilation takes about ten seconds per kind of site. The code then saves about 0.4 us per
 site tick.
 """
 
@@ -40,13 +40,13 @@ class RunGroup:
         runs: The runs before their first tick (control period).
         in_lanes: True to compute them together, each in a lane of the vector registers. They
             must have the same structure.
-        obstacle: Property because of which the runs cannot be computed together, or empty.
+        obstacle: Property that prevents computing the runs together. Empty if nothing does.
         record_rows: Number of latest records of each site (arm controller) that are kept, a
             power of two.
 
     Attributes:
         members: Indices of the runs that are left in the group.
-        obstacle: As the argument.
+        obstacle: The value of the argument.
     """
 
     def __init__(
@@ -64,7 +64,7 @@ class RunGroup:
         self._lanes = LaneRun(runs, record_rows) if in_lanes else None
 
     def advance_to(self, until_s: float) -> None:
-        """Continues the simulated runs of the group up to a time. Calls may follow one another.
+        """Continues the simulated runs of the group up to a time. Repeated calls are allowed.
 
         Args:
             until_s: The time, s, later than that of the previous call.
@@ -73,8 +73,9 @@ class RunGroup:
             try:
                 self._lanes.advance_to(until_s)
             except Exception:
-                # The law of some run failed, which ends the tick of all runs. Each run still
-                # has the state of the previous call. Now only the run whose law fails ends.
+                # The law of one run failed, which ended the tick of all runs. Each run still
+                # has the state of the previous call. Computed one by one, only the run whose
+                # law fails ends.
                 self._lanes = None
             else:
                 return
@@ -127,17 +128,16 @@ def prepare_lanes(
 def group_runs(runs: Sequence[CompiledRun], record_rows: int = 1) -> Iterator[RunGroup]:
     """Divides runs into groups, each of which can be simulated together.
 
-    Runs that differ in numbers only, such as gains, come into the same group. A run that must
-    be computed alone gets a group of its own.
+    Runs that differ in numbers only, such as gains, are in the same group. A run that must be
+    computed alone gets a group of its own.
 
     Args:
         runs: The runs before their first tick (control period).
-        record_rows: Number of ticks, a power of two, of which `CompiledRun.pop_records` must
-            find the records (results of control periods) after each call of
-            `RunGroup.advance_to`.
+        record_rows: Number of ticks whose records (results of control periods) are kept for
+            `CompiledRun.pop_records` after each call of `RunGroup.advance_to`, a power of two.
 
     Yields:
-        The groups, each when the work on the previous one has ended.
+        The groups. Each group is created when the work on the previous group has ended.
     """
     groups: dict[RunStructure, list[int]] = {}
     for index, run in enumerate(runs):

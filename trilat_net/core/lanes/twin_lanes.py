@@ -3,7 +3,7 @@
 The distance between a run and its twins shows whether small disturbances grow (`twins`). The
 run and the twins are computed at once, each in one lane of the vector registers. All of them
 receive the same samples (states of the other arms) at the same times, so the deliveries of the
-simulated network are computed once for all.
+simulated network are computed once for all runs.
 
 Invariant:
     - The states and the records are those of `CompiledRun`, bit for bit, as long as no arm
@@ -30,7 +30,7 @@ from .run_groups import LEAST_RUNS
 
 
 class LaneEndedError(Exception):
-    """Error: a run and its displaced copies (twins) can no longer be simulated together.
+    """Raised if a run and its displaced copies (twins) can no longer be simulated together.
 
     The reason is that an arm left its limits, or that a control law failed. The caller then
     simulates the runs again, one by one.
@@ -65,7 +65,7 @@ class TwinLanes(LaneRun):
     The run has the index (lane) 0.
 
     Args:
-        run: The run before its first tick (control period), which does not advance. See
+        run: The run before its first tick (control period). This object does not advance. See
             `suits_twins`.
         count: Number of runs, the twins included.
         ticks: Number of ticks of each site (arm controller) in the whole run.
@@ -125,7 +125,7 @@ class TwinLanes(LaneRun):
             raise LaneEndedError
 
     def _use_samples(self, end: IntArray) -> int:
-        """Computes which samples the runs use in a block of ticks: all use the same."""
+        """Computes the samples in use in a block of ticks, which are equal for all runs."""
         if self._feed.first.shape[2] == 0:
             age = super()._use_samples(end)
         else:
@@ -165,9 +165,9 @@ class TwinLanes(LaneRun):
 
         Args:
             i: Index of the site (arm controller).
-            columns: Which numbers of a tick's record (result of a control period), see
+            columns: Selects the numbers of a tick's record (result of a control period), see
                 `Layout.columns`.
-            runs: Which runs. Run 0 is the run itself, the others are its twins.
+            runs: Selects the runs. Run 0 is the run itself, and the others are its twins.
 
         Returns:
             The numbers, shape (ticks, columns, runs).
@@ -180,8 +180,8 @@ class TwinLanes(LaneRun):
 class LaneTwin:
     """A run or a slightly displaced copy of it (twin), simulated side by side with others.
 
-    The class has those methods of `CompiledRun` with which the growth of the displacement is
-    measured, so that callers need not know how the runs are simulated.
+    The class has the methods of `CompiledRun` that are needed to measure the growth of the
+    displacement, so callers need not know how the runs are simulated.
 
     Args:
         lanes: The run and its twins.
@@ -198,8 +198,8 @@ class LaneTwin:
     def copy_state(self, other: "LaneTwin") -> None:
         """Makes this run continue from exactly the same state as another run.
 
-        The other run belongs to the same simulation. Both then give the same results, until one
-        of them is displaced.
+        The other run must belong to the same simulation. Both runs then give the same results,
+        until one of them is displaced.
         """
         self.scale_difference(other, 0.0)
 

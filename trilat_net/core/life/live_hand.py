@@ -45,7 +45,7 @@ GRIP_NS = 100_000_000
 GLIDE_NS = 50_000_000
 """Longest time of a glide to the goal, unless a limit of the target prolongs it."""
 
-ANOTHER_HOLDS = "hand: another operator holds the arm"
+ANOTHER_HOLDS = "hand: another one holds the arm"
 OUT_OF_ORDER = "hand: out of order"
 TAKEN = "takes hold"
 RELEASED = "lets go"
@@ -159,8 +159,8 @@ class HandCommand(NamedTuple):
 class HandMemory(NamedTuple):
     """State of the pull of a person or program on an arm, stored between two control periods.
 
-    It states who holds the arm, how firmly, and how the target to which the arm is pulled
-    moves.
+    It states who holds the arm, how firmly, and the motion of the target to which the arm is
+    pulled.
 
     Attributes:
         source: Sender that holds the arm. 0 if nobody holds it; an earlier grip may still be
@@ -384,7 +384,7 @@ def find_glide_ns(between_messages_ns: int, rate_hz: int) -> int:
     message is expected, so that it moves evenly instead of jumping with each message.
 
     Args:
-        between_messages_ns: Time from the previous message to the new one, ns.
+        between_messages_ns: Time from the previous message to the new message, ns.
         rate_hz: Rate of the control loop, Hz.
     """
     period_ns = 1_000_000_000 // rate_hz

@@ -213,8 +213,8 @@ class OwnHand:
     def _view_peers(self, k: int, links: Any, coordinates: int) -> tuple[PeerView, ...]:
         """Returns what the user's program may know about the other arms.
 
-        It sees the states of the other arms that this arm used in the previous control period,
-        after their network delay.
+        The program sees the states of the other arms that this arm used in the previous control
+        period, after their network delay.
 
         Args:
             k: Number of the tick (control period) of the decision.
@@ -316,7 +316,7 @@ class OwnHand:
         """Computes how the user's program pulls the arm in control period k.
 
         Decisions whose reaction time has passed take effect. Then the point to which the arm is
-        pulled moves on by one period.
+        pulled advances by one period.
 
         Args:
             k: Number of the control period. It must follow the period of the previous call.

@@ -68,9 +68,9 @@ _KNOWN = int(Law.KNOWN)
 def rests(site: SiteRow) -> bool:
     """Returns True if the arm is being brought to rest, or is at rest already.
 
-    This is so in the modes WAITING, HOLD, FAULT and STOPPED, but only if the scenario chose
-    `StaleAction.GLIDE` for arms that fall silent. With other choices, these modes do not stop
-    the arm smoothly.
+    This is the case in the modes WAITING, HOLD, FAULT and STOPPED, but only if the scenario
+    chose `StaleAction.GLIDE` for arms that fall silent. With other choices, these modes do not
+    stop the arm smoothly.
     """
     still = site.mode in (_WAITING, _HOLD, _FAULT, _STOPPED)
     return bool(still and site.on_stale == _GLIDE)
@@ -149,7 +149,7 @@ def enter_rest(t_ns: int, mode: int, reason: int, site: SiteRow) -> None:
 
 @leaf
 def _read_rest_reference(site: SiteRow, i: int) -> tuple[float, float]:
-    """Returns where joint i should be while the arm comes to rest, and with which velocity.
+    """Returns the reference position and velocity of joint i while the arm comes to rest.
 
     `_write_rest_reference` says why joint space and task space keep them in different fields.
 
@@ -348,8 +348,8 @@ def add_rest_torque(k: int, t_ns: int, site: SiteRow) -> None:
     The integral term w, in N m, carries a constant load, for example unknown gravity:
 
     - At the start of the rest, it is the part of the previous torque that does not come from
-      the control law. This part is reduced if the arm moves, and the more the faster it moves.
-      It is zero in the first tick of a run, which has no previous torque.
+      the control law. The faster the arm moves, the more this part is reduced. It is zero in
+      the first tick of a run, which has no previous torque.
     - While the arm brakes, w may act in the direction of motion and so delay the stop. Then its
       magnitude is reduced by B |qd| in each tick, at most to zero. qd is the joint velocity.
     - After this tick, `advance_rest` integrates it.
@@ -417,7 +417,7 @@ def advance_rest(site: SiteRow) -> None:
 
 @leaf
 def limit_torque_rate(site: SiteRow) -> None:
-    """Limits the change of the torque from the previous control period to the present one.
+    """Limits the change of the torque from the previous to the present control period.
 
     Before the first period the torque is zero. While an arm comes to rest, the torque against
     the motion of a joint may change by B |qd| more in a period. B is the damping of the arm at

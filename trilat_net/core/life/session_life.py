@@ -127,7 +127,7 @@ def _alignment_s(site: SiteRow) -> float:
     """Returns the duration T of an alignment, s.
 
     An alignment is the smooth return of an arm to the arms that it follows, its peers, in the
-    mode RETURN. An offset is added to the reference, the position that the peers ask for, and
+    mode RETURN. An offset is added to the reference, the position computed from the peers, and
     falls from its start value to zero within the time T. The largest slope of its polynomial is
     1.5 times its mean slope, so with
 
@@ -138,8 +138,8 @@ def _alignment_s(site: SiteRow) -> float:
     Args:
         site: State of the site (the process that runs the arm). `q_held` is the start value of
             the offset, rad or m. For a pose, its last three coordinates are a rotation vector,
-            rad. `align_speed` counts for each linear coordinate, rad/s or m/s, and for the
-            angle of the rotation, rad/s.
+            rad. `align_speed` applies to each linear coordinate, rad/s or m/s, and to the angle
+            of the rotation, rad/s.
     """
     longest_distance = 0.0
     for i in range(count_linear_coordinates(site)):
@@ -164,10 +164,10 @@ def _start_alignment(t_ns: int, site: SiteRow, reason: int, q: Array, qd: Array)
     If a coordinate of the offset, or its angle, is above the limit, the mode does not change,
     and only the reason `ALIGN_LIMIT` is stored.
 
-    An orientation is a rotation vector in the coordinates from 3 on. With the rotation matrices
+    An orientation is a rotation vector in the coordinates 3 to 5. With the rotation matrices
     R_q of the given reference and R_p of that of the peers, its offset is the turn R_q R_p',
     which leads from the peers to the given reference. The angular velocity of the turn is the
-    given one minus that of the peers, which the turn rotates.
+    given angular velocity minus that of the peers, rotated by the turn.
 
     Args:
         t_ns: Time, ns since the epoch, the common start of the session.
@@ -234,15 +234,14 @@ def _extrapolate_reference(site: SiteRow) -> None:
     The reference is the position that the arm follows, computed from the positions of its
     peers, the other arms. It jumps if a peer is dropped because it is lost, or restored when it
     comes back. An alignment then leads smoothly to the new reference. It starts from the
-    reference of the previous tick (period of the control loop), moved on by one period at its
+    reference of the previous tick (period of the control loop), advanced by one period at its
     velocity. An arm at rest needs no such estimate, because it has a reference of its own.
 
-    An orientation, a rotation vector in the coordinates from 3 on, turns at its angular
-    velocity.
+    An orientation, a rotation vector in the coordinates 3 to 5, turns at its angular velocity.
 
     Args:
         site: State of the site, the process that runs the arm. `q_followed` and `qd_followed`
-            are the reference of the previous tick and its velocity; `q_followed` is moved on.
+            are the reference of the previous tick and its velocity; `q_followed` is advanced.
     """
     period_s = 1.0 / site.rate_hz
     for i in range(count_linear_coordinates(site)):
@@ -255,7 +254,7 @@ def _extrapolate_reference(site: SiteRow) -> None:
 
 @leaf
 def is_law_returning(t_ns: int, site: SiteRow) -> bool:
-    """Returns True while the torque blends from the torque at rest to that of the control law.
+    """Returns True while the torque blends from the torque at rest to the torque of the law.
 
     The blend starts when the arm begins to move from rest towards the other arms, and takes
     `RETURN_NS`. An arm that aligns with the others because one of them was lost or came back
@@ -342,8 +341,8 @@ def _apply_order(t_ns: int, site: SiteRow) -> None:
         or (order == _ORDER_RELEASED and site.reason == _STOP)
     ):
         # The brakes of a real arm close when the switch is released, and must not open again.
-        # An arm that was ordered to stop before that was held by a torque, which nobody
-        # supervises any more.
+        # Until then, a torque held the arm that was ordered to stop, but with the switch
+        # released, nobody supervises this torque.
         site.reason = _STOP_RELEASED
     elif stops and mode != _FAULT and mode != _STOPPED:
         reason = _STOP if order == _ORDER_STOP else _RELEASED
@@ -367,8 +366,8 @@ def _apply_order(t_ns: int, site: SiteRow) -> None:
 def _update_mode(t_ns: int, site: SiteRow, links: RowArray) -> None:
     """Changes the mode of an arm after a fault, or because peers fall silent or return.
 
-    A peer is another arm that this arm follows. The first of these changes that applies is made
-    (the code calls the mode RETURN `_ALIGN`):
+    A peer is another arm that this arm follows. The first change in this list that applies
+    takes place (the code calls the mode RETURN `_ALIGN`):
 
         any mode        a fault of the motion                       -> FAULT
         WAITING         all peers are heard                         -> RETURN
@@ -454,10 +453,10 @@ def update_session_life(t_ns: int, site: SiteRow, links: RowArray) -> None:
 
 @leaf
 def _find_offset(t_ns: int, duration_s: float, site: SiteRow, i: int) -> tuple[float, float]:
-    """Returns how far an arm that returns to its peers is still kept away from them.
+    """Returns the remaining offset of an arm that returns to its peers, and the offset's rate.
 
     The peers are the arms that it follows. During the smooth return (an alignment), an offset
-    is added to the position that the peers ask for. It falls to zero within the time T, and is
+    is added to the position computed from the peers. It falls to zero within the time T, and is
     the cubic Hermite polynomial with the start value D, the start rate D' and zero value and
     rate at the end:
 
@@ -480,7 +479,7 @@ def _find_offset(t_ns: int, duration_s: float, site: SiteRow, i: int) -> tuple[f
     T_D_rate = duration_s * site.qd_held[i]
     value_part = D * (1.0 - x * x * (3.0 - 2.0 * x))
     rate_part = T_D_rate * x * remaining * remaining
-    # The derivatives of both parts with respect to x, the second one with the opposite sign.
+    # The derivatives of both parts with respect to x, the second part with the opposite sign.
     slope_of_rate_part = T_D_rate * remaining * (1.0 - 3.0 * x)
     fall_of_value_part = D * 6.0 * x * remaining
     slope = slope_of_rate_part - fall_of_value_part
@@ -497,7 +496,8 @@ def _add_offset(t_ns: int, site: SiteRow) -> None:
 
     For an orientation, the offset is a turn, which follows the rotation of the peers: the
     rotation matrix of the reference is T R, with T of the turn and R of the peers. The angular
-    velocity is that of the turn plus that of the peers, which the turn rotates.
+    velocity is the sum of two terms: the angular velocity of the turn, and that of the peers,
+    rotated by the turn.
 
     Args:
         t_ns: Time, ns since the epoch, the common start of the session.

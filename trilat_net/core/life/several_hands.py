@@ -118,8 +118,8 @@ def _advance_hands(
 ) -> None:
     """Computes how programs pull the arms in the next ticks, for several simulations at once.
 
-    A tick is a period of the control loop. Each simulation has one program, whose decision is
-    made at the start and acts for all these ticks.
+    A tick is a period of the control loop. Each simulation has one program. It decides at the
+    start, and the decision acts for all these ticks.
 
     Args:
         runs: Number of runs.
@@ -247,7 +247,7 @@ class SeveralHands:
             largest_action: Largest absolute value of a number of an action.
 
         Returns:
-            The reason. Empty if there is none.
+            The reason. Empty if the pulls can be computed together.
         """
         if rules.size != AXES:
             return "actions that do not have two numbers"

@@ -2,8 +2,8 @@
 
 In each control period, an arm sends its state, a sample, over a link to each other arm. The
 number of the period is called the stamp of the sample. The model of a link may delay, lose or
-duplicate samples, for example with losses in bursts. `schedule_deliveries` computes the fate of
-all samples up to a given one.
+duplicate samples, for example with losses in bursts. `schedule_deliveries` computes the
+deliveries of all samples up to a given sample.
 
 Invariant (law L4 of docs/develop/design.md):
 
@@ -278,7 +278,7 @@ def select_model(sample: int, stamp_ns: int, link: LinkRow, models: RowArray) ->
         models: Models of the link, in the order in which they come into force.
 
     Returns:
-        True if the sample is the first one of the model.
+        True if the sample is the first sample of the model.
     """
     fresh = sample == 0
     # Move on while a later model has come into force before the sample was sent.
@@ -292,7 +292,7 @@ def select_model(sample: int, stamp_ns: int, link: LinkRow, models: RowArray) ->
 def schedule_deliveries(
     sample: int, link: LinkRow, models: RowArray, dues: IntArray, points: Points
 ) -> None:
-    """Computes when a simulated network link delivers its messages, up to a given one.
+    """Computes when a simulated network link delivers its messages, up to a given message.
 
     Every arm's process sends its state once per control period; such a message is called a
     sample. The model of the link's delay and loss may change at planned times. Each message

@@ -75,7 +75,7 @@ class TraceEnd(IntEnum):
 class LinkModel(NamedTuple):
     """Model of a network link: how long it delays messages, and how many it loses.
 
-    It applies to the messages that are sent from a given time on, until the next model applies.
+    It applies to messages that are sent at or after a given time, until the next model applies.
     The time of sending is called the stamp of a message.
 
     Attributes:
@@ -289,7 +289,7 @@ def next_ar1_value(
         sample: Index m of the sample.
         correlation: Correlation c of neighbours.
         before: Number x_{m-1} of the previous sample.
-        fresh: True: the sequence starts here, with x_m = n_m.
+        fresh: True if the sequence starts here, with x_m = n_m.
     """
     draw = standard_normal(key, sample, DELAY, 0)
     if fresh:
@@ -327,9 +327,8 @@ def trace_delay_us(stamp_ns: int, model: Row, points: Points) -> int:
 
     A trace is a table of delays by time.
 
-    The delay is that of the last point at or before the time at which the sample was sent. A
-    trace that loops starts again after its last point, which lasts as long as the point before
-    it.
+    The last point at or before the time at which the sample was sent gives the delay. A trace
+    that loops starts again after its last point, which lasts as long as the point before it.
 
     Args:
         stamp_ns: Stamp of the sample, the time at which it was sent, ns since the start of the

@@ -13,7 +13,7 @@ Invariant:
     - beta is the LEFT null vector of Upsilon.
     - Factors change along ramps. Every row sums to 1 during a ramp too. The factors at a time
       depend only on this time and the ramps.
-    - If samples from another site stay away, the reference stops. It later returns smoothly
+    - If samples from another site stop arriving, the reference stops. It later returns smoothly
       from the held pose along the polynomial 3 x^2 - 2 x^3, with x from 0 to 1.
 
 Source: Eq. (6), (7), (20) of the paper on which this project is based
@@ -55,7 +55,7 @@ def find_reach(alpha: Array) -> NDArray[np.bool_]:
 
 
 def is_irreducible(alpha: Array) -> bool:
-    """Returns True if every arm follows every other one, directly or through others.
+    """Returns True if every arm follows every other arm, directly or through others.
 
     The stability theorem needs this property of the matrix of weights (dominance matrix).
 
@@ -222,7 +222,7 @@ def fold_ramps(t_ns: int, count: int, ramps: Array) -> int:
     The dominance factors are the weights with which an arm follows the other arms. Each change
     is a ramp in time. The last ramp that has started is kept, because it may still be in
     progress. Its start values are stored in row 0. Therefore `apply_ramps` computes exactly the
-    same factors as before for all times from `t_ns` on.
+    same factors as before for `t_ns` and all later times.
 
     The table changes as follows, if m is the row of the last ramp that has started:
 
@@ -243,7 +243,7 @@ def fold_ramps(t_ns: int, count: int, ramps: Array) -> int:
     """
     last_started = int(np.searchsorted(ramps[1:count, 0], t_ns, side="right"))
     if last_started < 2:
-        return count  # no ramp is older than the last one that has started
+        return count  # no ramp is older than the last ramp that has started
 
     # The factors at the start of the current ramp, from ramp to ramp.
     factors = ramps[0, RAMP_COLUMNS:].copy()
@@ -334,7 +334,7 @@ def update_stale_mode(t_ns: int, site: SiteRow, links: RowArray) -> None:
     if site.mode == _RETURN and elapsed_ns >= site.return_ns:
         site.mode = _RUN
     if site.mode == _RUN:
-        return  # the reference is that of the peers
+        return  # the reference of the peers is used
 
     # With x = 0, in HOLD and BRAKE, the reference stays at q_held.
     x = elapsed_ns / site.return_ns if site.mode == _RETURN else 0.0
@@ -359,8 +359,8 @@ def update_reference(t_ns: int, site: SiteRow, links: RowArray, ramps: Array) ->
         felt   = -sum_j alpha_ij tau_x_j
 
     Here q_j, qd_j and tau_x_j are the position, velocity and exogenous torque in the sample of
-    peer j, alpha_ij is the weight of this peer and alpha_ij' its derivative. The torque `felt`
-    is that of operators and environments on the peers' arms. The terms are added in scenario
+    peer j, alpha_ij is the weight of this peer and alpha_ij' its derivative. `felt` is the
+    torque of operators and environments on the peers' arms. The terms are added in scenario
     order, because another order would change the last bits of the sums.
 
     Args:

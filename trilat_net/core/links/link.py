@@ -16,7 +16,7 @@ Invariant (law L2 of docs/develop/design.md):
       receiver's first tick at or after its due time, but never at the time when it was sent.
     - The actual arrival has no influence if it is before the due time. On a link without a
       simulated delay, a sample is used as soon as it arrives.
-    - The newest sample wins: an older sample never replaces a newer one.
+    - The newest sample wins: an older sample never replaces a newer sample.
 """
 
 from functools import cache
@@ -180,7 +180,7 @@ def release_tick(tick: int, rate_hz: int, link: LinkArrays) -> int:
     )
     kept = dues.shape[0]
     due_ns = dues[tick % kept]  # a ring buffer
-    # The entry of an older sample contains the due time of a newer one.
+    # The entry of an older sample contains the due time of a newer sample.
     oldest_kept = row.scheduled - kept + 1
     if due_ns == LOST or tick < oldest_kept:
         return LOST
@@ -261,8 +261,8 @@ def accept_sample(
     """Stores a message that arrived from another arm, until its simulated delay has passed.
 
     A message (sample) is the state of the other arm. If it arrives after its delivery time, it
-    is used in the present control period, unless a newer one is in use. Messages that cannot be
-    used are counted as rejected, lost or duplicate.
+    is used in the present control period, unless a newer message is in use. Messages that
+    cannot be used are counted as rejected, lost or duplicate.
 
     Args:
         k: Present tick, the number of the receiver's control period.
@@ -326,9 +326,9 @@ def accept_sample(
 def release_sample(k: int, rate_hz: int, link: LinkArrays) -> None:
     """Starts to use the newest message from another arm whose simulated delay has passed.
 
-    If no message is due in control period (tick) k, the previous one stays in use. The function
-    must be called once in each period of the receiver, in order. Otherwise, messages that
-    `accept_sample` stored would stay in the ring buffer (calendar), which has one page per
+    If no message is due in control period (tick) k, the previous message stays in use. The
+    function must be called once in each period of the receiver, in order. Otherwise, messages
+    that `accept_sample` stored would stay in the ring buffer (calendar), which has one page per
     period.
 
     The delivery times of all messages that were sent up to the time t_k of the period are

@@ -3,11 +3,11 @@
 An arm follows several other arms, its peers, each with a certain weight (dominance factor). A
 peer is lost if no sample (received state) of it could be used for some time. The remaining
 peers then get its weight: a slave that followed two users with 0.7 and 0.3 follows the second
-user alone if the first one is lost.
+user alone if the first user is lost.
 
 Invariant:
     - All decisions follow from the samples in use and from the stored state of the site, the
-      process that controls the arm. They are made in each period of the control loop.
+      process that controls the arm. Decisions are taken in each period of the control loop.
     - A site only continues without a peer if the remaining sites all reach each other without
       it, and if the site still follows another peer. Otherwise the arm stops.
     - The reference, the position that the arm follows, never jumps. It moves smoothly to the
@@ -35,7 +35,7 @@ _RESTORED = int(LifeReason.RESTORED)
 
 @leaf
 def _can_drop(lost: int, t_ns: int, site: SiteRow, links: RowArray) -> bool:
-    """Returns True if the site may go on without a peer that is lost.
+    """Returns True if the site may continue without a peer that is lost.
 
     A site is the process that runs one arm. Its peers are the other sites, from which it
     receives samples. The remaining sites are this site and the peers whose samples still
@@ -126,7 +126,7 @@ def _is_orientation_near(back: int, site: SiteRow, links: RowArray) -> bool:
 
 @leaf
 def _is_near(back: int, site: SiteRow, links: RowArray) -> bool:
-    """Returns True if an arm that comes back would move the reference only a little.
+    """Returns True if a returning arm would move the reference only slightly.
 
     The reference, the position that this arm follows, is the mean of the positions of the other
     arms with their weights alpha. The limit of the alignment applies to each linear coordinate,
@@ -167,7 +167,7 @@ def _redistribute_shares(links: RowArray) -> bool:
     """Divides the weights of lost arms among the other arms that this arm follows.
 
     The weight of a followed arm (peer) is its dominance factor alpha. The present peers get the
-    factors of the lost ones in proportion to their own, so that the sum is 1 again:
+    factors of the lost peers in proportion to their own factors, so that the sum is 1 again:
 
         alpha_j / sum alpha,  with the derivative by the quotient rule; 0 for a lost peer
 

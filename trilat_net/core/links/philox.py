@@ -132,7 +132,7 @@ def uniforms(key: DrawKey, sample: int, purpose: int, attempt: int) -> tuple[flo
 def standard_normal(key: DrawKey, sample: int, purpose: int, attempt: int) -> float:
     """Returns a random number with the normal distribution of mean 0 and deviation 1.
 
-    The method is that of Box and Muller. The same arguments always give the same number.
+    The method is due to Box and Muller. The same arguments always give the same number.
 
     Args:
         key: Key of the link for whose samples the number is drawn.

@@ -79,7 +79,8 @@ def compiled(law: T) -> T:
 def is_compiled(law: Any) -> bool:
     """Returns True if a user's control law is compiled to machine code before a run starts.
 
-    This is so if its class is marked with `compiled`, unless Numba, the compiler, is disabled.
+    The class of such a law is marked with `compiled`. The result is False if Numba, the
+    compiler, is disabled.
     """
     config: Any = numba.config
     return bool(getattr(law, "is_compiled", False)) and not config.DISABLE_JIT
@@ -292,8 +293,8 @@ def _compile_law(torque: Callable[..., Any], form: LawForm) -> Any:
             sent: Vectors that this law sends: those for all peers, then those for each peer.
         """
         s = site[0]
-        # A layout that is None stands for vectors that do not exist. Numba knows the layouts
-        # when it compiles, and removes the branch whose type does not apply.
+        # A layout is None if the vectors do not exist. Numba knows the layouts when it
+        # compiles, and removes the branch whose type does not apply.
         from_peers = () if received_dtype is None else received.reshape(-1).view(received_dtype)
         to_peers = () if sent_dtype is None else sent[to_all_size:sent_end].view(sent_dtype)
         to_all = None if to_all_dtype is None else sent[:to_all_size].view(to_all_dtype)[0]
@@ -614,7 +615,7 @@ class CompiledLaw:
     def memory(self) -> list[float]:
         """Numbers that the control law keeps from this control period to the next.
 
-        They are stored in the log, so that `restore` can continue a run from there.
+        They are stored in the log, so that `restore` can continue a run from this period.
         """
         memory: list[float] = self.row[: self._remembered].tolist()
         return memory

@@ -44,12 +44,12 @@ class SentVector(NamedTuple):
 
 
 class _SentEntry(NamedTuple):
-    """One of the numbers that a control law sends to other arms, with its name and unit.
+    """One of the values that a control law sends to other arms, with its name and unit.
 
     Attributes:
-        vector: Vector of the number.
+        vector: Vector that contains the value.
         peer: The only peer that gets the vector, or "" if all peers get it.
-        position: Position of the number in the vector, from 0.
+        position: Position of the value in the vector, from 0.
     """
 
     vector: SentVector
@@ -165,8 +165,8 @@ class LawChannel(NamedTuple):
             peers: Names of the sites that run the other arms, in the order of the scenario.
 
         Yields:
-            The vector to which the number belongs, its receiver, and its position in the
-            vector.
+            The vector that contains the value, the receiver, and the position of the value in
+            the vector.
         """
         to_each = self.select_vectors(per_peer=True)
         vectors_by_receiver = [("", self.select_vectors(per_peer=False))]

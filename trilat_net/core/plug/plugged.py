@@ -54,8 +54,8 @@ def _call_compiled(_context: Any, address: Any, arguments: Any) -> Any:
         """Generates the LLVM code of the call `function(*arguments)` by the function's address.
 
         The address is a value at run time. Therefore the compiled caller does not depend on the
-        function, and is not compiled again for another one. Numba calls `generate` while it
-        compiles the caller. Arguments, result and exceptions are passed as in all functions
+        function, and is not compiled again for another function. Numba calls `generate` while
+        it compiles the caller. Arguments, result and exceptions are passed as in all functions
         that Numba compiles.
 
         Args:
@@ -86,7 +86,7 @@ def _call_compiled(_context: Any, address: Any, arguments: Any) -> Any:
             convention.return_status_propagate(builder, status)
         return context.get_dummy_value()  # Numba represents None by an arbitrary value
 
-    # A Numba type that is called with types of arguments is a signature: this one returns None.
+    # Calling a Numba type with types of arguments gives a signature, here with the result None.
     return types.none(address, arguments), generate
 
 
@@ -185,7 +185,7 @@ def _compile(
 
     Args:
         function: The function of the model, called with the parameters and with a row.
-        form: Layout of the parameters: name and shape of each one, all of them floats.
+        form: Layout of the parameters: name and shape of each parameter. All are floats.
         row: Layout of the row, from which the function reads its input and into which it
             writes its result.
 

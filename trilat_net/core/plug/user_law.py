@@ -170,8 +170,8 @@ class LawInput(NamedTuple):
         gravity: Torque that holds the arm, N m; zeros if its parameters are unknown.
         theta_hat: Estimate in the record, written by the law; otherwise it does not change.
         inertia: M(q), one row per joint, for a law with `needs_model`; otherwise zeros.
-        bias: C qd + G (for a chain with friction, less the torque of its stops), N m, for a law
-            with `needs_model`; otherwise zeros.
+        bias: C qd + G, N m, for a law with `needs_model`; otherwise zeros. For a chain, it
+            includes the friction, minus the torque of the joint stops.
     """
 
     k: int
@@ -418,7 +418,7 @@ def write_memory(law: Any, memory: Sequence[float]) -> None:
 def restore_law(law: UserLaw, site: str, memory: Sequence[float]) -> None:
     """Restores the state that a control law had after a recorded control period.
 
-    A recorded run can then be continued or checked from that period on.
+    A recorded run can then be continued or checked from that period.
 
     Args:
         law: The law, which is changed.

@@ -1,12 +1,12 @@
 """Simulates the arms of several sites in one compiled loop, from the setups of the sites.
 
-The loop does not store every tick (period of the control loop), but the largest values of every
-interval of 50 ms, and sums over the run.
+A tick is one period of the control loop. The loop does not store every tick. It stores the
+largest values of every interval of 50 ms, and sums over the run.
 
 Invariant:
     - Two runs with the same setups may differ by a small disturbance.
       `CompiledRun.scale_difference` multiplies this difference by a factor, for all
-      floating-point numbers of the state. Numbers that are equal in both runs keep their bits.
+      floating-point numbers of the state. Numbers that are equal in both runs do not change.
 """
 
 import math
@@ -92,13 +92,13 @@ class RunTotals(NamedTuple):
 
     Attributes:
         rms_error_rad: Root mean square of the synchronisation error e over the run, in rad. e
-            is the difference between the angle of a joint and its reference. The value is that
-            of the joint of all sites (arm controllers) for which it is largest.
+            is the difference between the angle of a joint and its reference. The value is the
+            largest over all joints of all sites (arm controllers).
         effort_nm: Root mean square of tau - G(q) over sites and joints, in N m. tau is the
             control torque, and G(q) is the torque that compensates gravity in the pose q.
         force_peak_n: Largest force of a wall on an arm, in N. None if there is no wall.
         walls_j: Work of the environments on the arms, in J. An environment is a wall or another
-            body that acts on an arm. None if there is none.
+            body that acts on an arm. None if there is no environment.
     """
 
     rms_error_rad: float
@@ -115,15 +115,15 @@ class RunMemory(NamedTuple):
 
     Attributes:
         tables: Arrays of all sites.
-        progress: How far each site is, shape (N,), see `ProgressRow`.
-        next_samples: For each site and peer the next sample to accept, shape (N, P).
+        progress: Progress of each site, shape (N,), see `ProgressRow`.
+        next_samples: Next sample to accept, for each site and peer, shape (N, P).
         sent: Latest records (results of control periods) of the sites.
         peaks: Peaks in intervals of 50 ms, see `run_until`.
         sums: Sums over the records, shape (N,), see `SumsRow`.
         settled_rad: Position error below which an arm counts as settled, rad.
-        laws: Numbers of compiled laws that are not a part of the kernel. None if no site has
-            such a law.
-        compiled_laws: These laws, by the index of their site.
+        laws: Gains and memory of compiled laws that are not part of the kernel. None if no site
+            has such a law.
+        compiled_laws: The compiled laws themselves, by the index of their site.
         has_plain_law: True if a site has a law in plain Python.
         feed: Inputs of a recorded run.
     """
@@ -159,17 +159,17 @@ class CompiledRun:
         keep: Number of recent records of each site that are stored for `pop_records`.
         inputs: Inputs of a recorded run that is repeated. Without them, every sample arrives
             promptly.
-        hands: Live operators by the index of their site. They must be empty if there are inputs
-            of a recorded run, which contain the actions.
+        hands: Live operators by the index of their site. Must be empty if `inputs` is given,
+            because the inputs contain the actions.
         plants: Users' programs that move external arms, by the index of their site.
 
     Attributes:
         layouts: Layout of the records of each site.
         rates_hz: Tick rate of each site, in Hz.
-        duration_s: As the argument.
+        duration_s: Duration of the whole run, in s.
         ran_s: Time up to which `advance_to` has executed the run, in s.
-        pending_deliveries: Function that brings the links up to date, if the run was advanced
-            together with other runs. It is called before the run continues alone.
+        pending_deliveries: Function that updates the state of the links, if the run was
+            advanced together with other runs. It is called before the run continues alone.
     """
 
     def __init__(
@@ -231,7 +231,8 @@ class CompiledRun:
 
         Returns:
             Ring buffers for at least as many records per site as are needed. Their length is a
-            power of two, so that the compiled loop finds the place of a tick with a bit mask.
+            power of two, so that the compiled loop finds the position of a tick with a bit
+            mask.
         """
         site_count = len(self.layouts)
         fastest_hz = int(self._progress["rate_hz"].max())
@@ -309,7 +310,7 @@ class CompiledRun:
         )
 
     def _update_links(self) -> None:
-        """Brings the links up to date, if the run was advanced together with other runs."""
+        """Updates the state of the links, if the run was advanced together with other runs."""
         deliver = self.pending_deliveries
         self.pending_deliveries = None
         if deliver is not None:
@@ -345,9 +346,9 @@ class CompiledRun:
         """Executes the planned ticks up to a time, and calls users' programs in between.
 
         The programs act as operators, or compute the motion of an arm (plants). A program needs
-        the state of the arm at a certain time. Therefore the compiled loop pauses before the
-        tick (control period) of this time, and the program is called. Between two pauses, the
-        loop executes many ticks at once.
+        the state of the arm at a certain time, so the compiled loop pauses before the tick
+        (control period) of this time to call the program. Between two pauses, the loop executes
+        many ticks at once.
 
         Args:
             last_ns: Time of the last tick to be executed, in ns after the epoch, the common
@@ -363,12 +364,12 @@ class CompiledRun:
             self._step_piece(next_pause_ns - 1)  # up to the last tick before the pause
         if self.diverged_s is None:
             self._step_piece(last_ns)
-        # The arms of plants move on by the last tick, as all other arms did within the loop.
+        # Plants advance their arms by the last tick, as all other arms did within the loop.
         for i in self._plants:
             self._move_plant(i)
 
     def _move_plant(self, i: int) -> int:
-        """Lets a user's own program compute the motion of an arm in one control period.
+        """Calls a user's program to compute the motion of an arm in one control period.
 
         Such a program is called a plant, and a control period a tick. The plant moves once per
         tick, by the control torque of the last executed tick. The new state of the arm is
@@ -383,7 +384,7 @@ class CompiledRun:
         """
         next_tick = int(self._progress[i]["tick"])
         plant = self._plants[i]
-        # If no tick was executed since the last call, the arm has moved this far already.
+        # If no tick was executed since the last call, the arm has already moved this far.
         has_new_torque = next_tick > self._plant_ticks[i]
         if has_new_torque:
             last_record = self._last_row(i)
@@ -405,7 +406,7 @@ class CompiledRun:
         return tick_ns(next_tick + 1, int(self._progress[i]["rate_hz"]))
 
     def _request_actions(self, i: int) -> int:
-        """Requests the next actions of an operator, if the site has executed the previous ones.
+        """Requests the next actions of an operator, if the previous actions were executed.
 
         The operator is a program that answers with its actions for some ticks (periods of the
         control loop) in advance. They are written to the inputs of the compiled loop.
@@ -431,9 +432,9 @@ class CompiledRun:
     def _step_piece(self, last_ns: int) -> None:
         """Executes the planned ticks up to a time for which no user's program is needed.
 
-        These programs are those of operators and plants (simulated arms). Control laws are
-        called. If a user's law is plain Python, the loop over the ticks (control periods) runs
-        in Python too. Otherwise the whole loop is compiled.
+        Such programs are operators and plants (simulated arms). Control laws are called. If a
+        user's law is plain Python, the loop over the ticks (control periods) runs in Python
+        too. Otherwise the whole loop is compiled.
 
         Args:
             last_ns: Time of the last tick to be executed, in ns after the epoch, the common
@@ -464,17 +465,17 @@ class CompiledRun:
         except LawFailed:
             raise
         except Exception as error:
-            # A compiled law may raise any error. Each law knows whether the error is its own.
+            # A compiled law may raise any error. Each law can tell whether it raised the error.
             failures = [law.find_failure(error) for law in compiled]
             law_failures = filter(None, failures)
-            # An error that comes from no law is raised unchanged.
+            # An error that no law caused is raised unchanged.
             raise next(law_failures, error) from None
 
     def _run_plain_until(self, last_ns: int) -> None:
         """Executes ticks in a Python loop, because a control law is not compiled.
 
-        The loop equals that of the compiled function `run_until`. Within each tick, the law is
-        called after the measurements (`sense_site`) and before the motion (`finish_site`).
+        The loop does the same as the compiled function `run_until`. Within each tick, the law
+        is called after the measurements (`sense_site`) and before the motion (`finish_site`).
 
         Args:
             last_ns: Time of the last tick, in ns after the epoch.
@@ -516,10 +517,10 @@ class CompiledRun:
                     last_ns = t_ns
 
     def advance_to(self, until_s: float) -> None:
-        """Continues the run until it is as long as a run with a duration of `until_s` seconds.
+        """Continues the run up to the last tick of a run that lasts `until_s` seconds.
 
         Nothing happens if a site (arm controller) has diverged, that is, if its arm has left
-        its limits. Nothing happens either if the run is already that long.
+        its limits. Nothing happens either if the run has already passed this tick.
         """
         if until_s <= self.ran_s or self.diverged_s is not None:
             return
@@ -538,12 +539,12 @@ class CompiledRun:
         """Sets how many ticks each site will execute in total, and allocates memory for them.
 
         A tick is a period of a site's control loop. The memory for the largest values in
-        intervals of 50 ms (buckets), and for the actions of live operators, becomes longer. The
-        values in it are kept.
+        intervals of 50 ms (buckets), and for the actions of live operators, is enlarged. Values
+        that it contains are kept.
 
         Args:
             ticks: Total number of ticks of each site (arm controller), in the order of the
-                scenario. Ticks that have been executed already are included.
+                scenario. Ticks that have already been executed are included.
         """
         progress: Row
         for progress, planned_ticks in zip(self._progress, ticks, strict=True):
@@ -582,8 +583,8 @@ class CompiledRun:
     def has_programs(self) -> bool:
         """True if users' own programs act as operators, or compute the motion of an arm.
 
-        The run cannot be copied then, because the state of such programs is not part of its
-        state.
+        The run cannot be copied then, because the state of such programs is not part of the
+        state of the run.
         """
         return bool(self._hands or self._plants)
 
@@ -647,7 +648,7 @@ class CompiledRun:
     def displace(self, field: str, offsets: Array) -> None:
         """Adds offsets to one field of the state of all sites, for example to the joint angles.
 
-        Repeated runs with a small disturbance are disturbed in this way.
+        Twins, repeated runs with a small disturbance, are disturbed in this way.
 
         Args:
             field: Name of the field, for example "q" for the joint angles or "qd" for the
@@ -658,7 +659,7 @@ class CompiledRun:
         self._tables.site[field][:, 0, : offsets.shape[1]] += offsets
 
     def measure_distance(self, other: "CompiledRun", field: str) -> float:
-        """Returns how far the state of this simulation is from that of another, in one field.
+        """Returns the distance between the states of this simulation and another, in one field.
 
         Args:
             other: The other run of the same scenario.
@@ -679,8 +680,8 @@ class CompiledRun:
 
         Returns:
             The joint angles q in rad, shape (100, N, n), and the estimated parameters
-            theta_hat, shape (100, N, P). N is the number of sites (arm controllers), n that of
-            joints, and P that of parameters.
+            theta_hat, shape (100, N, P). N is the number of sites (arm controllers), n the
+            number of joints, and P the number of parameters.
         """
         q = []
         theta_hat = []
@@ -714,7 +715,7 @@ class CompiledRun:
 
     @property
     def buckets(self) -> tuple[Array, ...]:
-        """Course of the run in intervals of 50 ms, with one array for each site.
+        """Largest errors and speeds in intervals of 50 ms, with one array for each site.
 
         Each array has the shape (intervals, 3 n), where n is the number of joints. A row
         contains the largest synchronisation error |e| of each joint in rad, the largest speed
@@ -796,7 +797,7 @@ class CompiledRun:
 
     @property
     def tau_x(self) -> list[Array]:
-        """External torque on each arm in the last control period, in N m, not of the motors.
+        """External torque on each arm in the last control period, in N m, without the motors.
 
         The list has one array of the shape (n,) per site, for n joints. Operators and
         environments exert the torque.
@@ -808,7 +809,7 @@ class CompiledRun:
         """Returns the records that each site (arm controller) has produced since the last call.
 
         A record is the stored result of one tick (control period). Only a limited number of
-        recent records is stored (see `keep` of the constructor); older ones are lost.
+        recent records is stored (see `keep` of the constructor). Older records are lost.
 
         Returns:
             For each site, the nominal times of the records in ns, shape (K,), and the records,
@@ -829,14 +830,14 @@ class CompiledRun:
 
     @property
     def is_finished(self) -> bool:
-        """True if the run has the whole duration of its scenario, or if an arm has diverged."""
+        """True if the run has reached the end of its scenario, or if an arm has diverged."""
         return self.ran_s >= self.duration_s or self.diverged_s is not None
 
     def find_batch_end(self) -> float:
-        """Returns the time up to which the run may go on before its records are read, in s.
+        """Returns the time up to which the run may continue before its records are read, in s.
 
-        In this time no site (arm controller) produces more records than the run stores, see
-        `keep` of the constructor. The time is at most the duration of the scenario.
+        Up to this time, no site (arm controller) produces more records than the run stores, see
+        `keep` of the constructor. The result is at most the duration of the scenario.
         """
         fastest_hz = int(self._progress["rate_hz"].max())
         return min(self.ran_s + (self._keep - 1) / fastest_hz, self.duration_s)

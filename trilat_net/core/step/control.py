@@ -65,8 +65,8 @@ def control_errors(
 def regressor_transpose_times(Y: tuple[Five, Five], r: Vector) -> Five:
     """Computes Y' r, which drives the parameter estimate of the adaptive control law.
 
-    Y is the regressor, the 2 x 5 matrix that gives, times the five parameters of the planar
-    arm, its torque; r is the filtered tracking error.
+    Y is the regressor, the 2 x 5 matrix whose product with the five parameters of the planar
+    arm is its torque. r is the filtered tracking error.
 
     Args:
         Y: Regressor of the planar arm, two rows of five numbers. Y theta is the joint torque of
@@ -158,9 +158,9 @@ def adaptive_torque(
 def robust_torque(rho: float, width: float, r: float) -> float:
     """Returns rho r / sqrt(r^2 + width^2), a torque that opposes a bounded disturbance.
 
-    It is a smooth form of rho sign(r), and the law subtracts it. If the disturbance d of the
-    joint has at most the magnitude rho, the power (d - robust torque) r that remains is at most
-    ROBUST_RESIDUE rho width.
+    The robust torque is a smooth form of rho sign(r), and the law subtracts it. If the
+    disturbance d of the joint has at most the magnitude rho, the power (d - robust torque) r
+    that remains is at most ROBUST_RESIDUE rho width.
 
     Args:
         rho: Largest robust torque, N m.

@@ -1,4 +1,4 @@
-"""Computes a fingerprint of the platform's arithmetic, to tell where runs repeat exactly.
+"""Computes a fingerprint of the platform's arithmetic, which tells if runs repeat exactly.
 
 Results of the same program can differ in the last bit between platforms. A log of a run
 contains the fingerprint of the platform that wrote it. When a log is verified, the run is
@@ -32,7 +32,7 @@ _LINK = LinkModel(kind=DelayKind.GAMMA, extra=2.7, scale=900.0, playout_us=2_000
 def _compute_sines(angles: Array, results: Array) -> None:
     """Computes the sine and the cosine of many angles, whose bits the fingerprint covers.
 
-    They are the operations in which platforms are most likely to differ.
+    These are the operations in which platforms are most likely to differ.
 
     Args:
         angles: The angles, shape (n,), rad.

@@ -30,7 +30,7 @@ from .ticks import BUCKETS_PER_S, Mode, tick_ns
 from .vectors import Array, IntArray, Row, RowArray
 
 NEVER_NS = 2**63 - 1
-"""Stands for the time of the next control period of an arm that has made all of them, ns."""
+"""Replaces the time of the next control period once an arm has completed its run, ns."""
 
 PROGRESS_DTYPE = row_dtype("progress", {})
 """The layout of a site's progress, see `ProgressRow`."""
@@ -92,7 +92,7 @@ def max_over_joints(buckets: Array) -> Array:
 
 @leaf
 def first_sent_column(s: SiteRow) -> int:
-    """Returns the column of a record at which the numbers begin that the control law sends.
+    """Returns the first column of a record with values that the control law sends.
 
     A record is the row of floats that an arm's process computes in one control period.
     """
@@ -110,12 +110,12 @@ class ReplayedInputs(NamedTuple):
             the shape is (N, P, K + 1). If K is 0, each sample arrives at the first tick after
             it was sent.
         samples: The ticks in which the peers sent the samples, in the order of arrival.
-        hands: What the person or program that moves the arm does, by site and tick. The shape
+        hands: Actions of the person or program that moves the arm, by site and tick. The shape
             is (N, K, 1 + 2 m). The numbers are the firmness of the grip from 0 to 1, the m
             coordinates of the target, and the target one second later. If K is 0, nobody holds
             the arms.
         hand_indices: For each site the index of this person or program among its operators and
-            environments, shape (N,). -1 if there is none.
+            environments, shape (N,). -1 if nobody moves the arm.
     """
 
     first: IntArray
@@ -199,14 +199,14 @@ def _accept_prompt_records(
         t_ns: Time t of this tick, ns since the epoch, the common start of the session.
         rate_hz: Tick rate of the receiver, Hz.
         peer: State of the peer.
-        records: The number of records that the peer has made.
-        next_sample: The first record that was not accepted yet, by its tick of the peer.
+        records: Number of records that the peer has written.
+        next_sample: Tick of the peer's first record that has not been accepted yet.
         sent: The last records of the peer, in a ring buffer: record n is at n modulo its
             length.
         link: The link from the peer.
 
     Returns:
-        The first record that is not accepted yet.
+        The tick of the peer's first record that is still not accepted.
     """
     # The length of the ring is a power of two, so a modulo is a mask of the lower bits.
     ring_mask = sent.t_ns.shape[0] - 1
@@ -222,7 +222,7 @@ def _accept_prompt_records(
 def _apply_recorded_hand(
     i: int, k: int, actors: TorqueSourceRows, feed: ReplayedInputs
 ) -> None:
-    """Repeats what a person did with an arm in one control period of a recorded run.
+    """Repeats the action of a person on an arm in one control period of a recorded run.
 
     A person or program that moves the arm during the run is called a live hand. It is simulated
     by a spring, which pulls the arm to a target. The grip (a factor of the force), the target,
@@ -261,7 +261,7 @@ def update_peaks(
     peaks: Array,
     sums: SumsRow,
 ) -> None:
-    """Updates the largest errors and speeds of an arm, and its sums of errors, by a record.
+    """Updates the largest errors and speeds of an arm, and its sums of errors, for a record.
 
     A simulation of many runs keeps these statistics instead of the records. The largest values
     are kept for each interval of time (bucket).
@@ -286,7 +286,8 @@ def update_peaks(
         angle = 0.0
         if i < s.shared:
             e = row[pose + i] - row[reference + i]
-            if i >= POSITION and s.task:  # an orientation: differences of vectors are no error
+            # For an orientation, the difference of rotation vectors is not an error.
+            if i >= POSITION and s.task:
                 e = s.e[i]
         if i < s.joints:
             speed = abs(row[s.joints + i])
@@ -305,8 +306,9 @@ def update_peaks(
 def _advance_bucket(progress: ProgressRow) -> None:
     """Advances to the next interval of time (bucket) for which largest values are kept.
 
-    This happens once an arm has made all control periods of the present interval. The periods
-    are counted in parts of the interval, because an interval may not be a multiple of a period.
+    This happens once an arm has completed all control periods of the present interval. Periods
+    are counted in fractions of the interval, because an interval need not be a multiple of a
+    period.
 
     Args:
         progress: Progress of the site (the process that runs the arm); changed.
@@ -344,7 +346,7 @@ def _put_source_torque(
     sampled: int,
     torque: Array,
 ) -> None:
-    """Computes the torque of operators and environments at the motion in an arm's record.
+    """Computes the torque of operators and environments for the motion in an arm's record.
 
     An operator is a model of a person who moves the arm, and an environment a wall or a damper.
 
@@ -354,7 +356,7 @@ def _put_source_torque(
         chain: Data of the joints, one row per joint. None for the planar two-link arm.
         row: Floating-point numbers of the record. They begin with joint angles and velocities.
         actors: Operators and environments, one row for each.
-        table: Their tables, for example of recorded torques.
+        table: Numerical data of all operators and environments, for example recorded torques.
         sampled: 1 for those with a torque that is constant during a control period, 0 for all
             others.
         torque: Receives the torque, shape (n,), N m.
@@ -452,7 +454,7 @@ def update_sums(
 
 
 class LawArrays(NamedTuple):
-    """Arrays by which the compiled simulation calls users' control laws, for all N arms.
+    """Arrays with which the compiled simulation calls users' control laws, for all N arms.
 
     They contain the addresses of the compiled laws, and the numbers that the laws keep and
     send.
@@ -481,22 +483,22 @@ def _compute_torque(
     """Computes the torque of an arm's control law in the present control period (tick).
 
     A law is built in, or a user wrote it. `torque_stage` computes the torque of built-in laws,
-    and does nothing for users' laws. `law_stage` calls a user's law that was compiled. The
-    driver of the simulation has called a user's law in plain Python before.
+    and does nothing for users' laws. `law_stage` calls a user's law that was compiled. A user's
+    law in plain Python has been called by the driver of the simulation before.
 
     Args:
         i: Index of the site, the process that runs one arm.
         progress: Progress of the site, with the tick and its nominal time.
         arrays: Arrays of all sites.
         chain: Data of the joints, one row per joint. None for the planar two-link arm.
-        laws: The users' compiled laws. None if no site has one. The address of a law is 0 for a
-            site that has no compiled law.
+        laws: The users' compiled laws. None if no site has such a law. The address of a law is
+            0 for a site that has no compiled law.
     """
     if laws is None:
         torque_stage(arrays.site[i], chain)
         return
     # The channel contains the numbers that other sites' laws send to this law. A site with a
-    # compiled law has one.
+    # compiled law has such a channel.
     channel = channel_of(arrays.channel, i)
     is_compiled = laws.addresses[i] != 0
     if not is_compiled or channel is None:
@@ -519,13 +521,13 @@ def _compute_torque(
 def _record_sent(s: SiteRow, i: int, row: Array, laws: LawArrays | None) -> None:
     """Writes the numbers that a control law sends to other arms into the record of its arm.
 
-    The other arms of the simulation read them from there.
+    The other arms of the simulation read the values from this record.
 
     Args:
         s: State of the site (the process that runs the arm).
         i: Index of the site.
         row: Floating-point numbers of the record; changed.
-        laws: Compiled control laws that users wrote. None if there are none.
+        laws: Compiled control laws that users wrote. None if there are no such laws.
     """
     if laws is not None:
         first = first_sent_column(s)
@@ -547,7 +549,7 @@ def sense_site(
 
     This part accepts the messages (states) of the other arms, and computes the reference, which
     is the position to follow, the errors and the parameter estimate. The messages arrive as in
-    a recorded run, or without delay if there is none.
+    a recorded run, or without delay if no run is repeated.
 
     Args:
         i: Index of the site.
@@ -639,7 +641,7 @@ def finish_site(
         sums: Sums over the records, see `SumsRow`; updated.
         arrays: Arrays of all sites; updated.
         chain: Data of the joints, one row per joint. None for the planar two-link arm.
-        laws: Compiled control laws that users wrote. None if there are none.
+        laws: Compiled control laws that users wrote. None if there are no such laws.
 
     Returns:
         The mode of the site, a member of `Mode`.
@@ -663,7 +665,7 @@ def finish_site(
         record=record,
     )
     _record_sent(site[0], i, record, laws)
-    site_sums: SumsRow = sums[i]  # one view for both: a view of a row costs time
+    site_sums: SumsRow = sums[i]  # one view for both uses, because creating a view takes time
     update_peaks(
         row=record,
         t_ns=t_ns,
@@ -730,7 +732,7 @@ def run_until(
         arrays: Arrays of all sites, see `SiteArrays.stack`.
         chains: The field `chain` of `arrays` once more. If this argument is None, Numba does
             not compile the functions for chains of joints.
-        laws: Compiled control laws that users wrote. None if there are none.
+        laws: Compiled control laws that users wrote. None if there are no such laws.
     """
     count = progress.shape[0]
     while True:

@@ -52,8 +52,8 @@ from ...signals import end_process_at_signals
 P = ParamSpec("P")
 R = TypeVar("R")
 
-# With little address space LLVM and OpenBLAS would retry for ever without reacting to signals,
-# or abort.
+# With little address space, LLVM and OpenBLAS would abort, or retry for ever without reacting
+# to signals.
 with suppress(OSError, IndexError):  # only Linux has the file
     _limits = Path("/proc/self/limits").read_text("utf-8")
     _address_space = _limits.partition("Max address space")[2].split()[0]
@@ -95,7 +95,8 @@ def _core_digest() -> str:
 def _writable_cache() -> Path | None:
     """Returns the directory in which compiled functions are stored, and creates it if needed.
 
-    None if it cannot be written. Compiled functions are then kept in memory only.
+    The result is None if the directory is not writable. Compiled functions are then kept in
+    memory only.
     """
     try:
         directory = _cache_root() / "trilat-net" / _core_digest()
@@ -115,7 +116,8 @@ def is_core_cached() -> bool:
     """Returns True if a simulation can start at once, because its code was compiled earlier.
 
     Otherwise the first run takes longer, and a command can say so beforehand. Only the function
-    `kernel.site_tick` is looked for on disk: it is compiled last, so the others are there too.
+    `kernel.site_tick` is looked for on disk. It is compiled last, so the other functions are
+    there too.
     """
     folders = [_CACHE, _SHIPPED if _ships else None]
     for folder in folders:
@@ -147,7 +149,7 @@ class _CompilingNotice(event.Listener):
     def __init__(self) -> None:
         self.is_reported = False
         self.report: Callable[[str], None] = partial(print, file=sys.stderr, flush=True)
-        # Compilations may be nested: each one restores the handling of signals before it.
+        # Compilations may be nested, so each one restores the signal handlers that it found.
         self._restorers: list[Callable[[], None]] = []
 
     def on_start(self, event_data: Any) -> None:
@@ -207,17 +209,17 @@ _LEAF_OPTIONS: Any = {
     **_OPTIONS,
 }
 _INNER = "within"
-"""Marks kept code as that of an inner leaf."""
+"""Marks stored code as the code of an inner leaf."""
 _NO_LLVM_CODE = parse_assembly("").as_bitcode()
-"""An empty module."""
+"""An empty LLVM module."""
 
 
 @cache
 def _hash_folder(folder: Path) -> str:
     """Returns a hash of all Python files of a folder, to detect outdated machine code.
 
-    Functions outside of the core use it. If a file changes, so does the hash, and machine code
-    that was stored with the old hash is not used any more.
+    It is used for functions outside the core. If a file changes, so does the hash, and machine
+    code that was stored with the old hash is no longer used.
     """
     digest = hashlib.sha256()
     for source in sorted(folder.glob("*.py")):
@@ -228,8 +230,9 @@ def _hash_folder(folder: Path) -> str:
 class _LeafLocator:
     """Tells Numba where the machine code of a function is stored, and when it is out of date.
 
-    By default, Numba compares the time of the function's file. Here it compares a hash of all
-    files in the folder of the function, because the function may call others in them.
+    By default, Numba compares the time of the function's file. With this class, it compares a
+    hash of all files in the folder of the function, because the function may call functions of
+    these files.
     """
 
     def __init__(self, function: Callable[..., Any], file: str) -> None:
@@ -290,7 +293,7 @@ class _LeafCacheImpl(CompileResultCacheImpl):
 
         library = _LeafLibrary(context.codegen(), name)
         library.is_inner = True
-        # No machine code is to be made: the library counts as complete with its LLVM code.
+        # No machine code is needed, so the library counts as complete with its LLVM code.
         library._finalized = True
         library._final_module = parse_bitcode(code)
         # The order of `CompileResult._reduce`.
@@ -317,8 +320,8 @@ class _LeafCacheImpl(CompileResultCacheImpl):
 class _CompressedFiles(IndexDataCacheFile):
     """The cache files of one compiled function, compressed to a quarter of their size.
 
-    Numba numbers the files. Therefore two processes may write different code into one file.
-    Here the name of a file contains a hash of its key.
+    Numba numbers the files. Therefore two processes may write different code into one file. In
+    this class, the name of a file contains a hash of its key instead.
     """
 
     def save(self, key: Any, code: Any) -> None:
@@ -421,8 +424,8 @@ class _LeafCache(FunctionCache):
     def save_inner(self, argument_types: Any, result: Any) -> None:
         """Stores the LLVM code of an inner leaf, which only other compiled functions can call.
 
-        The code is kept in files of its own, besides those of the machine code that Python
-        calls. Nothing is stored if there is no cache directory in which files can be written.
+        The code is kept in its own files, separate from the machine code that Python calls.
+        Nothing is stored if there is no cache directory in which files can be written.
 
         Args:
             argument_types: Numba's types of the arguments.
@@ -442,7 +445,7 @@ class _LeafLibrary(JITCodeLibrary):
 
     A function that only other compiled functions call (an inner leaf) is optimised once, as a
     part of its caller. Numba would also optimise it alone, and add a wrapper for calls from
-    Python. This class saves both, which is half of the time of compilation.
+    Python. This class skips both steps, which halves the time of compilation.
     """
 
     is_inner = False
@@ -452,7 +455,7 @@ class _LeafLibrary(JITCodeLibrary):
             module = self._get_module_for_linking()
             return self.name, _INNER, module.as_bitcode()
         # Numba would store the LLVM code too, which is larger than the machine code. A compiled
-        # caller loads that of the inner leaf.
+        # caller loads the LLVM code of the inner leaf instead.
         name, kind, (machine_code, _) = super().serialize_using_object_code()
         return name, kind, (machine_code, _NO_LLVM_CODE)
 
@@ -471,7 +474,7 @@ def _as_inner(result: Any) -> Any:
     """Makes a function that exists only as LLVM code known to its compiled callers.
 
     Numba finds a called function by its entry point, the Python object of its machine code.
-    LLVM code has none, so a new object takes its place.
+    LLVM code has no entry point, so a new object takes its place.
     """
     result = result._replace(entry_point=object())
     context = result.target_context
@@ -486,7 +489,7 @@ class _LeafCompiler(Compiler):
     inner leaf, and becomes a part of its caller.
 
     Attributes:
-        depth: Number of compiled callers that need leaves now, one within another.
+        depth: Number of nested callers whose compilation is in progress and needs leaves.
         library_class: Class of the code of a leaf that is not an inner leaf.
         has_distinct_arguments: True if the arguments of a leaf that is not an inner leaf never
             overlap in memory.
@@ -523,7 +526,7 @@ class _LeafCompiler(Compiler):
             state.flags.no_cpython_wrapper = True
             state.flags.no_cfunc_wrapper = True
 
-        # A leaf that Numba compiles meanwhile is an inner leaf.
+        # A leaf that Numba compiles during this compilation is an inner leaf.
         with _compiling_caller():
             result = super().compile_extra(function)
 
@@ -539,7 +542,7 @@ class _LeafCompiler(Compiler):
 
 @contextmanager
 def _compiling_caller() -> Iterator[None]:
-    """Makes each leaf an inner leaf that Numba compiles or looks up within the context."""
+    """Treats each leaf that Numba compiles or looks up within the context as an inner leaf."""
     _LeafCompiler.depth += 1
     try:
         yield
@@ -551,9 +554,9 @@ def _prefer_wide_vectors(llvm_code: str) -> str:
     """Asks LLVM to use vector instructions of 512 bits in the loops of a module.
 
     By default LLVM chooses 256 bits even if a processor has longer registers, because some
-    processors lower their clock rate for these. The arithmetic here gains more than that loses.
-    Processors without such registers are not affected. The text is changed, because llvmlite
-    cannot set an attribute that has a value.
+    processors lower their clock rate for these. The arithmetic of this program gains more from
+    the longer registers than it loses. Processors without such registers are not affected. The
+    text is changed, because llvmlite cannot set an attribute that has a value.
 
     Args:
         llvm_code: The module as text.
@@ -596,8 +599,8 @@ class _LaneCompiler(_LeafCompiler):
     """Compiles a function that computes several simulations side by side, with SIMD.
 
     SIMD instructions process vectors. Each simulation has a lane, a position in the vectors.
-    The compiler may assume that the arguments do not overlap in memory, without which it would
-    not use vector instructions.
+    The compiler may assume that the arguments do not overlap in memory. Without this
+    assumption, it would not use vector instructions.
     """
 
     library_class = _LaneLibrary
@@ -641,11 +644,11 @@ class _Leaf(CPUDispatcher):
         self._compiler._get_implementation = self._choose_implementation
 
     def _choose_implementation(self, arguments: tuple[Any, ...], _keywords: Any) -> Any:
-        """Returns the Python function to compile for given types of arguments. Numba calls it.
+        """Returns the Python function to compile for given types of arguments.
 
         This is the function (leaf) itself, unless the arguments belong to several simulations
         side by side (lanes) and the function has another implementation for these, see
-        `set_lane_form`.
+        `set_lane_form`. Numba calls this method.
         """
         if self.choose_lane_form is not None and any(map(_is_in_lanes, arguments)):
             return self.choose_lane_form(arguments)
@@ -663,8 +666,9 @@ class _Leaf(CPUDispatcher):
         """
         plain_arguments = tuple(map(types.unliteral, arguments))
         plain_keywords = {name: types.unliteral(kind) for name, kind in keywords.items()}
-        # The caller may be a function of Numba's own, such as one of a user's law. It too gets
-        # an inner leaf: a reference to machine code would be missing when it is loaded again.
+        # The caller may be a plain function of Numba, such as a user's law. It also gets an
+        # inner leaf, because a reference to machine code would be missing when the caller is
+        # loaded again.
         with _compiling_caller():
             return super().get_call_template(plain_arguments, plain_keywords)
 
@@ -675,13 +679,13 @@ class _Leaf(CPUDispatcher):
         compiled because another leaf calls it, is LLVM code, which cannot be executed. Both are
         entered into `overloads`, the table in which compiled callers look up a function by the
         types of its arguments. Numba's own method also enters the machine code into the table
-        of functions that Python can call; an inner leaf must not get there. Numba calls this
+        of functions that Python can call, where an inner leaf must not appear. Numba calls this
         method.
 
         Args:
             result: Numba's description of the compiled form.
         """
-        # A library of Numba's own class, and not of `_LeafLibrary`, lacks the attribute.
+        # A library of Numba's own class, unlike a `_LeafLibrary`, lacks the attribute.
         is_inner = getattr(result.library, "is_inner", False)
         if not is_inner:
             super().add_overload(result)
@@ -723,11 +727,11 @@ class _Leaf(CPUDispatcher):
     def _load_or_compile_inner(self, argument_types: Any, return_type: Any) -> Any:
         """Returns the function as LLVM code, which becomes a part of a compiled caller.
 
-        The code is loaded from the cache on disk if it is there. Otherwise the function is
-        compiled, and its code is stored.
+        The code is loaded from the cache on disk if the cache contains it. Otherwise the
+        function is compiled, and its code is stored.
         """
-        # A leaf for several runs side by side (lanes) is a part of one function for each
-        # structure of runs, so its code would be stored without being loaded again.
+        # A leaf for several runs side by side (lanes) is compiled into one larger function for
+        # each structure of runs. Its own code is not stored, because it would never be loaded.
         is_stored = not any(map(_is_in_lanes, argument_types))
         if is_stored:
             loaded = self._cache.load_inner(argument_types, self.targetctx)
@@ -791,8 +795,8 @@ def _make_leaf(function: Callable[P, R], compiler: type[_LeafCompiler]) -> Calla
 def loop_leaf(function: Callable[P, R]) -> Callable[P, R]:
     """Marks a function with a long loop that calls other leaves (decorator).
 
-    All leaves that the loop calls become part of its code. This saves the time in which the
-    descriptions of arrays are passed to them. Python calls the function like any other leaf.
+    All leaves that the loop calls become part of its code. This saves the time for passing
+    descriptions of arrays to these leaves. Python calls the function like any other leaf.
     """
     return leaf(function) if _config.DISABLE_JIT else _make_leaf(function, _LoopCompiler)
 
@@ -803,8 +807,8 @@ def lane_leaf(function: Callable[P, R]) -> Callable[P, R]:
     Each simulation has a lane, a position in the processor's vector registers. The compiler
     needs two guarantees, which apply to the marked function only: all functions that it calls
     become part of its code, and no two of its arguments overlap in memory. The caller has to
-    make sure of the latter. Such a function is called from compiled code by its address
-    (`find_lane_address`).
+    make sure that no arguments overlap. Such a function is called from compiled code by its
+    address (`find_lane_address`).
     """
     return _make_leaf(function, _LaneCompiler)
 
@@ -842,7 +846,7 @@ def find_lane_address(function: Callable[..., Any], argument_types: tuple[Any, .
 def is_lane_code_stored(function: Callable[..., Any], argument_types: tuple[Any, ...]) -> bool:
     """Returns True if the machine code for several simulations side by side is on disk already.
 
-    If not, its first use takes long, because it has to be compiled.
+    If not, the first use of the function takes long, because it has to be compiled.
 
     Args:
         function: A function with the decorator `lane_leaf`.
@@ -867,7 +871,7 @@ def read_lane_assembly(function: Callable[..., Any], argument_types: tuple[Any, 
         argument_types: Numba's types of its arguments.
     """
     dispatcher: Any = function
-    # Numba has no text of code from the cache.
+    # Numba has no assembly text for code from the cache.
     compiled = _make_unstored(dispatcher.py_func)
     compiled.compile(argument_types)
     return str(compiled.overloads[argument_types].library.get_asm_str())
@@ -878,8 +882,8 @@ def set_lane_form(
 ) -> None:
     """Registers another version of a function, for code that computes several simulations.
 
-    For example, `compute_law` of `lanes.lane_laws` has a version for each control
-    law, because the simulations side by side all use the same law.
+    For example, `compute_law` of `core.lanes.lane_laws` has a version for each control law,
+    because all simulations that are computed side by side use the same law.
 
     Args:
         function: A function with the decorator `leaf`.
@@ -893,8 +897,9 @@ def set_lane_form(
 class _NamedCache(_LeafCache):
     """Stores the machine code of a closure on disk, under a name that the caller chooses.
 
-    A closure is a function that uses variables of an outer function. Numba would identify it by
-    the values of these variables. Here the name identifies all that the code depends on.
+    A closure is a function that uses variables of an outer function. Numba would identify the
+    closure by the values of these variables. In this class, the name identifies everything that
+    the code depends on.
     """
 
     def _index_key(self, signature: Any, codegen: Any) -> tuple[Any, Any]:
@@ -907,14 +912,14 @@ def compile_named(
     """Compiles a closure, and stores its machine code on disk under a name.
 
     A closure is a function that uses variables of an outer function. If a closure with this
-    name was compiled before, its code is loaded. The caller therefore derives the name from all
-    that the code depends on. The name is part of the symbols of the machine code: no two such
-    functions may have the same name in any process.
+    name was compiled before, its code is loaded. The caller must therefore derive the name from
+    everything that the code depends on. The name is part of the symbols of the machine code: no
+    two such functions may have the same name in any process.
 
     Args:
         function: The closure. Its qualified name is changed to `name`.
         name: Name of the function.
-        signature: Signature of the function, as Numba has it.
+        signature: Numba's signature of the function.
         **options: Options of `numba.njit`. The options that all leaves have in common, such as
             no counting of references, take precedence.
 
@@ -922,7 +927,7 @@ def compile_named(
         Numba's dispatcher of the compiled function.
     """
     function.__qualname__ = name
-    # The common options apply to new and to loaded code alike: neither counts references.
+    # The common options apply to both new and loaded code: neither counts references.
     dispatcher = numba.njit(**{**options, **_OPTIONS})(function)
     # Numba's own cache cannot store closures under a given name.
     dispatcher._cache = cast(Any, _NamedCache)(function)

@@ -55,16 +55,17 @@ _USER = int(Law.USER)
 def _place_arm(
     s: SiteRow, chain: RowArray | None, links: RowArray, updates_reference: bool
 ) -> None:
-    """Computes where the links of an arm are, before its tracking errors are computed.
+    """Computes the positions of an arm's links, before its tracking errors are computed.
 
-    If asked, it also computes the orientation that the end effector should follow. The planar
-    arm needs neither, because its equations contain the positions of its links.
+    If `updates_reference` is True, the orientation that the end effector should follow is
+    computed too. The planar arm needs neither, because its equations contain the positions of
+    its links.
 
     Args:
         s: State of the site (the process that runs the arm).
         chain: Data of the joints, one row per joint. None for the planar two-link arm.
         links: State of each link from another site, one row per link.
-        updates_reference: True in a tick; false if the reference was restored from a record.
+        updates_reference: True in a tick, False if the reference was restored from a record.
     """
     if chain is None:
         return
@@ -92,7 +93,7 @@ def _update_errors(s: SiteRow, chain: RowArray | None) -> None:
 
 @leaf
 def _advance_estimate(s: SiteRow, chain: RowArray | None, gain_s: float, Yr: Vector) -> None:
-    """Advances the estimate of the arm's parameters by theta_hat - gain_s Gamma Yr, in bounds.
+    """Advances the estimated parameters to theta_hat - gain_s Gamma Yr, within their bounds.
 
     Gamma is the adaptation gain, and Yr the product Y' r of the regressor and the filtered
     error.
@@ -123,9 +124,9 @@ def adapts(s: SiteRow) -> bool:
 def _update_estimate(k: int, s: SiteRow, chain: RowArray | None) -> None:
     """Updates the estimate of the arm's dynamic parameters (stage 5 of a tick).
 
-    The estimate theta follows Eq. (15) of the paper, dtheta/dt = -Gamma Y' r, where Gamma is
-    the matrix of the adaptation gains, Y the regressor and r the filtered error. The trapezoid
-    rule with the period h gives
+    The estimate theta obeys Eq. (15) of the paper, dtheta/dt = -Gamma Y' r, where Gamma is the
+    matrix of the adaptation gains, Y the regressor and r the filtered error. The trapezoid rule
+    with the period h gives
 
         theta_k = theta_{k-1} - h/2 Gamma (Y'r_{k-1} + Y'r_k)
 
@@ -149,7 +150,7 @@ def _update_estimate(k: int, s: SiteRow, chain: RowArray | None) -> None:
 def updates_estimate(k: int, s: SiteRow) -> bool:
     """Returns True if an adaptive law integrates its parameter estimate in this control period.
 
-    This is not so in the first period of an arm's process, nor under the scheme `digital`,
+    The result is False in the first period of an arm's process, and under the scheme `digital`,
     which integrates at the end of the period. `adapts` decides whether the mode allows
     adaptation.
     """
@@ -158,7 +159,7 @@ def updates_estimate(k: int, s: SiteRow) -> bool:
 
 @leaf
 def sum_trapezoid(s: SiteRow) -> None:
-    """Adds the adaptation rate Y' r of this control period to that of the previous one.
+    """Adds the adaptation rate Y' r of the previous control period to the present rate.
 
     The estimate of the arm's parameters is integrated by the trapezoid rule, which needs this
     sum. It is written into `Yr_before`, see `_update_estimate`.
@@ -171,7 +172,8 @@ def sum_trapezoid(s: SiteRow) -> None:
 def torque_stage(site: RowArray, chain: RowArray | None) -> None:
     """Computes the torque of a control law that is built into the compiled simulation.
 
-    It does nothing for a law that was written as a Python class; `law_stage` calls such a law.
+    The function does nothing for a law that was written as a Python class; `law_stage` calls
+    such a law.
 
     Args:
         site: State of the site (the process that runs the arm), shape (1,). The torque is
@@ -189,10 +191,10 @@ def torque_stage(site: RowArray, chain: RowArray | None) -> None:
 
 @leaf
 def _put_known_gravity(s: SiteRow, chain: RowArray | None, torque: Array) -> None:
-    """Computes the torque that holds the arm, from the parameters that are known or estimated.
+    """Computes the torque that holds the arm, from its known or estimated parameters.
 
-    It holds an arm at rest if the control law cannot. Laws that learn, and laws of arms with
-    unknown parameters, have an estimate.
+    This torque holds an arm at rest if the control law cannot do so. The estimate is used for
+    adaptive laws, and for arms with unknown parameters.
 
     Args:
         s: State of the site (the process that runs the arm).
@@ -212,14 +214,15 @@ def _put_known_gravity(s: SiteRow, chain: RowArray | None, torque: Array) -> Non
 def guard_torque(k: int, t_ns: int, s: SiteRow, chain: RowArray | None) -> None:
     """Turns the torque of the control law into the torque that the motors get.
 
-    It is called after the law has written the torque `tau`. The rate of every torque is
-    limited. Under the rule `glide`, by which an arm comes to rest while another arm is silent,
-    the torque is first modified in these cases:
+    The function is called after the law has written the torque `tau`. The rate of every torque
+    is limited. Under the rule `glide`, by which an arm comes to rest while another arm is
+    silent, the torque is first modified in these cases:
 
     - The torque is not finite: the mode becomes FAULT, in which the arm comes to rest.
     - The arm comes to rest or is at rest: damping and an integral term are added, see
       `resting`. If the law cannot hold the arm, the gravity torque replaces that of the law.
-    - The arm has just left its rest: the torque blends from that at rest to that of the law.
+    - The arm has just left its rest: the torque blends from the torque at rest to the torque of
+      the law.
 
     Args:
         k: Number of the tick, a period of the control loop.
@@ -272,7 +275,8 @@ def _write_record(s: SiteRow, row: Array) -> None:
     first += 2 * shared
     for i in range(joints):
         row[first + i] = s.tau[i]
-        # A subtraction and not a negation: where nothing acts the record has 0.0, never -0.0.
+        # This is a subtraction, not a negation, so that the record has 0.0 and not -0.0 where
+        # nothing acts.
         row[first + joints + i] = 0.0 - s.on_arm[i]
     first += 2 * joints
     for p in range(parameters):
@@ -303,7 +307,7 @@ def _update_external_torque(
         s: State of the site (the process that runs the arm).
         chain: Data of the joints, one row per joint. None for the planar two-link arm.
         actors: Operators and environments of the arm, one row for each.
-        table: Their tables, for example of recorded torques.
+        table: Numerical data of all operators and environments, for example recorded torques.
     """
     if chain is None:
         two_link_stages.update_external_torque(t_s, s, actors, table)
@@ -330,7 +334,7 @@ def _advance_arm(
         s: State of the site (the process that runs the arm).
         chain: Data of the joints, one row per joint. None for the planar two-link arm.
         actors: Operators and environments of the arm, one row for each.
-        table: Their tables, for example of recorded torques.
+        table: Numerical data of all operators and environments, for example recorded torques.
 
     Returns:
         False, without a change, if the result is not finite.
@@ -346,8 +350,8 @@ def _advance_arm(
 def hold_motor_torque(k: int, s: SiteRow) -> None:
     """Computes the motor torque u that is held during the whole control period.
 
-    The constant torque that represents the period best is that of its middle. It is
-    extrapolated from the torques of this tick and the previous tick:
+    The constant torque that represents the period best is the torque in the middle of the
+    period. It is extrapolated from the torques of this tick and the previous tick:
 
         u = 1.5 tau_k - 0.5 tau_{k-1}, within the limit
 
@@ -371,7 +375,7 @@ def hold_motor_torque(k: int, s: SiteRow) -> None:
 
 @leaf
 def finish_advance(s: SiteRow, chain: RowArray | None, is_adapting: bool) -> None:
-    """Stores the torque and the adaptation rate Y' r of this control period for the next one.
+    """Stores the torque and the adaptation rate Y' r of this tick for the next tick.
 
     Y' r drives the parameter estimate, see `_update_estimate`. Under the scheme DIGITAL the
     estimate itself is advanced here.
@@ -379,7 +383,7 @@ def finish_advance(s: SiteRow, chain: RowArray | None, is_adapting: bool) -> Non
     Args:
         s: State of the site (the process that runs the arm).
         chain: Data of the joints, one row per joint. None for the planar two-link arm.
-        is_adapting: What `adapts` returned before the arm moved.
+        is_adapting: Result of `adapts` before the arm moved.
     """
     h_s = 1.0 / s.rate_hz
     if s.scheme == _DIGITAL and s.law == _ADAPTIVE and is_adapting and s.mode != _DIVERGED:
@@ -407,7 +411,7 @@ def _advance(
         s: State of the site (the process that runs the arm).
         chain: Data of the joints, one row per joint. None for the planar two-link arm.
         actors: Operators and environments of the arm, one row for each.
-        table: Their tables, for example of recorded torques.
+        table: Numerical data of all operators and environments, for example recorded torques.
     """
     h_s = 1.0 / s.rate_hz
     # Evaluate this before the arm moves: whether an arm at rest is fast depends on its speed.
@@ -424,13 +428,13 @@ def _advance(
 
 @leaf
 def channel_of(channel: ChannelArrays | None, peer: int) -> ChannelArrays | None:
-    """Returns the arrays for the numbers that the control law of one other arm (peer) sends.
+    """Returns the arrays for the values that the control law of one other arm (peer) sends.
 
-    Some laws send numbers besides the motion of the arm, for example energies.
+    Some laws send values besides the motion of the arm, for example energies.
 
     Args:
         channel: Arrays of all peers of a site, or of all sites of a simulation. None if the
-            control law of this site reads no such numbers.
+            control law of this site reads no such values.
         peer: Index of the peer, or of the site.
 
     Returns:
@@ -465,7 +469,7 @@ def _link_arrays(arrays: SiteArrays, peer: int) -> LinkArrays:
 
 @leaf
 def find_release(peer: int, tick: int, arrays: SiteArrays) -> int:
-    """Finds the control period of this arm in which a message of another arm is used first.
+    """Finds the control period of this arm in which a message from another arm is first used.
 
     A message (sample) is the state that the other arm sends once per period of its own loop.
 
@@ -513,7 +517,7 @@ def accept_stage(k: int, count: int, arrays: SiteArrays, buffers: TickBuffers) -
 def guard_reference(k: int, t_ns: int, s: SiteRow, links: RowArray) -> None:
     """Stops the reference while other arms are silent, and limits its speed.
 
-    The reference is the position that the arm follows. It stops if no messages come from the
+    The reference is the position that the arm follows. It stops if no messages arrive from the
     other arms for too long.
 
     Args:
@@ -550,7 +554,7 @@ def error_stages(
         s: State of the site (the process that runs the arm), with the reference; written.
         chain: Data of the joints, one row per joint. None for the planar two-link arm.
         actors: Operators and environments, one row for each.
-        table: Numbers of all operators and environments.
+        table: Numerical data of all operators and environments.
     """
     # 4 errors
     _update_errors(s, chain)
@@ -583,7 +587,7 @@ def reference_stages(
         links: States of the links from the other sites, one row per link.
         ramps: Planned changes of the weights with which the arm follows the other arms.
         actors: Operators and environments, one row for each.
-        table: Numbers of all operators and environments.
+        table: Numerical data of all operators and environments.
         chain: Data of the joints, one row per joint. None for the planar two-link arm.
     """
     s: SiteRow = site[0]
@@ -604,7 +608,7 @@ def sense_stages(
     process, sends in one of its ticks. The stages are:
 
     - 1 accept: store the samples that arrived, until their simulated delay has passed.
-    - 2 release: put into use the newest sample of each peer whose delay has passed.
+    - 2 release: take the newest sample of each peer whose delay has passed.
     - 3 reference: compute the position that the arm should follow.
     - 4 errors: compute the tracking errors.
     - 5 estimate: update the estimate of the arm's dynamic parameters.
@@ -683,7 +687,7 @@ def act_stages(
         site: State of the site (the process that runs the arm), shape (1,), with the torque of
             the law; written.
         actors: Operators and environments, one row for each.
-        table: Numbers of all operators and environments.
+        table: Numerical data of all operators and environments.
         chain: Data of the joints, one row per joint. None for the planar two-link arm.
         record: Receives the floating-point numbers of the record, the results of the tick.
     """
@@ -757,9 +761,9 @@ def site_tick(
 def resume_stages(k: int, arrays: SiteArrays) -> None:
     """Completes the state of an arm that was restored from a log, to continue the run.
 
-    Some numbers that the next control period needs are not in the log. They are computed here
-    from the restored state: the tracking errors, the external torques, and the motion until
-    then. Control periods are called ticks.
+    Some values that the next control period needs are not in the log: the tracking errors, the
+    external torques, and the motion until that period. They are computed here from the restored
+    state. Control periods are called ticks.
 
     Args:
         k: The last tick that was recorded.

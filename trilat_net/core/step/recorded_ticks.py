@@ -2,7 +2,8 @@
 
 A log has a record of each control period (tick), with its inputs, such as the received states
 of the other arms, and its results. The loop computes the ticks again from their inputs and
-compares the results. It does the same as repeated calls of `Site.step`, but faster.
+compares the results. The loop gives the same results as repeated calls of `Site.step`, but
+faster.
 
 Invariant:
     - The loop calls the stages of the kernel, as `Site.step` does. It contains no equation.
@@ -38,8 +39,8 @@ def _list_checksums() -> NDArray[np.uint32]:
     """Returns tables with which a CRC-32 checksum is updated by eight bytes at once.
 
     CRC-32 is linear in the bits of the message, except for a constant. Therefore the effect of
-    a byte depends only on its value and on the number of bytes that follow, which are taken as
-    zeros here.
+    a byte depends only on its value and on the number of bytes that follow. The tables assume
+    that the following bytes are zero.
 
     Returns:
         The effect by number of following bytes and value of the byte, shape (8, 256).
@@ -64,7 +65,7 @@ def _update_checksum(crc: int, word: int) -> int:
     The final inversion of all bits, which belongs to CRC-32, is left to the caller.
 
     Args:
-        crc: The checksum of the data before.
+        crc: The checksum of the preceding data.
         word: The eight bytes as an integer, least byte first.
     """
     bits = crc ^ word
@@ -151,7 +152,7 @@ class _TickRules(NamedTuple):
         remembers: True if every record has numbers in the field `mem`.
         hand: Index of the live hand among the operators and environments, or -1.
         most_pages: Largest number of entries of a calendar.
-        most_ahead: Largest lead of a sample over the present tick, in ticks.
+        most_ahead: Largest number of ticks by which a sample may be ahead of the present tick.
     """
 
     rate_hz: int
@@ -200,7 +201,7 @@ def _has_room(
         peer_hz = links[peer].rate_hz
         ahead = tick * rules.rate_hz // peer_hz - k
         if ahead > rules.most_ahead:
-            continue  # the sample will be refused
+            continue  # the sample will be rejected
         if ahead + rooms[peer, 1] > pages and pages < rules.most_pages:
             return False
         rooms[peer, 0] = (k + pages - rooms[peer, 1]) * peer_hz // rules.rate_hz
@@ -225,7 +226,7 @@ def _put_arrivals(
         views: Memory of the site, a `_SiteViews`; its arrivals are written.
 
     Returns:
-        The CRC-32 of the arrivals, which the record must have, too.
+        The CRC-32 of the arrivals, which must equal the checksum in the record.
     """
     # A row of `samples` has positions, velocities and forces, `shared` numbers each.
     shared = rules.shared
@@ -255,7 +256,7 @@ def _put_arrivals(
 
 @leaf
 def _put_inputs(row: int, arrays: SiteArrays, rows: Any, rules: Any) -> None:
-    """Writes those recorded inputs of a control period that did not come from other arms.
+    """Writes the recorded inputs of a control period that did not come from other arms.
 
     These are the action of a person or program that moved the arm (live hand), and the motion
     of a real arm that was measured. Most arms have neither.
@@ -288,9 +289,9 @@ def _equals_record(
 ) -> bool:
     """Returns True if the results of a tick (control period) have the same bits as its record.
 
-    Compared are the mode, the checksum of the samples (states of other arms) that arrived, the
-    tick of the sample in use of each other arm, all numbers, and the numbers that are kept for
-    the next tick.
+    The comparison covers the mode, the checksum of the samples (states of other arms) that
+    arrived, the tick of the sample in use of each other arm, all computed numbers, and the
+    numbers that are kept for the next tick.
 
     Args:
         row: Index of the record.
@@ -455,7 +456,7 @@ class TickRepeater:
 
         repeated, has_differed = self._run(first_tick, rows, samples)
         if has_differed:
-            # Restore the state, and compute only the ticks before the one that differs.
+            # Restore the state, and compute only the ticks before the tick that differs.
             for saved, array in zip(self._saved, arrays, strict=True):
                 array[...] = saved
             self._parts.calendar_sizer.newest[:] = newest
@@ -474,7 +475,7 @@ class TickRepeater:
         return [array for array in changed if array is not None]
 
     def _run(self, first_tick: int, rows: RecordedRows, samples: IntArray) -> tuple[int, bool]:
-        """Calls the compiled loop over recorded control periods, for the kind of arm.
+        """Calls the compiled loop over recorded control periods that matches the kind of arm.
 
         The loop and `CalendarSizer`, which enlarges the buffers of waiting messages, tell each
         other which messages fit into them.
@@ -500,8 +501,8 @@ class TickRepeater:
 def _view_words(array: NDArray[Any]) -> IntArray:
     """Returns the same memory as 64-bit integers, to compare all bits of floats.
 
-    Floats would compare 0.0 and -0.0 as equal. No bit is copied: a change of the array changes
-    the result.
+    Floats would compare 0.0 and -0.0 as equal. Nothing is copied, so a change of the array
+    changes the result.
 
     Args:
         array: Array of numbers of 8 bytes, or a structured array of such numbers.
@@ -530,7 +531,7 @@ def _list_memory_sources(site: Site) -> IntArray:
     link_type = site.arrays.links.dtype
 
     def add(dtype: np.dtype[Any], field: str, row: int = 0) -> None:
-        """Adds where the numbers of one field are stored, counted in words of eight bytes.
+        """Adds the positions of the numbers of one field, counted in words of eight bytes.
 
         Args:
             dtype: Type of the row, that of the site or that of a link.

@@ -3,8 +3,8 @@
 They are NumPy structured arrays, whose elements are called rows. Each class below describes the
 fields of one kind of row, for example `q` in `SiteRow`: their shape, unit and meaning, and the
 stage of a control period that writes them. The types of the attributes serve readers and mypy,
-and `row_dtype` derives the memory layout from the `Field` of each attribute. README.md of this
-folder shows the same information as tables.
+and `row_dtype` derives the memory layout from the `Field` of each attribute. `core/README.md`
+shows the same information as tables.
 
 Invariant:
     - The order of the attributes is the order of the fields in memory. Digests of runs, cached
@@ -58,7 +58,7 @@ class SiteRow(Protocol):
     """
 
     rate_hz: Annotated[int, Field("", "Hz", "tick rate", "setup")]
-    first: Annotated[int, Field("", "tick", "first tick that the site makes", "setup")]
+    first: Annotated[int, Field("", "tick", "first tick that the site computes", "setup")]
     scheme: Annotated[int, Field("", "Scheme", "how the law is sampled", "setup")]
     law: Annotated[int, Field("", "Law", "control law", "setup")]
     external: Annotated[int, Field("", "", "1: the arm is measured, not integrated", "setup")]
@@ -73,28 +73,39 @@ class SiteRow(Protocol):
     ]
     asked: Annotated[
         int,
-        Field("", "", "1 while a user's compiled law runs: an error is its own", "6 torque"),
+        Field(
+            "",
+            "",
+            "1 while a user's compiled law runs, which then causes any error",
+            "6 torque",
+        ),
     ]
     order: Annotated[
-        int, Field("", "LifeOrder", "order to carry out at the next tick; 0: none", "input")
+        int,
+        Field(
+            "", "LifeOrder", "order to carry out at the next tick, 0 without an order", "input"
+        ),
     ]
     skipped: Annotated[int, Field("", "ticks", "ticks missed before this one", "input")]
-    degrades: Annotated[int, Field("", "", "1: the site goes on without lost peers", "setup")]
+    degrades: Annotated[int, Field("", "", "1: the site continues without lost peers", "setup")]
     regrouped: Annotated[
         int,
         Field(
-            "", "LifeReason", "DROPPED or RESTORED if this tick did so; else 0", "3 reference"
+            "",
+            "LifeReason",
+            "DROPPED or RESTORED after such a change in this tick",
+            "3 reference",
         ),
     ]
     bit: Annotated[int, Field("", "", "the site's bit in sets of sites", "setup")]
     holds: Annotated[
-        int, Field("", "", "1: a user's law is right while its reference rests", "setup")
+        int, Field("", "", "1: a user's law also works while its reference rests", "setup")
     ]
     joints: Annotated[int, Field("", "", "joints of the arm", "setup")]
     shared: Annotated[int, Field("", "", "coordinates that sites exchange", "setup")]
     parameters: Annotated[int, Field("", "", "dynamic parameters of the arm", "setup")]
     task: Annotated[int, Field("", "", "1: sites exchange end effector poses", "setup")]
-    sent: Annotated[int, Field("", "", "numbers that the law sends in a record", "setup")]
+    sent: Annotated[int, Field("", "", "values in a record that the law sends", "setup")]
     mode: Annotated[
         int, Field("", "Mode", "mode; DIVERGED also by stages 6 to 8", "3 reference")
     ]
@@ -114,9 +125,13 @@ class SiteRow(Protocol):
     align_limit: Annotated[
         float, Field("", "rad or m", "longest distance of an alignment", "setup")
     ]
-    lengths: Annotated[Array, Field("2", "m", "links of the planar arm", "setup")]
+    lengths: Annotated[
+        Array, Field("2", "m", "lengths of the links of the planar arm", "setup")
+    ]
     k: Annotated[int, Field("", "tick", "present tick, for a user's law", "6 torque")]
-    t_s: Annotated[float, Field("", "s", "its nominal time, for a user's law", "6 torque")]
+    t_s: Annotated[
+        float, Field("", "s", "nominal time of the tick, for a user's law", "6 torque")
+    ]
     h_s: Annotated[float, Field("", "s", "period, for a user's law", "6 torque")]
     M: Annotated[
         Array, Field("joints x joints", "kg m^2", "inertia, for a user's law", "6 torque")
@@ -133,7 +148,9 @@ class SiteRow(Protocol):
     ]
     qd: Annotated[Array, Field("joints", "rad/s", "joint velocities, as q", "8 advance")]
     tau: Annotated[Array, Field("joints", "N m", "control torque", "6 torque")]
-    tau_before: Annotated[Array, Field("joints", "N m", "tau of the tick before", "8 advance")]
+    tau_before: Annotated[
+        Array, Field("joints", "N m", "tau of the previous tick", "8 advance")
+    ]
     on_arm: Annotated[
         Array, Field("joints", "N m", "exogenous torque ON the arm: -tau_x", "6 torque")
     ]
@@ -149,12 +166,14 @@ class SiteRow(Protocol):
         ),
     ]
     tau_x: Annotated[Array, Field("joints", "N m", "-on_arm, for a user's law", "6 torque")]
-    q_before: Annotated[Array, Field("joints", "rad", "q of the tick before", "8 advance")]
+    q_before: Annotated[Array, Field("joints", "rad", "q of the previous tick", "8 advance")]
     G: Annotated[Array, Field("joints", "N m", "gravity torque, for a user's law", "6 torque")]
     bias: Annotated[Array, Field("joints", "N m", "C qd + G, for a user's law", "6 torque")]
     rho: Annotated[Array, Field("joints", "N m", "largest robust torque", "setup")]
     width: Annotated[Array, Field("joints", "rad/s", "r at 71 % of rho", "setup")]
-    friction: Annotated[Array, Field("joints", "", "share of friction compensated", "setup")]
+    friction: Annotated[
+        Array, Field("joints", "", "fraction of friction that is compensated", "setup")
+    ]
     q_min: Annotated[Array, Field("joints", "rad", "least joint angle", "setup")]
     q_max: Annotated[Array, Field("joints", "rad", "largest joint angle", "setup")]
     tau_rate: Annotated[Array, Field("joints", "N m/s", "largest rate of tau", "setup")]
@@ -168,7 +187,9 @@ class SiteRow(Protocol):
     qd_rest: Annotated[Array, Field("joints", "rad/s", "its rate", "3 reference")]
     damping: Annotated[Array, Field("joints", "N m s/rad", "B of an arm at rest", "setup")]
     integral: Annotated[Array, Field("joints", "N m/rad", "k B of an arm at rest", "setup")]
-    deceleration: Annotated[Array, Field("joints", "rad/s^2", "of the rest reference", "setup")]
+    deceleration: Annotated[
+        Array, Field("joints", "rad/s^2", "deceleration of the rest reference", "setup")
+    ]
 
     Lambda: Annotated[Array, Field("shared", "1/s", "rate of the error in r", "setup")]
     Kd: Annotated[Array, Field("shared", "N m s/rad", "gain of ed", "setup")]
@@ -182,11 +203,14 @@ class SiteRow(Protocol):
     q_des: Annotated[Array, Field("shared", "rad or m", "reference, Eq. (6)", "3 reference")]
     qd_des: Annotated[Array, Field("shared", "rad/s or m/s", "its rate", "3 reference")]
     q_followed: Annotated[
-        Array, Field("shared", "rad or m", "reference of the tick before", "3 reference")
+        Array, Field("shared", "rad or m", "reference of the previous tick", "3 reference")
     ]
     qd_followed: Annotated[Array, Field("shared", "rad/s or m/s", "its rate", "3 reference")]
     felt: Annotated[
-        Array, Field("shared", "N m or N", "torque on the peers, by share", "3 reference")
+        Array,
+        Field(
+            "shared", "N m or N", "torque on the peers' arms, weighted by share", "3 reference"
+        ),
     ]
     e: Annotated[Array, Field("shared", "rad or m", "q - q_des, Eq. (9)", "4 errors")]
     ed: Annotated[Array, Field("shared", "rad/s or m/s", "its derivative", "4 errors")]
@@ -205,7 +229,7 @@ class SiteRow(Protocol):
     ]
     Yr: Annotated[Array, Field("parameters", "", "Y' r", "4 errors")]
     Yr_before: Annotated[
-        Array, Field("parameters", "", "Y' r of the tick before; in 5 the sum", "8 advance")
+        Array, Field("parameters", "", "Y' r of the previous tick; in 5 the sum", "8 advance")
     ]
 
     x: Annotated[
@@ -219,9 +243,7 @@ class SiteRow(Protocol):
     b: Annotated[Array, Field("shared", "", "right side of (J J') y = b", "scratch")]
     y: Annotated[Array, Field("shared", "", "solution of (J J') y = b", "scratch")]
 
-    posture: Annotated[
-        Array, Field("joints", "rad", "angles that the free motion seeks", "setup", True)
-    ]
+    posture: Annotated[Array, Field("joints", "rad", "preferred joint angles", "setup", True)]
     v: Annotated[Array, Field("joints", "rad/s", "reference velocity", "4 errors", True)]
     a: Annotated[Array, Field("joints", "rad/s^2", "reference acceleration", "4 errors", True)]
     zeros: Annotated[Array, Field("joints", "", "zeros", "setup", True)]
@@ -237,7 +259,9 @@ class SiteRow(Protocol):
     ]
     gravity: Annotated[Array, Field("3", "m/s^2", "gravity in the base frame", "setup", True)]
     tip: Annotated[Array, Field("3", "m", "end effector in the last link", "setup", True)]
-    scale: Annotated[float, Field("", "m/m", "metres of the task per metre", "setup", True)]
+    scale: Annotated[
+        float, Field("", "m/m", "metres of the task per metre of this arm", "setup", True)
+    ]
     posture_rate: Annotated[float, Field("", "1/s", "rate towards `posture`", "setup", True)]
     singular_value: Annotated[
         float, Field("", "m/rad", "least singular value without damping", "setup", True)
@@ -254,7 +278,8 @@ class SiteRow(Protocol):
         Array, Field("3 x 3", "", "transposed rotation of the end effector", "setup", True)
     ]
 
-    # Also a chain has Y: Numba compiles the leaves of the planar arm for every row.
+    # A chain has the field Y too, because Numba compiles the leaves of the planar arm for every
+    # row.
     Y: Annotated[
         Array, Field(f"{JOINTS} x {PARAMETERS}", "", "regressor, Eq. (12)", "4 errors")
     ]
@@ -303,19 +328,27 @@ class LinkRow(Protocol):
     bad: Annotated[int, Field("", "", "1: the loss chain is in its bad state", "2 release")]
     due_before: Annotated[int, Field("", "ns", "latest due time so far", "2 release")]
     memory: Annotated[float, Field("", "", "last number of the AR(1) delay", "2 release")]
-    accepted: Annotated[int, Field("", "samples", "that arrived", "1 accept")]
+    accepted: Annotated[int, Field("", "samples", "samples that arrived", "1 accept")]
     late: Annotated[
-        int, Field("", "samples", "that arrived after their tick of release", "1 accept")
+        int, Field("", "samples", "samples that arrived after they were due", "1 accept")
     ]
-    duplicate: Annotated[int, Field("", "samples", "that had arrived before", "1 accept")]
-    refused: Annotated[int, Field("", "samples", "with a stamp out of range", "1 accept")]
+    duplicate: Annotated[
+        int, Field("", "samples", "samples that had arrived before", "1 accept")
+    ]
+    refused: Annotated[
+        int, Field("", "samples", "samples with a stamp out of range", "1 accept")
+    ]
     lost: Annotated[
-        int, Field("", "samples", "lost by the link's model, or far too old", "1 accept")
+        int,
+        Field("", "samples", "samples lost by the link's model, or far too old", "1 accept"),
     ]
     superseded: Annotated[
-        int, Field("", "samples", "not used, as a newer one was (1, 2)", "1 accept")
+        int,
+        Field("", "samples", "samples not used, because a newer one was (1, 2)", "1 accept"),
     ]
-    copies: Annotated[int, Field("", "samples", "duplicated by the link's model", "2 release")]
+    copies: Annotated[
+        int, Field("", "samples", "samples duplicated by the link's model", "2 release")
+    ]
 
 
 class SampleRow(Protocol):
@@ -323,7 +356,7 @@ class SampleRow(Protocol):
 
     A message (sample) is the state that the other arm sends once per control period. A ring
     buffer has one entry per control period of the receiver. The entry holds the newest message
-    that is used from that period on.
+    that is first used in that period.
     """
 
     tick: Annotated[int, Field("", "tick", "stamp of the sample; -1: no sample", "1 accept")]
@@ -345,7 +378,7 @@ class ArrivalRow(Protocol):
 
 
 class ProgressRow(Protocol):
-    """How far the simulation of one arm has advanced, and statistics of its motion.
+    """Progress of the simulation of one arm, and statistics of its motion.
 
     The largest errors and speeds are collected for each interval of time, which is called a
     bucket.
@@ -450,7 +483,7 @@ def row_dtype(
         lengths: Number of joints, of shared coordinates and of dynamic parameters of the arm,
             under the names "joints", "shared" and "parameters". Only the names that the fields
             use are needed.
-        chain: True to include the fields that only an arm which is a chain of joints needs.
+        chain: True to include the fields that only a chain of joints needs.
     """
     columns: list[Any] = [
         (name, field.kind, field_shape(field, lengths))

@@ -1,7 +1,7 @@
-"""Stores everything that a simulated run receives from outside: arrivals, changes and hands.
+"""Stores the external inputs of a simulated run: arrivals, changes and operators' actions.
 
-A run that repeats a log receives what the log recorded. A new run receives nothing, except for
-the actions of programs that move an arm.
+A run that repeats a log receives the recorded inputs. A new run receives nothing except the
+actions of programs that move an arm.
 """
 
 from collections.abc import Collection, Sequence
@@ -19,7 +19,7 @@ _TARGET_COLUMN = 3
 
 
 class RunInputs(NamedTuple):
-    """Everything that a recorded run received from outside, so that it can be repeated.
+    """All external inputs of a recorded run, with which the run can be repeated.
 
     N is the number of sites (processes that run one arm), and P the largest number of peers
     (other sites) from which a site receives samples (sent states).
@@ -27,9 +27,9 @@ class RunInputs(NamedTuple):
     Attributes:
         feed: Ticks (control periods) in which samples of other sites arrived, and actions of
             live operators (persons or programs that move an arm during the run).
-        changes: Changes of links or sites during the run, in the order of time. Each entry
-            contains the tick before which the site applies the change, the index of the site,
-            and the change.
+        changes: Changes of links or sites during the run, in order of time. Each entry contains
+            the tick before which the site applies the change, the index of the site, and the
+            change.
         late_ns: Largest time from the stamp of a sample to its arrival, in ns. The loop needs
             it to decide how long samples are stored.
     """

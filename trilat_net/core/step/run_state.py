@@ -1,10 +1,10 @@
-"""Copies the state of a simulated run to another run, or scales the difference of two runs.
+"""Copies the state of a simulated run to another, or scales the difference between two runs.
 
 The growth of a small difference between two runs of the same scenario shows whether the runs
 are stable.
 
 Invariant:
-    - Numbers that are equal in both runs keep their bits.
+    - Numbers that are equal in both runs do not change.
 """
 
 from collections.abc import Sequence
@@ -16,7 +16,7 @@ from .vectors import Array
 
 
 def mark_floats(dtype: np.dtype[np.generic]) -> NDArray[np.bool_]:
-    """Returns which of the 8-byte numbers in an element of an array are floats.
+    """Marks which of the 8-byte numbers in an element of an array are floats.
 
     For a structured type with the fields x (two float64) and count (int64), the result is
     [True, True, False]. A small disturbance of a run scales only the floats
@@ -38,7 +38,7 @@ def mark_floats(dtype: np.dtype[np.generic]) -> NDArray[np.bool_]:
 def scale_differences(x: Array, y: Array, factor: float) -> Array:
     """Scales the difference between the states of two simulations: y + factor (x - y).
 
-    With a factor below 1, for example, the first one comes closer to the second one.
+    With a factor below 1, for example, the first state moves closer to the second.
 
     Args:
         x: Numbers of a run.
@@ -52,9 +52,9 @@ def scale_differences(x: Array, y: Array, factor: float) -> Array:
 class RunState:
     """The complete state of a simulated run: all arrays that change, viewed as 64-bit integers.
 
-    With this object, the state of a run can be copied to another run, or brought closer to it.
-    The views share the memory of the run, so a change of the object changes the run. Integers
-    are used because equal integers mean equal bits.
+    With this object, the state of a run can be copied to another run, or moved closer to that
+    of another run. The views share the memory of the run, so a change of the object changes the
+    run. Integers are used because equal integers mean equal bits.
 
     Args:
         arrays: The arrays that contain the state. Their memory is shared, not copied.
@@ -73,10 +73,10 @@ class RunState:
             self._floats.append(np.tile(mark_floats(array.dtype), array.size))
 
     def scale_difference(self, other: "RunState", factor: float) -> None:
-        """Multiplies the difference between this state and another one by a factor.
+        """Multiplies the difference between this state and another state by a factor.
 
         Every floating-point number x of this state becomes x_other + factor (x - x_other). With
-        the factor 0, this state becomes an exact copy of the other one. Integers, and results
+        the factor 0, this state becomes an exact copy of the other state. Integers, and results
         that would not be finite, are copied from the other state.
 
         Args:

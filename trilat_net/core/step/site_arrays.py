@@ -43,7 +43,7 @@ from .vectors import Array, IntArray, Points, Row, RowArray
 
 _OTHER_GAINS = ("law", "theta_hat0", "absolute")
 _GAINS = tuple(name for name in Gains._fields if name not in _OTHER_GAINS)
-"""Constant gains, named as the site's fields are; theta_hat0 becomes `theta_hat`."""
+"""Constant gains, with the names of the site's fields. theta_hat0 is stored as `theta_hat`."""
 
 
 @cache
@@ -90,7 +90,7 @@ class SiteArrays(NamedTuple):
             sites share one table.
         chain: The joints of a chain, shape (n,), see `chain_dtype`. None for the planar
             two-link arm.
-        channel: The numbers that the peers' laws send to a user's law, per peer. None if the
+        channel: The values that the peers' laws send to a user's law, per peer. None if the
             kernel computes the law.
     """
 
@@ -120,8 +120,8 @@ class SiteArrays(NamedTuple):
 
         Args:
             setup: Setup of the site.
-            spare: Two numbers of free rows for changes during the run: for changes of each
-                link's delay model, and for changes of the weights with which the site follows
+            spare: Numbers of free rows for changes during the run: first for changes of each
+                link's delay model, then for changes of the weights with which the site follows
                 the other sites.
             pages: Number of samples that can wait on each link, which is also the number of
                 delivery times that each link stores. 0 to derive both numbers from the setup.
@@ -176,13 +176,13 @@ class SiteArrays(NamedTuple):
         """Creates the arrays for a simulation of several sites, stacked along a first axis.
 
         A site is a process that runs one arm. If the arrays of a site are shorter than those of
-        another site, they are filled up with rows that are never read. The ring buffers for
+        another site, they are padded with rows that are never read. The ring buffers for
         delayed samples (states of other sites) are long enough for all delays.
 
         Args:
             setups: Setups of the sites.
-            changes: Changes during the run. There is room for all of them, for each link and
-                for the weights with which each site follows the others.
+            changes: Changes during the run. The tables of each link, and of the weights with
+                which each site follows the others, have free rows for all changes.
             late_ns: Longest time by which a sample may arrive after its delivery time, ns.
         """
         longest_us = 0
@@ -228,7 +228,8 @@ class SiteArrays(NamedTuple):
     def select(self, i: int, layout: Layout) -> "SiteArrays":
         """Returns the arrays of one arm in a simulation of several arms, without copying.
 
-        Vectors may be longer than this arm needs, because all arms have equally long ones.
+        Vectors may be longer than this arm needs, because the vectors of all arms are equally
+        long.
 
         Args:
             i: Index of the site.
@@ -267,8 +268,8 @@ class TickBuffers(NamedTuple):
             `arrival_dtype`.
         forces: External torques or forces on the arms of the senders, N m or N, shape
             (MAX_ARRIVALS, m).
-        sent: Further numbers that the control laws of the senders sent, shape (MAX_ARRIVALS, C)
-            for at most C numbers per sample.
+        sent: Further values that the control laws of the senders sent, shape (MAX_ARRIVALS, C)
+            for at most C values per sample.
         record: Receives the floating-point numbers of the record, see `Layout.columns`.
     """
 
@@ -317,17 +318,17 @@ def needed_pages(setup: SiteSetup) -> int:
 
 
 def links_bytes(setup: SiteSetup, pages: int) -> int:
-    """Returns how much memory the network links of an arm take in bytes, to limit it.
+    """Returns the memory that the network links of an arm take, in bytes.
 
-    Most of it are the ring buffers in which delayed messages wait. `CalendarSizer` limits their
-    length by this number.
+    The ring buffers in which delayed messages wait take most of the memory. `CalendarSizer`
+    uses the result to limit their length.
 
     Args:
         setup: Setup of the arm.
         pages: Number of samples that can wait in the ring buffer of each link.
     """
     number_bytes = 8
-    law_numbers = 0  # that a user's control law receives with each sample
+    law_numbers = 0  # count of values that a user's law receives with each sample
     if setup.law_factory is not None:
         law_numbers = sum(vector.length for vector in setup.received_vectors)
     page_bytes = sample_dtype(setup.layout.shared).itemsize + number_bytes * law_numbers
@@ -337,7 +338,7 @@ def links_bytes(setup: SiteSetup, pages: int) -> int:
 
 
 def _count_kept_dues(setup: SiteSetup) -> int:
-    """Returns for how many messages a link stores when they are to be delivered.
+    """Returns the number of messages whose delivery times a link stores.
 
     A delivery time (due time) is stored for as long as its message may still arrive, late or as
     a duplicate. The longest possible delay, and the largest time by which the sender's clock
@@ -387,7 +388,7 @@ class CalendarSizer:
     A sample is the state of a peer, the process of another arm. It waits until its simulated
     delay has passed. A buffer is too short if the delays have become longer, or if the clock of
     the peer is far ahead. The buffers never take more memory than `MAX_LINKS_BYTES`, or than
-    the delays in the setup need. A sample that still does not fit is refused later.
+    the delays in the setup need. A sample that still does not fit is rejected later.
 
     Attributes:
         newest: For each peer the number of the newest sample that is known to fit now and
@@ -446,15 +447,15 @@ class CalendarSizer:
 
         A sample is the state that a peer (another arm's process) sends in one of its ticks, the
         periods of its control loop. The sample waits in the buffer until its simulated delay
-        has passed. The buffer has one entry, called page, for each tick of the receiver from
-        the present one on. The sample fits if the last tick in which it may come into use has a
-        page. This tick is at most `ahead` + `longest_wait` ticks away: the sample was sent
-        `ahead` ticks after the present one (negative for an earlier sample), and then waits for
-        at most `longest_wait` ticks.
+        has passed. The buffer has one entry, called page, for the present tick and each later
+        tick of the receiver. The sample fits if the last tick in which it may come into use has
+        a page. This tick is at most `ahead` + `longest_wait` ticks away: the sample was sent
+        `ahead` ticks after the present tick (negative for an earlier sample), and then waits
+        for at most `longest_wait` ticks.
 
         If the clock of the peer is too far ahead, the buffer is not enlarged, and the sample is
-        refused later. Otherwise `newest` is updated: it is the newest sample of the peer that
-        fits into the buffer as it is now. Samples up to this one need no call of this method.
+        rejected later. Otherwise `newest` is updated: it is the newest sample of the peer that
+        fits into the buffer as it is now. Samples up to `newest` need no call of this method.
 
         Args:
             arrays: Arrays of the site, the process that receives the sample.
@@ -463,8 +464,8 @@ class CalendarSizer:
             tick: Tick of the peer in which it sent the sample.
 
         Returns:
-            The same arrays if the sample fits, is to be refused, or if the buffers have their
-            largest size. Otherwise arrays with larger buffers.
+            The same arrays if the sample fits, if it will be rejected, or if the buffers have
+            their largest size. Otherwise arrays with larger buffers.
         """
         rate_hz = self._rate_hz
         peer_hz = self._peer_hz[peer]
@@ -472,7 +473,7 @@ class CalendarSizer:
         sent_at_tick = tick * rate_hz // peer_hz  # in ticks of this site
         ahead = sent_at_tick - k
         if ahead > span_ticks(AHEAD_LIMIT_NS, rate_hz):
-            return arrays  # the sample will be refused
+            return arrays  # the sample will be rejected
 
         needed = ahead + longest_wait
         pages = arrays.calendars.shape[1]
@@ -491,7 +492,7 @@ class CalendarSizer:
 def _add_ramp(arrays: SiteArrays, ramp: DominanceRamp) -> None:
     """Adds a planned change of the weights with which an arm follows the other arms.
 
-    The changes stand in a table, which is sorted by their start times.
+    The changes are stored in a table, which is sorted by their start times.
 
     Args:
         arrays: Arrays of the site (the process that runs the arm). Their table must have a free
@@ -513,7 +514,7 @@ def _add_ramp(arrays: SiteArrays, ramp: DominanceRamp) -> None:
 def _add_model(arrays: SiteArrays, peer: int, model: LinkModel) -> None:
     """Adds a planned change of a network link's delay and loss.
 
-    The changes stand in a table, which is sorted by the time from which each applies.
+    The changes are stored in a table, which is sorted by the time from which each applies.
 
     Args:
         arrays: Arrays of the site (the process that runs the arm). Their table must have a free
@@ -538,11 +539,12 @@ def _add_model(arrays: SiteArrays, peer: int, model: LinkModel) -> None:
 
 
 MAX_CHANGES = 4096
-"""Largest number of changes of one link besides those of the scenario."""
+"""Largest number of changes of one link in addition to those in the scenario."""
 MAX_RAMPS = 256
-"""Largest number of waiting changes of the dominance factors besides those of the scenario.
+"""Largest number of waiting changes of the dominance factors that are not in the scenario.
 
-A run may have any number of changes: those that have begun are folded, see `fold_ramps`.
+A run may have any number of changes, because changes that have begun are removed, see
+`fold_ramps`.
 """
 
 
@@ -554,11 +556,11 @@ def apply_change(arrays: SiteArrays, change: CoreChange, t_ns: int) -> None:
     - The message that the site missed ticks, the periods of its control loop. Their number is
       stored until the next tick.
     - An order, for example to stop the arm. The next tick carries it out. If several orders
-      come before this tick, the one with the highest number counts, see `LifeOrder`.
+      arrive before this tick, the order with the highest number counts, see `LifeOrder`.
     - A new model of the delay and loss of a link. It is added to the table of the link's
-      models, and applies from its start time on.
-    - A ramp of the dominance factors, the weights with which the arm follows the other arms.
-      It is added to the table of ramps, from which old ramps are removed before.
+      models, and applies from its start time.
+    - A ramp of the dominance factors, the weights with which the arm follows the other arms. It
+      is added to the table of ramps, after old ramps have been removed.
 
     Args:
         arrays: Arrays of the site; changed.
@@ -581,7 +583,7 @@ def apply_change(arrays: SiteArrays, change: CoreChange, t_ns: int) -> None:
             raise ValueError(f"a run can have at most {MAX_CHANGES} changes to a link")
         _add_model(arrays, change.peer, change.model)
     if change.ramp is not None:
-        # Remove the ramps that are over, to have room for the new one.
+        # Remove the ramps that are over, to make room for the new ramp.
         s.ramps = fold_ramps(t_ns, int(s.ramps), arrays.ramps)
         if s.ramps >= len(arrays.ramps):
             raise ValueError(
@@ -591,13 +593,14 @@ def apply_change(arrays: SiteArrays, change: CoreChange, t_ns: int) -> None:
 
 
 _NEAR_NS = NS_PER_S // 4
-"""Lead of senders over a receiver that is a little late: calendars have pages for it, ns."""
+"""Time by which senders may be ahead of a slightly late receiver without a larger buffer, ns.
+"""
 MAX_LINKS_BYTES = 64 << 20
 """Largest memory of a site's links beyond what their delays need, bytes."""
 _SLACK = 4
-"""Reserve, ticks: a sample is scheduled up to two ticks before it is filed."""
+"""Reserve in ticks, because a sample is scheduled up to two ticks before it is stored."""
 _NEVER_SAMPLED = 2
-"""Marks an actor that only fills up a stack: it is evaluated neither per stage nor per tick."""
+"""Marks an actor that only pads a stack, and is evaluated neither per stage nor per tick."""
 
 
 def _share_tables(sites: Sequence[SiteArrays]) -> None:
@@ -624,17 +627,18 @@ def _share_tables(sites: Sequence[SiteArrays]) -> None:
 def _stack_channels(
     setups: Sequence[SiteSetup], channels: Sequence[ChannelArrays]
 ) -> ChannelArrays:
-    """Stacks the arrays for the numbers that control laws send, over several sites.
+    """Stacks the arrays for the values that control laws send, for several sites.
 
     A site is the process that runs one arm, and its peers are the other sites. The law of a
-    peer sends A numbers to all sites, and E numbers to each of them. A single site receives
-    only the A + E numbers that are meant for it. In a simulation of all sites, it reads the
-    record of the peer, which contains the numbers for all of its receivers:
+    peer sends A values to all sites, and E values to each of them. A single site receives only
+    the A + E values that are meant for it. In a simulation of all sites, it reads the record of
+    the peer, which contains the values for all of its receivers:
 
         a single site:  A to all | E to this site
         record:         A to all | E to receiver 0 | E to receiver 1 | ...
 
-    Therefore the column of a number to each site grows by E for each receiver before this site.
+    Therefore, for values that are sent to each site separately, the column increases by E for
+    each receiver before this site.
 
     Args:
         setups: Setups of the sites.
@@ -655,7 +659,8 @@ def _stack_channels(
     received = _stack_padded([channel.received for channel in channels])
     columns = _stack_padded([channel.columns for channel in channels])
     for channel, padded in zip(channels, columns, strict=True):
-        # Padding with zeros would mean column 0: -1 stands for a number that is not sent.
+        # Zeros would mean column 0, so the padding is -1, which stands for a value that is not
+        # sent.
         count = channel.columns.shape[1]
         padded[:, count:] = -1
     return ChannelArrays(waiting, received, columns)
@@ -724,7 +729,7 @@ def _build_site(setup: SiteSetup, layout: Layout) -> RowArray:
         s.singular_value = task.singular_value
         s.axes[: site_layout.shared] = task.axes
         s.posture[: site_layout.joints] = task.posture or setup.q0
-    # Views of the fields of a row take longer than the numbers themselves.
+    # Creating a view of each field would take longer than copying the numbers.
     floats = site.view(np.float64)
     places = _find_places(layout, site_layout)
     for name, numbers in _list_vectors(setup).items():
@@ -734,7 +739,7 @@ def _build_site(setup: SiteSetup, layout: Layout) -> RowArray:
 
 @cache
 def _find_places(layout: Layout, site_layout: Layout) -> dict[str, slice]:
-    """Returns the place of each vector among all numbers of a site's row, by its name.
+    """Returns the position of each vector among all numbers of a site's row, by its name.
 
     Args:
         layout: Layout of the row.
@@ -776,13 +781,13 @@ def _list_vectors(setup: SiteSetup) -> dict[str, Any]:
 
 
 def _build_channel(setup: SiteSetup, pages: int) -> ChannelArrays:
-    """Creates the arrays for the numbers that the control laws of other arms send.
+    """Creates the arrays for the values that the control laws of other arms send.
 
-    Some control laws send numbers besides the motion of the arm, for example energies. The
+    Some control laws send values besides the motion of the arm, for example energies. The
     arrays are empty for all other laws.
 
     Args:
-        setup: Setup of the site that receives the numbers.
+        setup: Setup of the site that receives the values.
         pages: Number of samples that can wait on each link until their delay has passed.
     """
     vectors = setup.received_vectors

@@ -29,7 +29,7 @@ from .vectors import Array, Points, Vector
 
 
 class Scheme(IntEnum):
-    """How the continuous control law is converted to a discrete one.
+    """Method by which the continuous control law is converted to a discrete one.
 
     SECOND_ORDER extrapolates the torque to the middle of the control period, and updates the
     parameter estimate by the trapezoid rule. DIGITAL uses a zero-order hold and the forward
@@ -51,8 +51,8 @@ class Law(IntEnum):
     Here q and qd are the joint angles and velocities, G is the gravity torque, e and ed are the
     errors of position and velocity, and felt is the torque that acts ON the other arms. The
     gains are the stiffness K, the damping d, the derivative gain Kd and the force gain k_f. The
-    gains decide whether this is P+d, PD+d or direct force reflection. USER is a law in Python,
-    either written by a user or from `trilat_net.laws`.
+    gains decide whether the law is P+d, PD+d or direct force reflection. USER is a law in
+    Python, either written by a user or from `trilat_net.laws`.
     """
 
     ADAPTIVE = 0
@@ -65,14 +65,14 @@ LEAST_STOP_S = 0.1
 
 
 class StaleAction(IntEnum):
-    """What a site does while a peer is silent for too long.
+    """Reaction of a site while a peer is silent for too long.
 
     A site is a process that runs one arm, and a peer is another site that it follows.
 
     USE follows the last known state of the peer. HOLD keeps the last reference, the position
-    that the arm follows. BRAKE keeps the pose that the arm had when the peer fell silent.
-    GLIDE brings the arm smoothly to rest. With GLIDE, the arm also waits at the start until all
-    peers are heard, see `session_life`.
+    that the arm follows. BRAKE keeps the pose that the arm had when the peer fell silent. GLIDE
+    brings the arm smoothly to rest. With GLIDE, the arm also waits at the start until samples
+    of all peers arrive, see `session_life`.
     """
 
     USE = 0
@@ -82,12 +82,12 @@ class StaleAction(IntEnum):
 
 
 class StaleRule(NamedTuple):
-    """What an arm does if no new message has come from another arm for too long.
+    """Reaction of an arm if no new message has arrived from another arm for too long.
 
     The other arm is called a stale peer. The process that runs an arm is called a site.
 
     Attributes:
-        action: What the site does while a peer is stale.
+        action: Reaction of the site while a peer is stale.
         age_ns: Largest age of the newest sample, ns. For GLIDE, the largest time since a new
             sample could be used.
         return_ns: Duration of the return to the reference of the peers, ns. Not used for GLIDE.
@@ -111,7 +111,7 @@ class MotionLimits(NamedTuple):
     A limit is one number for all joints or coordinates, or one number for each of them.
 
     Attributes:
-        q_min: Least joint angles, rad.
+        q_min: Smallest joint angles, rad.
         q_max: Largest joint angles, rad.
         qd_des_limit: Largest speed of the reference, rad/s; in task space m/s.
         tau_rate: Largest rate of the control torque, N m/s.
@@ -131,8 +131,8 @@ class RestGains(NamedTuple):
 
     Attributes:
         damping: Damping B of the joints, N m s/rad.
-        time_s: Time constant with which the damping alone stops a joint, s. It holds for the
-            inertia for which B was chosen.
+        time_s: Time constant with which the damping alone stops a joint, s. This is true for
+            the inertia for which B was chosen.
         deceleration: Deceleration of the reference, the motion that the joints follow while
             they come to rest, rad/s^2.
     """
@@ -142,7 +142,7 @@ class RestGains(NamedTuple):
     deceleration: Vector = (math.inf,)
 
     def vectors(self) -> dict[str, Vector]:
-        """Returns the gains by the names of the fields in which the state of an arm holds them.
+        """Returns the gains by the names of their fields in the state of an arm.
 
         They are "damping", "integral" and "deceleration". The integral gain is the damping
         divided by 4 `time_s`, in N m/rad.
@@ -175,23 +175,23 @@ class LinkSetup(NamedTuple):
 
     Attributes:
         peer: Name of the peer.
-        alpha: Its dominance factor, the weight of the peer in this site's reference, Eq. (6).
+        alpha: Dominance factor of the peer, its weight in this site's reference, Eq. (6).
         rate_hz: Tick rate of the peer, Hz.
         q0: Start pose of the peer, rad, or of its end effector; in use until the first sample
             is due (L7).
         key: Key from which the random numbers of the link follow, see `link_key`.
-        models: Models of the delay in the order of their first stamps; the first one applies
+        models: Models of the delay in the order of their first stamps. The first model applies
             from stamp 0.
-        traces: Per model the points of its trace, a table of delays by time, shape (n, 2), see
-            `Points`, or None.
+        traces: For each model the points of its trace, a table of delays by time, shape (n, 2),
+            see `Points`. None for a model without a trace.
         outages: Interruptions of the link: pairs of first stamp and end, ns.
-        channel: Numbers that the peer's law sends besides its motion.
+        channel: Values that the peer's law sends besides the motion of the peer.
         index_at_peer: Index of this site among the peers of the peer, in scenario order.
         speed_limit: Largest speeds of the peer's joints, rad/s, beyond which its samples are
-            dropped; (): no limit.
+            dropped. () for no limit.
         bit: Bit of the peer in sets of sites, which are integers with a bit per site.
         followed: Set of the sites that the peer follows.
-        dispensable: True: the site may go on without the peer if the peer is lost.
+        dispensable: True if the site may continue without the peer after the peer is lost.
     """
 
     peer: str
@@ -276,7 +276,7 @@ class ChainSetup(NamedTuple):
     """Settings of an arm that is a chain of joints, as read from a URDF file.
 
     Attributes:
-        joints: The joints, from the base on.
+        joints: The joints, starting at the base.
         gravity_m_s2: Gravitational acceleration in the frame of the base, m/s^2.
         tip_m: Position of the end effector in the frame of the last link, m.
         tip_rotation: Orientation of the end effector in that frame.
@@ -291,29 +291,29 @@ class ChainSetup(NamedTuple):
 
 
 class Gains(NamedTuple):
-    """Kind of control law of an arm, and its gains, in the form that compiled code reads.
+    """Kind of control law of an arm and the gains of the law, in a form for compiled code.
 
     Gains of other kinds of law have no effect. Diagonal matrices are vectors. A vector of one
     number has this number for all its entries.
 
     Attributes:
         law: The law.
-        Lambda: Shape (n,), 1/s.
-        Kp: Shape (n,), N m s/rad.
-        Kd: Shape (n,), N m s/rad.
+        Lambda: Rate at which errors decay, shape (n,), 1/s.
+        Kp: Damping of the filtered error, shape (n,), N m s/rad.
+        Kd: Damping of the error's velocity, shape (n,), N m s/rad.
         Gamma: Adaptation gain per parameter, shape (P,).
         theta_hat0: The first estimate, shape (P,).
         low: Lower bound of each estimate, shape (P,).
-        high: Upper bound, shape (P,).
+        high: Upper bound of each estimate, shape (P,).
         known: The parameters that KNOWN assumes, shape (P,).
         K: Stiffness of KNOWN, shape (n,), N m/rad.
         d: Damping of KNOWN, shape (n,), N m s/rad.
         k_f: Gain of the reflected force of KNOWN, shape (n,), dimensionless.
         rho: Largest robust torque of ADAPTIVE, shape (n,), N m.
         width: Speed r at which the robust torque is 0.71 rho, shape (n,), rad/s.
-        friction: Part of a chain's joint friction that ADAPTIVE compensates, shape (n,).
-        absolute: True: r of ADAPTIVE is qd + Lambda q, and Kp couples it to r of the peers;
-            only linear analysis uses this.
+        friction: Fraction of a chain's joint friction that ADAPTIVE compensates, shape (n,).
+        absolute: True if r of ADAPTIVE is qd + Lambda q, and Kp couples it to r of the peers.
+            Only the linear analysis uses this.
     """
 
     law: Law
@@ -346,7 +346,8 @@ class SiteSetup(NamedTuple):
         scheme: The sampling of the law.
         gains: The law and its gains.
         theta: The true parameters of the arm, shape (P,).
-        g_m_s2: Gravitational acceleration, m/s^2; a chain has that of its setup instead.
+        g_m_s2: Gravitational acceleration, m/s^2. A chain uses the value of its `ChainSetup`
+            instead.
         lengths_m: Lengths of the two links, m; without effect for a chain.
         tau_limit_nm: Largest control torque of a joint, N m; one number, or one per joint.
         qd_limit_rad_s: Joint speed beyond which the run counts as diverged, rad/s.
@@ -356,12 +357,13 @@ class SiteSetup(NamedTuple):
         links: The links from the peers, in scenario order.
         ramps: The scripted changes of the dominance factors, in the order of their starts.
         on_stale: The rule for a stale peer.
-        external: True: the arm is outside of the program: it is measured, and not integrated.
+        external: True if the arm is outside the program, so that its motion is measured and not
+            simulated.
         law_factory: Creates the user's law. None if the kernel computes the law.
-        theta_known: False: `theta` does not describe the arm, which is external and not
-            identified.
+        theta_known: False if `theta` does not describe the arm, because the arm is external and
+            was not identified.
         chain: The arm if it is a chain. None for the planar two-link arm.
-        channel: The numbers that the site's law sends to its peers.
+        channel: The values that the site's law sends to its peers.
         limits: Limits of the motion.
         rest: The gains with which the arm comes to rest.
         bit: The bit of the site in sets of sites, which are integers with a bit per site.
@@ -404,7 +406,7 @@ class SiteSetup(NamedTuple):
 
     @property
     def live_actor(self) -> int:
-        """Index of the live operator among the operators and environments; -1: there is none.
+        """Index of the live operator among the operators and environments. -1 without one.
 
         A live operator is a person or program that moves the arm during the run.
         """
@@ -421,7 +423,7 @@ class SiteSetup(NamedTuple):
         besides the motion of its arm. A vector that another site does not send is zero.
 
         Returns:
-            A description of each vector, in the order in which the law receives them.
+            A description of each vector, in the order in which the law receives the vectors.
         """
         channels = [link.channel for link in self.links]
         return join_received([*channels, self.channel])

@@ -79,7 +79,7 @@ class TickParts(NamedTuple):
         glides: True if the arm comes to rest while a peer is silent (the rule `glide`).
         degrades: True if the site continues without lost peers.
         hand_index: Index of the person or program that moves the arm among the operators and
-            environments. -1 if there is none.
+            environments. -1 if nobody moves the arm.
     """
 
     buffers: TickBuffers
@@ -93,7 +93,7 @@ class TickParts(NamedTuple):
 
 
 class Site:
-    """One arm with its controller, and with the network links over which it receives.
+    """One arm with its controller, and the network links over which it receives samples.
 
     The process of an arm (site) creates this object and calls `step` once per control period. A
     simulation in virtual time does the same for each arm.
@@ -106,8 +106,8 @@ class Site:
         rate_hz: Tick rate, Hz.
         peers: Names of the peers, in scenario order.
         layout: Lengths of the site's vectors.
-        law_failure: Last failure of a user's law under the rule `glide`; None if it never
-            failed.
+        law_failure: Last failure of a user's law under the rule `glide`. None if the law has
+            never failed.
     """
 
     def __init__(self, setup: SiteSetup) -> None:
@@ -164,7 +164,7 @@ class Site:
         self._used_ns = self._links["used_ns"]
         self._gone = self._links["gone"]
         self._reflects = bool(np.any(setup.gains.k_f)) or self._user_law is not None
-        # A user's hand sees the forces that its site received.
+        # A user's program that moves the arm receives the forces that its site received.
         self._keeps_forces = self._reflects or self._hand is not None
 
     def _find_hand(self, index: int) -> tuple[Array, Array, Array]:
@@ -196,8 +196,8 @@ class Site:
         functions: `_sense` computes the stages of a tick before the torque, and `_act` those
         after it. Without such a law, nothing is compiled here.
 
-        `_user_law` is the user's object. `_law` calls it with the arrays of this site, and may
-        be a compiled form of it. Both are None without such a law.
+        `_user_law` is the user's object. `_law` calls this object with the arrays of this site,
+        and may be a compiled form of the object. Both are None without a user's law.
 
         Args:
             setup: Setup of the site, which may contain a factory of the law.
@@ -213,9 +213,9 @@ class Site:
         arrays = self._arrays
         buffers = self._buffers
         self._law = plug_law(self._user_law, setup, arrays, self._sent)
-        # Compile now, and not within the time that the law has for a tick. The arguments serve
-        # for their types: the zeros stand for the tick, its time in ns, and the count of
-        # arrivals.
+        # Compile now, and not within the time that the law has for a tick. Only the types of
+        # the arguments matter: the zeros take the place of the tick, its time in ns, and the
+        # number of arrivals.
         self._law.bind()
         self._sense = bind_leaf(sense_stages, 0, 0, 0, arrays, buffers)
         self._act = bind_leaf(
@@ -247,11 +247,11 @@ class Site:
             self._sizer.add_model(command.peer, command.model)
 
     def start_at(self, k: int) -> None:
-        """Makes tick (control period) `k` the first one of an arm that joins a running session.
+        """Makes `k` the first tick (control period) of an arm that joins a running session.
 
-        No tick must have been computed before. The arm stands at its start pose, and no sample
-        (state) of another arm is in use or waits. The models of delay and loss of the links
-        process all samples that the other arms have sent until tick k - 1.
+        No tick must have been computed before. The arm is at rest in its start pose, and no
+        sample (state) of another arm is in use or waits. The models of delay and loss of the
+        links process all samples that the other arms have sent until tick k - 1.
 
         Args:
             k: Number of the first tick.
@@ -265,7 +265,8 @@ class Site:
             peer_hz = int(link["rate_hz"])
             last_sample = (k - 1) * peer_hz // self.rate_hz
             if last_sample >= 0:
-                # Not for its result: it advances the random models of the link to this sample.
+                # The result is not needed: the call advances the random models of the link to
+                # this sample.
                 find_release(n, last_sample, self._arrays)
         # Copies of samples that were sent before the site joined do not count.
         self._links["copies"] = 0
@@ -310,7 +311,8 @@ class Site:
             row[column] for column in self._state_columns
         ]
         x, xd, wrench = [row[column] for column in self._shared_columns] or _NO_SHARED
-        # Positional: a call that names the twenty fields takes 3 microseconds longer.
+        # Positional arguments, because a call that names the twenty fields takes 3 microseconds
+        # longer.
         return TickRecord(
             tick.k,
             t_ns,
@@ -430,12 +432,12 @@ class Site:
 
     @property
     def mode(self) -> Mode:
-        """What the arm did in the last control period, for example RUN: it followed others."""
+        """Mode of the arm in the last control period, for example RUN if it followed others."""
         return _MODES[self._mode.item()]
 
     @property
     def life_reason(self) -> LifeReason:
-        """Why the arm last changed its mode, for example because another arm fell silent.
+        """Reason why the arm last changed its mode, for example that another arm fell silent.
 
         Reasons exist only under the rule `glide`, see `session_life`.
         """
@@ -448,7 +450,7 @@ class Site:
 
     @property
     def parts(self) -> "TickParts":
-        """Internal parts by which `recorded_ticks` computes many control periods at once."""
+        """Internal parts with which `recorded_ticks` computes many control periods at once."""
         return TickParts(
             buffers=self._buffers,
             calendar_sizer=self._sizer,
@@ -464,7 +466,7 @@ class Site:
     def q(self) -> list[float]:
         """Joint angles at the start of the next control period, one per joint, rad.
 
-        The last record has those at the start of its own period.
+        The last record contains the joint angles at the start of its own period.
         """
         joints = self.layout.joints
         angles: list[float] = self._site[0]["q"][:joints].tolist()
@@ -497,10 +499,10 @@ class Site:
     def _compute_crc(self, packed_bytes: int, arrivals: int) -> int:
         """Returns the checksum of the samples (states of other arms) that arrived, for the log.
 
-        A later verification of the log compares it. Only what this site uses is part of the
-        checksum: sender, tick and motion of each sample, then the forces if the site reflects
-        forces to its user, then the numbers that the other control laws send if the law of this
-        site reads such numbers.
+        A later verification of the log compares the checksum, which covers only what this site
+        uses: sender, tick and motion of each sample, then the forces if the site reflects
+        forces to its user, then the values that the other control laws send if the law of this
+        site reads such values.
 
         Args:
             packed_bytes: Number of bytes of the packed arrivals: peers, ticks and motions.
@@ -566,7 +568,7 @@ class Site:
         return tuple(counts)
 
     def release_tick(self, peer: int, tick: int) -> int | None:
-        """Finds the control period of this arm in which a message of another arm is used first.
+        """Finds the control period of this arm in which another arm's message is first used.
 
         Control periods are called ticks. A message (sample) is the state that the other arm
         (peer) sends once per period of its own loop.
@@ -584,7 +586,7 @@ class Site:
         return None if release == LOST else release
 
     def is_measured(self, peer: int) -> bool:
-        """Returns True if only the real network delays a link, and no delay is simulated.
+        """Returns True if a link has only the delay of the real network, not a simulated one.
 
         Args:
             peer: Index of the sender at the other end of the link.
@@ -594,7 +596,7 @@ class Site:
         return bool(model["kind"] == DelayKind.MEASURED)
 
     def peer_rate_hz(self, peer: int) -> int:
-        """Returns the rate of another arm's control loop, which may differ from this one's, Hz.
+        """Returns the rate of another arm's control loop, Hz, which may differ from this arm's.
 
         Args:
             peer: Index of the other arm (peer), in scenario order.
@@ -614,7 +616,7 @@ class Site:
           silent, the further numbers that `_restore_life` reads,
         - the numbers that the user's law remembers, if there is one.
 
-        `mem` is empty if nothing is to be remembered.
+        `mem` is empty if there are no such numbers.
 
         Args:
             before: Record of the control period before `last`. If `last` is the first record,
@@ -638,7 +640,7 @@ class Site:
         law_memory = last.mem[shared + 1 :]
         if self._glides and law_memory:
             law_memory = self._restore_life(law_memory)
-        self._sent[:] = last.ch or 0.0  # `ch` is empty if the law sends no numbers
+        self._sent[:] = last.ch or 0.0  # `ch` is empty if the law sends no values
         self._apply_hand(last.hand)
         if self._law is not None:
             self._law.restore(law_memory)
@@ -649,7 +651,7 @@ class Site:
     def _restore_life(self, memory: list[float]) -> list[float]:
         """Restores the memory of the rule `glide` from the field `mem` of a record.
 
-        By this rule, an arm comes to rest while a peer (another arm) is silent, see
+        Under this rule, an arm comes to rest while a peer (another arm) is silent, see
         `session_life`. The numbers are read in the order in which `_held_memory` writes them:
 
         - `qd_held`: the rate of the held reference, one number per shared coordinate,
@@ -687,7 +689,8 @@ class Site:
         if self._degrades:
             self._links["gone"] = remaining[:peers]
             remaining = remaining[peers:]
-        # Orders and missed ticks are inputs of the tick that applies them: none is waiting.
+        # Orders and missed ticks are inputs of the tick that applies them, so none are pending
+        # here.
         s.order = 0
         s.skipped = 0
         return remaining
@@ -736,13 +739,13 @@ class Site:
         accept_stage(k, len(waiting), self._arrays, self._buffers)
 
     def _restore_received(self, peer: int, sample: Arrival | None) -> None:
-        """Restores the numbers that the control law of a peer sent with the sample in use.
+        """Restores the values that the control law of a peer sent with the sample in use.
 
-        Control laws that users wrote can send numbers to each other, besides the motion of the
-        arms. They travel in the field `ch` of a sample, the state that a peer (another arm's
-        process) sends. The law of this site reads them in an order of its own. The array
-        `columns` contains for each number that it reads the index in `ch`, or -1 if the law of
-        the peer does not send this number. Such a number is 0.
+        Control laws that users wrote can send values to each other, besides the motion of the
+        arms. The values are in the field `ch` of a sample, the state that a peer (another arm's
+        process) sends. The law of this site reads the values in an order of its own. For each
+        value that it reads, the array `columns` contains the index in `ch`, or -1 if the law of
+        the peer does not send this value, which is 0 then.
 
         Args:
             peer: Index of the peer.

@@ -24,7 +24,7 @@ from ..links.delay import LinkModel
 from .jit import leaf
 
 BUCKETS_PER_S = 20
-"""Equal parts of a second for which a run that is reduced to peaks keeps the peaks."""
+"""Number of intervals per second for which a run without a log keeps its largest values."""
 
 
 @leaf
@@ -57,11 +57,11 @@ def first_tick_at(due_ns: int, rate_hz: int) -> int:
 
 
 MAX_ARRIVALS = 4096
-"""Largest number of arrivals of one tick; a driver keeps further ones for the next tick."""
+"""Largest number of arrivals in a tick. A driver keeps further arrivals for the next tick."""
 
 
 class LifeReason(IntEnum):
-    """Why an arm last changed its mode, for example because another arm fell silent.
+    """Reason why an arm last changed its mode, for example that another arm fell silent.
 
     The reasons only exist under the rule `glide`, by which an arm waits for the others and
     comes to rest while one of them is silent. `session_life` explains this rule.
@@ -91,7 +91,7 @@ class LifeReason(IntEnum):
 
 
 RELEASE_REASONS = (LifeReason.RELEASED, LifeReason.STOP_RELEASED)
-"""Reasons of a stop after a release of the dead-man switch, so that brakes hold the arm."""
+"""Reasons of a stop in which brakes hold the arm, because its dead-man switch was released."""
 
 
 class LifeOrder(IntEnum):
@@ -113,8 +113,8 @@ class LifeOrder(IntEnum):
     - HELD: somebody holds the dead-man switch again.
     - OVERRUN: the site was too slow and missed control periods.
 
-    If several orders come in the same period, the order with the highest number counts. OVERRUN
-    is applied in addition.
+    If several orders arrive in the same period, the order with the highest number counts.
+    OVERRUN is applied in addition.
     """
 
     ENABLE = 1
@@ -185,10 +185,10 @@ class PlantState(NamedTuple):
 
 
 class TickInput(NamedTuple):
-    """Everything from outside that may influence one period of the control loop.
+    """All external inputs that may influence one period of the control loop.
 
-    `Site.step` receives it. Time, messages and measurements come in here, so that the same
-    input always gives the same results.
+    `Site.step` receives this object. It contains the time, the messages and the measurements,
+    so the same input always gives the same results.
 
     Attributes:
         k: Number of the period.
@@ -197,8 +197,8 @@ class TickInput(NamedTuple):
         commands: Changes of the settings that were ordered since the previous period.
         measured: Measured state of a real or otherwise external arm. None if there is no new
             measurement.
-        hand: What a person or program does with the arm in this period, see `live_hand`. Empty
-            if nobody holds the arm.
+        hand: Action of a person or program on the arm in this period, see `live_hand`. Empty if
+            nobody holds the arm.
     """
 
     k: int
@@ -209,17 +209,17 @@ class TickInput(NamedTuple):
 
 
 class LinkCounts(NamedTuple):
-    """Counts of the messages on one network link since the start, such as late and lost ones.
+    """Counts of messages on one network link since the start, such as late and lost messages.
 
     A link leads from another arm's process (peer) to this one. A message is a sample, the state
     of the peer in one control period.
 
     Attributes:
         accepted: Samples that arrived.
-        late: Of those, samples that arrived after they were due.
-        duplicate: Of those, samples that had arrived before.
-        refused: Of those, samples whose stamp was out of range.
-        lost: Of those, samples that the link's model of losses dropped.
+        late: Arrived samples that came after they were due.
+        duplicate: Arrived samples that had already arrived before.
+        refused: Arrived samples whose stamp was out of range.
+        lost: Arrived samples that the link's model of losses dropped.
         superseded: Samples that were never used, because a newer sample was released before
             them or in the same tick.
         copies: Duplicates that the link's model produced.
@@ -267,7 +267,7 @@ def find_life_reason(output: TickRecord) -> LifeReason:
 
 
 class LifeAlarm(NamedTuple):
-    """Alarm for people: why an arm does not follow the others, and what they can do.
+    """Alarm that tells people why an arm does not follow the others, and what they can do.
 
     `LifeAlarm.find` creates it. Pages and terminals show it as long as the arm stays in this
     mode.
@@ -303,9 +303,10 @@ class LifeAlarm(NamedTuple):
     ) -> "LifeAlarm | None":
         """Returns the alarm that tells people why an arm does not follow the other arms.
 
-        Only an arm under the rule `glide` has alarms. By this rule it comes to rest while
-        another arm (peer) is silent. After a fault or a stop, it follows again after a person's
-        order. All facts come from the arm's record, the stored result of one control period.
+        Only an arm under the rule `glide` has alarms. Under this rule, it comes to rest while
+        another arm (peer) is silent. After a fault or a stop, it waits for an order of a person
+        before it follows again. All facts come from the arm's record, the stored result of one
+        control period.
 
         Args:
             session: Name of the session, which the advice of the alarm quotes.
@@ -314,7 +315,7 @@ class LifeAlarm(NamedTuple):
             mem: Numbers that the site keeps from tick to tick, the field `mem` of the record.
                 They contain the reason for the mode.
             shared: Number of coordinates that sites share, by which `mem` is divided.
-            lost: Names of the peers without which the site goes on.
+            lost: Names of the peers without which the site continues.
 
         Returns:
             The alarm. None if the site needs no attention, or if the record is not from a site
@@ -329,7 +330,7 @@ class LifeAlarm(NamedTuple):
         if mode not in _ALARM_MODES and not is_too_far:
             return _find_lost_alarm(lost)
 
-        # The dead-man switch ends a release, and no order does.
+        # Only the dead-man switch can end a release, not an order.
         order = "" if reason is LifeReason.RELEASED else _ORDERS.get(mode, "")
         before = _REMEDIES.get(reason, "") if mode == "fault" else ""
         advice = _DEFAULT_ADVICE
@@ -353,18 +354,19 @@ _ADVICE = {
     ("stopped", LifeReason.RELEASED): "hold the switch",
     ("fault", LifeReason.RELEASED): "hold the switch",
     ("hold", LifeReason.RELEASED): "hold the switch",
-    ("hold", LifeReason.ARM_SILENT): "it goes on by itself once its arm is heard",
+    ("hold", LifeReason.ARM_SILENT): "it continues by itself once its arm sends again",
     ("hold", LifeReason.ALIGN_LIMIT): "bring the arms closer together",
     ("waiting", LifeReason.ALIGN_LIMIT): "bring the arms closer together",
 }
-_DEFAULT_ADVICE = "it goes on by itself once all its peers are heard"
+_DEFAULT_ADVICE = "it continues by itself once samples arrive from all its peers"
 
 
 def _find_lost_alarm(lost: Sequence[str]) -> LifeAlarm | None:
-    """Returns the alarm of an arm that goes on without lost arms. None if no arm is lost.
+    """Returns the alarm of an arm that continues without lost arms, or None if no arm is lost.
 
-    The other arms (peers) have got the weight (share) of the lost one. Example of the alarm's
-    word: "WITHOUT m2". It asks for no order, because a lost arm gets its share back by itself.
+    The weight (share) of the lost arm is divided among the other arms (peers). The `word` of
+    the alarm is, for example, "WITHOUT m2". No order is needed, because a lost arm gets its
+    share back automatically when it returns.
 
     Args:
         lost: Names of the lost peers.
@@ -374,8 +376,8 @@ def _find_lost_alarm(lost: Sequence[str]) -> LifeAlarm | None:
     names = ", ".join(lost)
     return LifeAlarm(
         word=f"WITHOUT {names}",
-        reason="the others have its share",
-        advice=f"the share comes back by itself once {names} is there again",
+        reason="its share is divided among the other peers",
+        advice=f"the share is given back automatically once samples arrive from {names} again",
     )
 
 
@@ -396,20 +398,18 @@ def describe_mode(
     """Writes the sentence with which a site reports a change of its mode in the log.
 
     A site is the process that runs one arm, and its peers are the other sites. The sentence
-    states what the arm does, from which time on, and why, for example "s holds its reference
-    from t = 1.250 s: a peer is stale". A peer is stale if nothing has come from it for too
-    long.
+    states what the arm does, since when, and why, for example "s holds its reference from t =
+    1.250 s: a peer is stale". A peer is stale if no sample has arrived from it for too long.
 
-    No reason is given for what happens as soon as the peers are heard: that the arm returns to
-    them (RETURN) and follows them (RUN). An exception is a return because a peer was dropped or
-    restored.
+    No reason is given for the modes RETURN and RUN, which follow as soon as samples of all
+    peers arrive, unless the arm returns because a peer was dropped or restored.
 
     Args:
         site: Name of the site.
         output: Record of the first tick (period of the control loop) in the mode.
-        glides: True: the site is under the rule `glide`, by which an arm comes to rest while a
-            peer is silent. Its record contains the reason for the mode. Without this rule, the
-            mode can only change because of a stale peer.
+        glides: True if the site is under the rule `glide`, by which an arm comes to rest while
+            a peer is silent. Its record then contains the reason for the mode. Without this
+            rule, the mode can only change because of a stale peer.
         law_failure: Error with which the user's control law failed last, or None. It is given
             as the reason if the mode is due to this failure. It is only used under the rule
             `glide`.

@@ -59,7 +59,7 @@ def put(a: Any, values: Any) -> None:
         a[i] = values[i]
 
 
-# A tuple is not indexed by the variable of a loop: the compiled code would branch on it.
+# No loop is used: indexing a tuple by a loop variable would compile to branches.
 @leaf
 def put_pair(a: Any, values: Pair) -> None:
     """Overwrites an array of length 2 with two numbers, without allocating memory."""
@@ -81,9 +81,9 @@ def put_five(a: Any, values: Five) -> None:
 def choose(condition: bool, if_true: float, if_false: float) -> float:
     """Returns one of two numbers, without a branch in the compiled code.
 
-    Both numbers are computed before. With `choose` in place of `if`, a function can also be
-    compiled for several simulations side by side (SIMD), where each may need another choice.
-    See `core/lanes`.
+    Both numbers are always computed. With `choose` in place of `if`, a function can also be
+    compiled for several simulations side by side (SIMD), each of which may need a different
+    choice. See `core/lanes`.
 
     Args:
         condition: The condition.
@@ -95,7 +95,7 @@ def choose(condition: bool, if_true: float, if_false: float) -> float:
 
 @leaf
 def holds_anywhere(condition: bool) -> bool:
-    """Returns the condition itself; for several simulations, True if it holds in any of them.
+    """Returns the condition, or for several simulations, True if it holds in any of them.
 
     Code that is compiled for several simulations side by side may skip an operation only if
     none of them needs it, see `choose`.
@@ -150,8 +150,8 @@ Row = Any
 Points = NDArray[np.int64]
 """A table of pairs, shape (n, 2), of traces and then of outages.
 
-The points of a trace are the time since its first point, us, and the delay, us; -1: the sample
-is lost. An outage is its first stamp and its end, ns.
+A point of a trace consists of the time since the first point, us, and the delay, us, which is
+-1 if the sample is lost. An outage consists of its first stamp and its end, ns.
 """
 
 RowArray = NDArray[np.void]

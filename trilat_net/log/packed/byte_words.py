@@ -23,7 +23,7 @@ _SIGN = 1 << 63
 
 
 def _generate_load(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-    """Generates the load of eight bytes at any place of an array of bytes."""
+    """Generates the code that loads eight bytes at any offset of an array of bytes."""
     data, offset = args
     array = context.make_array(signature.args[0])(context, builder, data)
     pointer = builder.gep(array.data, [offset])
@@ -33,13 +33,13 @@ def _generate_load(context: Any, builder: Any, signature: Any, args: Any) -> Any
 
 @intrinsic
 def _load_compiled(_context: Any, data: Any, _place: Any) -> Any:
-    """Generates the load of a word in the byte order of the processor."""
+    """Generates the code that loads a word in the byte order of the processor."""
     return types.int64(data, types.intp), _generate_load
 
 
 @intrinsic
 def _load_swapped(_context: Any, data: Any, _place: Any) -> Any:
-    """Generates the load of a word in the other byte order."""
+    """Generates the code that loads a word in the opposite byte order."""
 
     def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
         return builder.bswap(_generate_load(context, builder, signature, args))
@@ -93,10 +93,9 @@ _is_little = sys.byteorder == "little"
 _little: Any = _load_compiled if _is_little else _load_swapped
 _big: Any = _load_swapped if _is_little else _load_compiled
 load_little: Any = _load_plain_little if _config.DISABLE_JIT else _little
-"""Loads the word at a place of an array, least byte first: `load_little(data, offset)`."""
+"""Loads a word from an array, least significant byte first: `load_little(data, offset)`."""
 load_big: Any = _load_plain_big if _config.DISABLE_JIT else _big
-"""Loads the word at a place of an array, most significant byte first: `load_big(data, offset)`.
-"""
+"""Loads a word from an array, most significant byte first: `load_big(data, offset)`."""
 copy_bytes: Any = _copy_plain if _config.DISABLE_JIT else _copy_compiled
 """Copies bytes between arrays that do not overlap: `copy_bytes(source, offset, target, first,
 length)`.

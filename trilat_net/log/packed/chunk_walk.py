@@ -5,8 +5,8 @@ all channels. `walk_messages` finds where each message lies, and `copy_payloads`
 messages of each channel.
 
 Invariant:
-    - The pass stops before everything but a complete message of a known channel, or a record
-      that a reader ignores. The caller reads the rest as it reads any other file.
+    - The pass stops at any record that is neither a complete message of a known channel nor a
+      record that a reader ignores. The caller reads the rest record by record.
 """
 
 from typing import Any, NamedTuple
@@ -21,7 +21,7 @@ from .packed_messages import Bytes, Ints
 
 _SCHEMA, _CHANNEL = map(int, DEFINITIONS)
 _MESSAGE_HEAD_BYTES = MESSAGE_HEAD.size
-# Places in the head of a message: the channel comes first.
+# Offsets in the head of a message, which begins with the channel.
 _LOG_TIME = 6
 _PUBLISH_TIME = _LOG_TIME + 8
 
@@ -49,7 +49,7 @@ class MessageRun(NamedTuple):
         begins: Offset of the payload's first byte in the chunk.
         ends: Offset after its last byte.
         log_ns: Time of arrival at the recorder, in Unix time, in ns, as a signed number.
-        publish_ns: Time of sending, in the same form.
+        publish_ns: Time of sending, in the same format.
         counts: Number of messages, per slot.
         lengths: Sum of the lengths of the messages with their heads, per slot, in bytes.
         excess: Sum of the lengths beyond a limit, per slot, in bytes.

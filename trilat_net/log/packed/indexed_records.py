@@ -1,7 +1,7 @@
-"""Gives the fields of many records of an arm as arrays, without decoding them one by one.
+"""Reads the fields of many records of an arm as arrays, without decoding records one by one.
 
 A record is the message with the state of an arm in one period of its control loop. Compiled
-code finds the place of each field in the encoded records once. Then, for example, the ticks of
+code finds the offset of each field in the encoded records once. Then, for example, the ticks of
 all records are read directly from the bytes.
 
 Invariant:
@@ -100,8 +100,8 @@ class IndexedRecords:
     def boots(self) -> Ints:
         """Random number that identifies the start of the process in each record, shape (K,).
 
-        A restarted process has another number. It has 64 bits and no sign, but is given as the
-        signed number with the same bits.
+        A restarted process has another number. The number is unsigned with 64 bits, but is
+        returned as the signed number with the same bits.
         """
         return self._heads[:, _BOOT]
 
@@ -165,8 +165,8 @@ class IndexedRecords:
 
         The shape is (K, numbers). Equal bits mean equal numbers, also for NaN and signed zeros.
         Compiled code reads the numbers at fixed distances after a known position (mark) in each
-        encoded record. A record has two such positions, so that the numbers are read in up to
-        two groups.
+        encoded record. A record has two such positions, so the numbers are read in up to two
+        groups.
 
         Args:
             fields: Names of the vectors. The records must have all of them.
@@ -225,7 +225,7 @@ class IndexedRecords:
         offset = 0
         for n, (name, count) in enumerate(zip(names, counts, strict=True)):
             if n == first_optional:
-                offset = 0  # the optional vectors have a mark of their own
+                offset = 0  # the optional vectors have their own mark
             mark = record_scan.VECTORS if n < first_optional else record_scan.OPTIONAL
             name_bytes = int(exact.lengths[FIRST_VECTOR + n])  # the name and the list's head
             offset += name_bytes
@@ -274,7 +274,7 @@ class IndexedRecords:
     def change_counts(self) -> NDArray[np.int32]:
         """Number of changes of settings that each record contains, shape (K,).
 
-        They are the strings of the field `cmd`. Most records contain none.
+        The changes are the strings of the field `cmd`. Most records contain no changes.
         """
         return self._counts[:, record_scan.CHANGE_COUNT]
 

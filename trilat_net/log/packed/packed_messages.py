@@ -14,8 +14,8 @@ Ints = NDArray[np.int64]
 Bytes = NDArray[np.uint8]
 
 PADDING = 16
-"""Number of bytes after the last message, so that eight bytes can be loaded at every place of a
-message, and after the head of a number at its end.
+"""Number of bytes after the last message, so that eight bytes can be loaded at every offset of
+a message, and after the head of a number at its end.
 """
 
 
@@ -27,8 +27,8 @@ class PackedMessages(Sequence[bytes]):
 
     Args:
         data: The messages, followed by `PADDING` bytes.
-        starts: Place of the first byte of each of the K messages, shape (K,).
-        ends: Place after the last byte of each message, shape (K,).
+        starts: Offset of the first byte of each of the K messages, shape (K,).
+        ends: Offset after the last byte of each message, shape (K,).
 
     Attributes:
         data: The bytes of all messages.

@@ -64,7 +64,7 @@ class RecordLayout(NamedTuple):
     def of_site(cls, site: str, peers: Sequence[str], layout: Layout) -> "RecordLayout":
         """Describes byte by byte how this program encodes the records of one arm.
 
-        Records of this form can be read without a general decoder, which is faster.
+        Records with this layout can be read without a general decoder, which is faster.
 
         Args:
             site: Name of the site.

@@ -1,11 +1,11 @@
 """Checks whether encoded records have the exact layout, and finds where their values lie.
 
-A record is the encoded state of an arm in one period of its control loop. Once the places of
+A record is the encoded state of an arm in one period of its control loop. Once the offsets of
 the values are known, a field of all records can be read directly from the bytes
 (`indexed_records`).
 
 Invariant:
-    - A record is accepted only if the decoder of whole records accepts it too, with the same
+    - A record is accepted only if the decoder of whole records also accepts it, with the same
       values.
     - A record with another order of fields, another version, or an unusual value is not
       accepted, even if it is valid.
@@ -39,7 +39,7 @@ from .record_layout import (
     NUMBER_BYTES,
 )
 
-# Columns of the marks of a record: the place of a value, from the first byte of the record.
+# Columns of the marks of a record: the offset of a value from the first byte of the record.
 TIME, VECTORS, USED, ARRIVALS, CRC, MEMORY, LATE, OPTIONAL = range(8)
 MARKS = 8
 """Number of the marks of a record."""
@@ -61,7 +61,7 @@ _UNSIGNED, _SIGNED, _NEGATIVE = 0xCC, 0xD0, 0xE0
 
 
 def _list_sizes() -> NDArray[np.int64]:
-    """Returns the length of an encoded integer by its first byte. 0 if it is no integer."""
+    """Returns the length of an encoded integer by its first byte. 0 for other bytes."""
     sizes = np.zeros(256, np.int64)
     sizes[:_SHORT_MAP] = 1
     sizes[_NEGATIVE:] = 1
@@ -100,7 +100,8 @@ def _read_int(data: Bytes, offset: int) -> int:
 def _after_literal(data: Bytes, offset: int, end: int, literal: int, layout: Any) -> int:
     """Returns the offset after constant bytes that every encoded record has at this point.
 
-    The result is -1 if the record has other bytes there, so that it must be decoded otherwise.
+    The result is -1 if the record has other bytes there. The record must then be decoded in
+    another way.
     """
     after: int = offset + layout.lengths[literal]
     if after > end:
@@ -176,7 +177,7 @@ def _after_floats(data: Bytes, offset: int, end: int, count: int) -> int:
 def _after_vectors(
     data: Bytes, offset: int, end: int, first: int, vectors: Ints, layout: Any
 ) -> int:
-    """Returns the offset after some vectors with their names. -1 if they are not all there."""
+    """Returns the offset after some vectors with their names. -1 if any of them is missing."""
     for n in range(vectors.shape[0]):
         offset = _after_literal(data, offset, end, first + n, layout)
         if offset >= 0:
@@ -220,7 +221,7 @@ def _after_stamps(data: Bytes, offset: int, end: int) -> int:
 def _after_texts(data: Bytes, offset: int, end: int) -> int:
     """Returns the offset after a list of ASCII strings, such as the changes in a record.
 
-    The result is -1 if there is no such list. Other characters than ASCII are left to the
+    The result is -1 if there is no such list. Characters other than ASCII are left to the
     general decoder, which checks their encoding.
     """
     count = _list_count(data, offset, end)
@@ -256,7 +257,7 @@ def _after_texts(data: Bytes, offset: int, end: int) -> int:
 def _find_mode(data: Bytes, offset: int, end: int, layout: Any) -> int:
     """Returns the index of the controller's operating mode whose name begins at an offset.
 
-    The result is -1 if no mode has this name. A name has at most eight letters, so that it is
+    The result is -1 if no mode has this name. A name has at most eight letters, so it is
     compared as one integer.
     """
     if offset < 0 or offset >= end:
@@ -267,7 +268,7 @@ def _find_mode(data: Bytes, offset: int, end: int, layout: Any) -> int:
     word = load_little(data, offset + 1)
     for n in range(layout.modes.shape[0]):
         mask = layout.modes[n, 1]
-        # The mask of a shorter name would accept a longer one.
+        # The mask of a shorter name would accept a longer name.
         if (word & mask) == layout.modes[n, 0] and _mask_bytes(mask) == length:
             return n
     return _NOT_ACCEPTED
@@ -445,8 +446,8 @@ def gather_ints(data: Bytes, starts: Ints, marks: Any, gaps: Ints, numbers: Ints
 def gather_floats(data: Bytes, starts: Ints, marks: Any, places: Ints, bits: Ints) -> None:
     """Reads some floating-point numbers, as their bits, from each record.
 
-    Vectors have fixed lengths, so that their numbers lie at fixed distances after a position in
-    each record, the mark.
+    Vectors have fixed lengths, so their numbers lie at fixed distances after a position in each
+    record, the mark.
 
     Args:
         data: The encoded records, followed by padding.
@@ -463,7 +464,7 @@ def gather_floats(data: Bytes, starts: Ints, marks: Any, places: Ints, bits: Int
 
 @loop_leaf
 def gather_stamps(data: Bytes, starts: Ints, marks: Any, counts: Any, numbers: Ints) -> None:
-    """Reads which samples (states of other arms) arrived, and when, from every record.
+    """Reads the arrivals of samples (states of other arms) from every record.
 
     Args:
         data: The encoded records, followed by padding.

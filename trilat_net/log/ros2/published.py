@@ -9,7 +9,7 @@ Invariant:
     - The live bridge and a bag have the same topics with the same types and the same numbers,
       because this module encodes the messages of both.
     - The quaternions of a topic do not jump. Two quaternions of opposite sign are the same
-      orientation; of these, the one that is nearer to the previous quaternion is chosen.
+      orientation. The one that is nearer to the previous quaternion is chosen.
     - A message is encoded only if its topic is wanted.
 """
 
@@ -157,8 +157,8 @@ class SiteMessages:
     def _list_topics(self, peers: Sequence[str]) -> Topics:
         """Lists the topics of the site (arm controller), by their names in trilat-net.
 
-        The sites exchange either joint angles or the pose of the end effector, on which the
-        topics of the reference depend.
+        The topics of the reference depend on whether the sites exchange joint angles or the
+        pose of the end effector.
 
         Args:
             peers: Names of the other sites.
@@ -219,7 +219,7 @@ class SiteMessages:
             topics[topic] = array.channel
         is_full_pose = self._arm.counts.shared == POSE
         if is_full_pose and self._arm.shares_pose:
-            # The error then contains a rotation, whose form is not obvious.
+            # The error then contains a rotation, whose format is not obvious.
             error = topics["error"]
             rotation_text = "rotation vector of the law's error, at most half a turn long"
             about = {**error.about, "orientation": rotation_text}
@@ -227,7 +227,7 @@ class SiteMessages:
         return topics
 
     def stamp_ns(self, record: State) -> int:
-        """Returns the time stamp of all ROS 2 messages that are made from one record.
+        """Returns the time stamp of all ROS 2 messages that are derived from one record.
 
         Args:
             record: The record.
@@ -331,9 +331,9 @@ class SiteMessages:
                 angular = _fill_rotation(rate)
                 yield twist_topic, self._pack_vectors(stamp_ns, linear, angular)
         if is_wanted("tip_wrench"):
-            # The message contains the wrench that acts on the arm. In the model of the arm,
-            # Eq. (8) of the paper, the exogenous wrench is subtracted. Therefore a record
-            # contains its negative.
+            # The message contains the wrench that acts on the arm. In the model of the arm, Eq.
+            # (8) of the paper, the exogenous wrench is subtracted. Therefore a record contains
+            # the negative of this wrench.
             subtracted_force = record.wrench[:POSITION]
             subtracted_torque = _fill_rotation(record.wrench)
             force = [-self._scale * component for component in subtracted_force]
@@ -367,7 +367,8 @@ class SiteMessages:
         """
         rotation_vector = self._compute_rotation_vector(record, pose)
         quaternion = compute_quaternion(rotation_vector)
-        # Only packed quaternions are aligned: the sign is continuous from message to message.
+        # Only packed quaternions are aligned, so that the sign is continuous from message to
+        # message.
         aligned_quaternion = self._signs[topic].align(quaternion)
         position = self._compute_position(record, pose)
         return self._pack_vectors(stamp_ns, position, aligned_quaternion)
@@ -385,7 +386,7 @@ class SiteMessages:
             coordinates = pose[:POSITION]
             return [coordinate / self._scale for coordinate in coordinates]
         end_effector = self._arm.end_effector(record.q)
-        # The end effector of a planar arm has two coordinates; the third is 0.
+        # The end effector of a planar arm has two coordinates. The third coordinate is 0.
         coordinates = [*end_effector, 0.0]
         return coordinates[:POSITION]
 
@@ -469,7 +470,7 @@ class SiteMessages:
 
 
 def _name_array_topic(name: str) -> str:
-    """Returns the topic of an array. The topic `mode` contains the mode as a string already."""
+    """Returns the topic of an array. The topic `mode` already contains the mode as a string."""
     return "mode_number" if name == "mode" else name
 
 
@@ -489,7 +490,7 @@ def pack_session_diagnostics(
         epoch_unix_ns: Start time of the session (tick 0), in Unix time, in ns. It is 0 in
             virtual time.
         records: Newest record (result of a control period) of each site (arm controller) that
-            has published any.
+            has published records.
 
     Returns:
         The message, with one status per site.

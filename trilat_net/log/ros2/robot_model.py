@@ -1,15 +1,15 @@
-"""Builds the model with which a viewer draws an arm: its URDF, and the poses of its links.
+"""Builds the model of an arm that a viewer draws: its URDF, and the poses of its links.
 
 URDF is an XML description of a robot by its links (bodies) and joints. A viewer draws the arms
 of all sites (processes that run one arm) in one scene. They stand in a row, `SPACING_M` apart,
-in a common frame `WORLD` whose z axis points up. If a URDF contains no shapes, plain ones are
-added, so that the arm can be seen. The files of meshes are never opened.
+in a common frame `WORLD` whose z axis points up. If a URDF contains no shapes, plain shapes are
+added, so that the arm is visible. The files of meshes are never opened.
 
 Invariant:
     - The frame of a link is named "<site>/<link>", both in the URDF and in the transforms, so
       that arms with the same URDF can be shown together.
     - The joints have the same names in the URDF as in the messages with joint states.
-    - The transforms place the end effector where the site computes it.
+    - The transforms place the end effector at the position that the site computes.
 """
 
 import math
@@ -183,10 +183,10 @@ _PLANAR = (DEFINITIONS / "planar.urdf").read_text(encoding="utf-8")
 
 
 def name_ros_joints(scenario: Scenario, site: str) -> list[str]:
-    """Lists the names of an arm's joints, as ROS messages and the URDF for viewers state them.
+    """Lists the names of an arm's joints in ROS messages and in the URDF for viewers.
 
     Joints keep the names of their URDF. If no arm of the scenario has a URDF, the joints have
-    the same names at all sites (arm controllers), therefore the name of the site is put in
+    the same names at all sites (arm controllers). The name of the site is therefore put in
     front: "m1_q1".
 
     Args:
@@ -265,11 +265,11 @@ class RobotModel:
         base_origin = (x, y + site_y, z)
         world_rotation = multiply_quaternions(upright, base_rotation)
         self._base = (base_origin, world_rotation)
-        # The description is made last, because the links of `root` are renamed for it.
+        # The description is created last, because the links of `root` are renamed for it.
         self.description = _describe_robot(root, site, site_number)
 
     def compute_transforms(self, q: Sequence[float]) -> list[Transform]:
-        """Computes where the links of the arm are, for given positions of its joints.
+        """Computes the poses of the arm's links for given positions of its joints.
 
         Viewers draw the arm from these poses.
 
@@ -325,7 +325,7 @@ def _list_joints(root: Element, base: str) -> list[Element]:
         siblings.append(joint)
     joints: list[Element] = []
     links = [base]
-    # The list of links grows while the loop runs: breadth-first search.
+    # Breadth-first search: the list of links grows while the loop runs.
     for link in links:
         for joint in joints_of_parent.get(link, ()):
             child = _get_link(joint, "child")
@@ -350,7 +350,7 @@ def _get_link(joint: Element, end: str) -> str:
 def _parse_vector(element: Element | None, key: str, default: Vector) -> Vector:
     """Parses an attribute with three numbers.
 
-    The default is returned if the attribute does not contain three finite numbers. That is
+    The default is returned if the attribute does not contain three finite numbers. This is
     possible only in branches of the URDF that are not part of the arm, because `read_urdf`
     checks the arm.
 
@@ -371,7 +371,7 @@ def _parse_vector(element: Element | None, key: str, default: Vector) -> Vector:
 
 
 def _read_joint_frame(joint: Element, joint_names: Sequence[str]) -> _JointFrame:
-    """Reads from a URDF where a joint is, with the same defaults as `read_urdf`.
+    """Reads the frame of a joint from a URDF, with the same defaults as `read_urdf`.
 
     Args:
         joint: The joint's element in the URDF.

@@ -8,8 +8,8 @@ Invariant:
     - Values are copied without a conversion. Only times are converted, to the unit that is
       stated in the metadata of the channel.
     - A value that was not measured is NaN.
-    - Viewers find a name for each curve. Joint states contain the names of the joints. In an
-      array, the label of each dimension lists the names of its entries.
+    - Each curve has a name, which viewers display. Joint states contain the names of the
+      joints. In an array, the label of each dimension lists the names of its entries.
 """
 
 import math
@@ -93,7 +93,7 @@ class StandardChannels:
     """Registers ROS 2 channels for viewers in an MCAP file, each when it is first needed.
 
     Indexing the object with the topic of a channel returns the number of the channel in the
-    file. If the channel is not registered yet, it is registered then.
+    file. If the channel is not registered yet, it is registered first.
 
     Args:
         file: The file.
@@ -165,14 +165,14 @@ _MODE_NUMBERS.update(NUMBERS_BY_MODE_WORD)
 
 
 def pack_event(event: Event, stamp_ns: int) -> NamedMessages:
-    """Encodes an event for viewers in two forms: as a string, and as a line for the ROS log.
+    """Encodes an event for viewers as two messages: a string, and a line for the ROS log.
 
     Args:
         event: The event, such as the loss of a connection.
         stamp_ns: Unix time of the event, in ns, 0 or more.
 
     Yields:
-        For each form, the name of its channel (`EVENTS` or `LINES`) and the message.
+        For each message, the name of its channel (`EVENTS` or `LINES`) and the encoded message.
     """
     text = describe_event(event.kind, event.text, event.command)
     text_with_member = f"{event.member}: {text}"
@@ -307,7 +307,7 @@ class Ros2SiteChannels:
                 "one-way delay, last 100 ms", "ms", peers, ("median", "max")
             ),
             "link_offset": _ArrayChannel(
-                "the peer's clock minus the own one", "ms", peers, ("offset", "bound")
+                "the peer's clock minus this site's clock", "ms", peers, ("offset", "bound")
             ),
             "timing": _ArrayChannel(
                 "largest in the last 100 ms", "us", ("lateness", "computing_time")
@@ -383,8 +383,8 @@ class Ros2SiteChannels:
         """Encodes the statistics about the connections of a site to other sites as arrays.
 
         The age of the received states is always included. Delays, clock offsets and the timing
-        of the control loop are included only in a live session, because simulated time has
-        none. Nothing is yielded for a site that receives no other site.
+        of the control loop are included only in a live session, because simulated time has no
+        such quantities. Nothing is yielded for a site that receives samples of no other site.
 
         Args:
             stats: The statistics.
@@ -444,7 +444,7 @@ def _make_sent_arrays(scenario: Scenario, site: str) -> ArrayChannels:
     peers = scenario.peers(site)
     channel = scenario.channel(site)
     for vector, peer, index in channel.entries(peers):
-        # A vector has an entry per number. The first entry stands for the whole vector.
+        # A vector has an entry per number. The first entry describes the whole vector.
         if index:
             continue
         suffix = f"_to_{peer}" if peer else ""
@@ -464,7 +464,7 @@ def _convert_to_ms(us: int) -> float:
 
 
 def read_ros2_channels(path: Path) -> dict[str, Ros2Channel]:
-    """Reads from a finished file which standard ROS 2 channels it contains.
+    """Lists the standard ROS 2 channels that a finished file contains.
 
     Args:
         path: The file.

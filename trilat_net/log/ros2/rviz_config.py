@@ -1,14 +1,15 @@
 """Writes the configuration with which RViz, the 3D viewer of ROS 2, shows a session's arms.
 
 The configuration is a YAML file that states which displays are shown, and of which topics. It
-has a display for the model of each arm and for each pose, besides the frames of all links and a
-grid. The same file serves a running session that the live bridge publishes, and an exported bag
-of this session, because both have the same topics.
+has a display for the model of each arm and for each pose, and also shows the frames of all
+links and a grid. The same file serves a running session that the live bridge publishes, and an
+exported bag of this session, because both have the same topics.
 
 Invariant:
     - An existing file is replaced only with `force`.
-    - Each topic of the configuration is a topic of the session, and has its quality of service:
-      RViz receives a description that was published before RViz was started.
+    - Each topic of the configuration is a topic of the session with the same quality of
+      service. RViz therefore also receives a description that was published before RViz was
+      started.
     - The names of links in the descriptions are the names of their frames, so that no display
       needs a prefix.
 """

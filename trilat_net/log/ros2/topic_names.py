@@ -80,7 +80,7 @@ class RobotTable(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class TopicTable(NamedTuple):
-    """Under which names the topics of a session appear in ROS 2, as the user chose.
+    """Names of a session's topics in ROS 2, as chosen by the user.
 
     Attributes:
         names: Name of each topic in ROS 2, by its name in trilat-net.
@@ -112,7 +112,7 @@ class TopicTable(NamedTuple):
 
     @classmethod
     def read(cls, source: str) -> "TopicTable":
-        """Reads under which names the topics of a session should appear in ROS 2.
+        """Reads the names under which the topics of a session should appear in ROS 2.
 
         The names follow a built-in convention, or come from a TOML file. The conventions are
         "crisp" (a set of ROS 2 controllers) and "crtk" (the Collaborative Robotics Toolkit).
@@ -173,7 +173,7 @@ def _read_names_file(source: str) -> TopicTable:
         site_tables = names.pop("sites", {})
         site_names = msgspec.convert(site_tables, dict[str, dict[str, Any]])
         robot_fields: dict[str, dict[str, Any]] = {}
-        # A table of a site holds names of topics as well as the fields of the site's robot.
+        # The table of a site contains both names of topics and fields of the site's robot.
         for site, table in site_names.items():
             field_names = [key for key in RobotTable.__struct_fields__ if key in table]
             robot_fields[site] = {key: table.pop(key) for key in field_names}
@@ -184,12 +184,12 @@ def _read_names_file(source: str) -> TopicTable:
             f"{error.strerror}"
         ) from None
     except (ValueError, msgspec.ValidationError) as error:
-        raise UsageError(f"{source}: is not a valid TOML file of names: {error}") from None
+        raise UsageError(f"{source} is not a valid TOML file of names: {error}") from None
     return TopicTable(names, site_names, robots)
 
 
 def _check_names(source: str, names: Mapping[str, object]) -> None:
-    """Checks that topics which a user renamed exist, and that ROS 2 permits the new names.
+    """Checks that the topics that a user renamed exist, and that ROS 2 permits the new names.
 
     Args:
         source: Name of the file, for the error message.
@@ -218,10 +218,10 @@ def _check_unique_names(source: str, table: TopicTable) -> None:
     Raises:
         UsageError: Two topics have the same name.
     """
-    # The states of several robots may be in one message, so that `robot_states` may repeat.
+    # One message may contain the states of several robots, so `robot_states` may repeat.
     topics = [topic for topic in TOPICS if topic != "robot_states"]
-    # Two invented sites stand for the sites without changed names. They show whether a full
-    # name, which begins with /, is used by several sites.
+    # Two invented sites represent the sites without changed names. They show whether several
+    # sites use a full name, which begins with /.
     full_names: list[str] = []
     for site in (*table.of_site, "*", "**"):
         full_names += [table.find("", site, topic) for topic in topics]

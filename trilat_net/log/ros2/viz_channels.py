@@ -14,7 +14,7 @@ Invariant:
       the end of the bucket.
     - The second message has the time of the bucket's middle record, and is written half a
       bucket later.
-    - Records that arrive after their bucket was written form a bucket of their own.
+    - Records that arrive after their bucket was written form a separate bucket.
 """
 
 import math
@@ -37,8 +37,8 @@ If there is a message for every record with the joints, the same applies to thes
 MAX_PENDING_BYTES = 1 << 13
 """Largest size of a site's messages that are not written yet, in bytes, for two joints."""
 SENT_PENDING_BYTES = 512
-"""Additional size for each number that the site's control law sends, in bytes. Each may be an
-array of its own.
+"""Additional size for each number that the site's control law sends, in bytes. Each number may
+be a separate array.
 """
 
 StampedRow = tuple[int, SignalRow]
@@ -50,7 +50,7 @@ _get_tick = attrgetter("tick")
 
 
 class _BucketOutput:
-    """Writes two messages for each interval of time: one at its end, and one half later.
+    """Writes two messages for each time interval: at its end, and half an interval later.
 
     A message contains the values of all curves of a viewer at one time (a row). An interval is
     called a bucket. The second row is written by `flush`, or before the first row of the next
@@ -83,7 +83,7 @@ class _BucketOutput:
     def flush(self, log_ns: int) -> None:
         """Writes the second message of a time interval, if it was not written yet.
 
-        `add` has kept its curve values, so that messages are evenly spaced in time.
+        `add` has stored its curve values, so that messages are evenly spaced in time.
 
         Args:
             log_ns: Arrival time that the log states for the message, in Unix time, in ns.
@@ -145,14 +145,14 @@ class _SiteBuckets:
             MAX_PENDING_BYTES * joint_pairs + SENT_PENDING_BYTES * sent_numbers
         )
 
-        # The reference of each joint is written as another joint, named after it. Only its
-        # angle is written, because the messages would be twice as large with velocity and
-        # effort.
+        # The reference of each joint is written as an additional joint, named after the joint.
+        # Only its angle is written, because the messages would be twice as large with velocity
+        # and effort.
         references = [f"{name}_ref" for name in site_channels.joints]
         joint_names = [*site_channels.joints, *references]
         self._joint_state_packer = JointStatePacker(joint_names)
         self._joint_count = joint_count
-        # Velocities or efforts of the references, which have none.
+        # Placeholders for the velocities and efforts of the references, which have neither.
         self._not_measured = [math.nan] * joint_count
         joint_channel = site_channels.joint_states(joint_names)
         channels = {"joint_states": joint_channel, **site_channels.channels}
@@ -308,15 +308,15 @@ class _SiteBuckets:
         time intervals of equal length, the fast buckets. The extremes of `_slow_ratio`
         successive fast buckets are collected in a slow bucket. Each bucket becomes two
         messages: the first one is written when the bucket is closed, and the second one half a
-        bucket later. It is kept until then by an object of its own, one for fast and one for
+        bucket later. Two objects store the second message until then, one for fast and one for
         slow buckets.
 
         Args:
             log_ns: Arrival time that the log states for the messages, in Unix time, in ns.
         """
         # A bucket is closed when a later one is opened. A fast bucket that belongs to a later
-        # slow bucket closes both kinds. The next slow bucket would suffice, and one more leaves
-        # a margin.
+        # slow bucket closes both kinds. The next slow bucket would suffice, but one more
+        # provides a margin.
         bucket_after_log = self._bucket + 2 * self._slow_ratio
         self._close_bucket(bucket_after_log, log_ns)
         # Write the second messages of these buckets at once.
@@ -328,7 +328,7 @@ class _SiteBuckets:
 
         The first message is written now, and the second one half a bucket later
         (`_BucketOutput`). Records (results of control periods) of older buckets that arrived
-        late are written before.
+        late are written first.
 
         The slow curves, such as the estimate, are reduced a second time: a slow bucket consists
         of `_slow_ratio` fast buckets, and contains their extremes. It also becomes two
@@ -350,7 +350,8 @@ class _SiteBuckets:
         slow_half = 2 * self._bucket // self._slow_ratio
         next_slow_half = 2 * next_bucket // self._slow_ratio
         if next_slow_half != slow_half:
-            # Half a slow bucket has passed: write the second message of the previous one.
+            # Half a slow bucket has passed: write the second message of the previous slow
+            # bucket.
             self._slow_output.flush(log_ns)
         is_slow_bucket_over = next_slow_half // 2 != slow_half // 2
         if is_slow_bucket_over and self._slow_rows:
@@ -399,7 +400,7 @@ class _SiteBuckets:
         Returns:
             Two rows with their times, or one row for a single record.
         """
-        # Records nearly always arrive in order, so that sorting costs little.
+        # Records nearly always arrive in order, so sorting takes little time.
         records.sort(key=_get_tick)
         stamps_ns: list[int] = []
         first_record = records[0]
@@ -441,7 +442,7 @@ def _stamp_extremes(stamps_ns: Sequence[int], curves: Iterable[SignalRow]) -> li
 
 
 class VizChannels:
-    """Writes messages for general viewers into a log, besides the messages of the session.
+    """Writes messages for general viewers into a log, next to the messages of the session.
 
     Viewers such as Foxglove cannot decode or draw all messages of a session. They get standard
     ROS 2 messages with fewer points, which keep the minimum and maximum of each interval.
@@ -481,7 +482,7 @@ class VizChannels:
             event_key = topics.key(session, member, topics.EVENT)
             self.receivers[event_key] = self._add_event
 
-        # Those of each site, for its records and statistics.
+        # Channels and receivers of each site, for its records and statistics.
         self._buckets: list[_SiteBuckets] = []
         for site in scenario.names:
             buckets = _SiteBuckets(
@@ -501,8 +502,8 @@ class VizChannels:
     def _add_event(self, event: Event, log_ns: int) -> None:
         """Writes an event of the session for viewers, as text and as a line for the ROS log.
 
-        An event from before the start of the session has no time of its own. Its arrival time
-        is used instead.
+        An event from before the start of the session states no time. Its arrival time is used
+        instead.
         """
         stamp_ns = log_ns
         if event.t_ns >= 0:
@@ -548,8 +549,8 @@ def offer_views(scenario: Scenario, views_hz: float) -> MakeViews | None:
 
     Args:
         scenario: Scenario of the session.
-        views_hz: Rate of the messages with the joints, in Hz, see `VizChannels`. With 0, the
-            log contains no messages for viewers.
+        views_hz: Rate of the messages with the joints, in Hz, see `VizChannels`. If it is 0,
+            the log contains no messages for viewers.
     """
     if not views_hz:
         return None
@@ -583,8 +584,7 @@ def decimate_min_max(curves: Iterable[SignalRow]) -> tuple[list[float], list[flo
     earlier: list[float] = []
     later: list[float] = []
     for values in curves:
-        # Smooth curves are nearly sorted, so that sorting takes a third of the time of min and
-        # max.
+        # Smooth curves are nearly sorted, so sorting takes a third of the time of min and max.
         ordered = sorted(values)
         minimum = ordered[0]
         maximum = ordered[-1]

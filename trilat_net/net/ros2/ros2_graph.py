@@ -3,15 +3,15 @@
 Zenoh is a library that transports messages over a network. ROS 2 programs that use the
 middleware rmw_zenoh exchange their messages over Zenoh. `Ros2Graph` opens a Zenoh session of
 its own, as a client of ROS's router (rmw_zenohd) or of another Zenoh router, and follows the
-same wire format. ROS programs then see a node with topics and services, as if it was written
-with a ROS library.
+same wire format. ROS programs then see a node with topics and services, as if this program used
+a ROS library.
 
 The wire format has three elements:
 
 - A key per topic: domain / name / DDS type / hash of the type's definition.
 - An attachment of 33 bytes to each message: its number, the time of sending, and an identifier
   of the sender.
-- A liveliness token per node and per endpoint, from which other programs learn what exists.
+- A liveliness token per node and per endpoint, which shows its existence to other programs.
 
 Source: ros2/rmw_zenoh, docs/develop/design.md and rmw_zenoh_cpp/src/detail (at 99a6a2bd).
 
@@ -138,24 +138,24 @@ class Attachment(NamedTuple):
         """Encodes the number, time and sender of a message as 33 bytes, as ROS 2 expects."""
         return _ATTACHMENT.pack(self.number, self.sent_unix_ns, _GID_BYTES, self.gid)
 
+    @classmethod
+    def decode(cls, content: Any) -> "Attachment | None":
+        """Reads the number, time and sender that ROS 2 adds to each message over Zenoh.
 
-def parse_attachment(content: Any) -> Attachment | None:
-    """Reads the number, time and sender that ROS 2 adds to each message over Zenoh.
+        Args:
+            content: The bytes, or the `ZBytes` object of Zenoh. None if the message has no
+                attachment.
 
-    Args:
-        content: The bytes, or the `ZBytes` object of Zenoh. None if the message has no
-            attachment.
-
-    Returns:
-        The attachment. None if there is none, or if it does not have the format of ROS.
-    """
-    data = b"" if content is None else bytes(content)
-    if len(data) != _ATTACHMENT.size:
-        return None
-    number, sent_unix_ns, gid_length, gid = _ATTACHMENT.unpack(data)
-    if gid_length != _GID_BYTES:
-        return None
-    return Attachment(number, sent_unix_ns, gid)
+        Returns:
+            The attachment. None if there is none, or if it does not have the format of ROS.
+        """
+        data = b"" if content is None else bytes(content)
+        if len(data) != _ATTACHMENT.size:
+            return None
+        number, sent_unix_ns, gid_length, gid = _ATTACHMENT.unpack(data)
+        if gid_length != _GID_BYTES:
+            return None
+        return cls(number, sent_unix_ns, gid)
 
 
 def find_type_hash(kind: str, distro: str) -> str:
@@ -218,7 +218,7 @@ class Ros2Member(NamedTuple):
     name: str
 
     def token(self) -> str:
-        """Returns the text by which ROS 2 programs see that a node exists.
+        """Returns the text that shows ROS 2 programs that a node exists.
 
         The node exists for them as long as this program declares the text to Zenoh as a
         liveliness token.
@@ -250,8 +250,8 @@ class Ros2Member(NamedTuple):
     def _path(self) -> str:
         """Returns the part of liveliness tokens that names the node, "%/NAMESPACE/NAME".
 
-        The first % stands for the root enclave, the place of security rules. A node without a
-        namespace has a % in its place.
+        The first % stands for the root enclave, to which security rules may be attached. A node
+        without a namespace has a % in place of the namespace.
         """
         namespace = _mangle("/" + self.namespace) if self.namespace else "%"
         return f"%/{namespace}/{self.name}"
@@ -298,7 +298,7 @@ def make_gid(token: str) -> bytes:
 _SETTINGS = {"timestamping": {"enabled": {"client": True}}}
 """Zenoh settings of the session.
 
-Messages need time stamps, which tell late subscribers of a latched topic the last messages.
+Messages need time stamps, by which late subscribers of a latched topic find the last messages.
 """
 SENSOR = QualityOfService(reliable=False, depth=5)
 """Quality of service of all subscriptions of this program.
@@ -318,7 +318,7 @@ It is limited because reasons contain texts from other programs, which may diffe
 class Refusals:
     """Counts messages from ROS programs that could not be used, by the reason.
 
-    A faulty ROS program can therefore not stop this process, and the user sees what is wrong.
+    A faulty ROS program therefore cannot stop this process, and the user sees what is wrong.
 
     Args:
         report: Function that receives a sentence when a reason occurs for the first time.
@@ -364,7 +364,7 @@ class Refusals:
         def guarded(*args: P.args, **named: P.kwargs) -> None:
             """Passes a message to `act`, and counts it as refused if `act` raises an error.
 
-            Without this, the error would end in a thread of Zenoh, where nobody sees it.
+            Without this, the error would be lost in a thread of Zenoh, where nobody sees it.
             """
             try:
                 act(*args, **named)
@@ -403,7 +403,7 @@ class TopicPublisher:
 
     @property
     def has_subscribers(self) -> bool:
-        """True if somebody would receive a message, so that composing one is worth the time.
+        """True if somebody would receive a message, so that it is worth composing a message.
 
         It is always true for a latched topic, whose last message later subscribers receive.
         """
@@ -440,7 +440,8 @@ class Ros2Graph:
         name: Name of the node.
         clock: Clock for the times of sending.
         domain: Number of the ROS domain (ROS_DOMAIN_ID). Nodes of other domains are invisible.
-        distro: Distribution of ROS 2, one of `DISTROS`. It determines the form of type hashes.
+        distro: Distribution of ROS 2, one of `DISTROS`. It determines the format of type
+            hashes.
 
     Raises:
         RouterSilent: No router answers (yet).
@@ -503,8 +504,8 @@ class Ros2Graph:
     def connected(self) -> bool:
         """True while this program is connected to the Zenoh router of ROS 2.
 
-        It may be False for some time if the router is restarted, until the connection is there
-        again.
+        It may be False for some time if the router is restarted, until the connection is
+        restored.
         """
         return bool(self._session.info.routers_zid())
 
@@ -596,7 +597,7 @@ class Ros2Graph:
     def tap(self, topic: str, receive: Callable[[str, Attachment], None]) -> None:
         """Receives the messages of a topic, of any type, without being listed as a subscriber.
 
-        The subscription is not announced to ROS, so that ROS tools do not show it.
+        The subscription is not announced to ROS, so ROS tools do not show it.
 
         Args:
             topic: Name of the topic.
@@ -622,8 +623,8 @@ class Ros2Graph:
         """
 
         def receive_sample(sample: zenoh.Sample) -> None:
-            """Passes a message of a ROS 2 program to `receive`, and refuses any other."""
-            attachment = parse_attachment(sample.attachment)
+            """Passes a ROS 2 program's message to `receive`, and refuses other messages."""
+            attachment = Attachment.decode(sample.attachment)
             if attachment is None:
                 self.refusals.add(f"{topic}: a message without an attachment of ROS")
             else:
@@ -635,8 +636,8 @@ class Ros2Graph:
     def serve(self, service: str, kind: str, answer: Callable[[bytes], bytes]) -> None:
         """Offers a service to ROS programs.
 
-        The requests of all services are processed one after another, so that `answer` may take
-        time.
+        The requests of all services are processed one after another in a separate thread, so
+        `answer` may take time.
 
         Args:
             service: Name of the service.
@@ -650,7 +651,7 @@ class Ros2Graph:
             """Computes and sends the response to a request (service call) of a ROS program."""
             # A query ends for its sender only when the query object is dropped.
             with query:
-                request = parse_attachment(query.attachment)
+                request = Attachment.decode(query.attachment)
                 if request is None or query.payload is None:
                     self.refusals.add(f"{service}: a request without an attachment of ROS")
                     return

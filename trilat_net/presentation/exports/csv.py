@@ -1,4 +1,4 @@
-"""Exports a log as a folder of CSV files, a file per table.
+"""Exports a log as a folder of CSV files, with one file per table.
 
 A table contains, for instance, the records of one arm, with a row per period of its control
 loop. A file has a line of column names and then a line per row. Numbers are written with as
@@ -13,7 +13,7 @@ from ...log import Log, Table
 from ..export import ExportFormat, Written, write_table_files
 
 _ROWS_AT_ONCE = 4096
-"""Number of rows that are converted to text together, which limits the memory."""
+"""Number of rows that are converted to text at a time, which limits the memory."""
 
 
 def _write(log: Log, folder: Path, written: Written) -> None:

@@ -1,26 +1,27 @@
 """Exports logs as a dataset of LeRobot, version 3.0, for learning from demonstrations.
 
-LeRobot trains programs to move robots like people did. A dataset is a sequence of frames at a
-fixed rate, divided into episodes. A frame has the state of the slave arm, the pose of every
-user's arm, the dominance factors of the users (the weights with which the slave follows them),
-the ages of the samples with which the sites follow each other, and in a run with a program
-whether a person intervened in its place.
+LeRobot trains programs to move robots as people did. A dataset is a sequence of frames at a
+fixed rate, divided into episodes. A frame contains the state of the slave arm, the pose of
+every user's arm, the dominance factors of the users (the weights with which the slave follows
+them), the ages of the samples with which the sites follow each other, and, in a run with a
+program, whether a person intervened instead of the program.
 
 Invariant:
     - A frame has the newest record of every site at or before its time. A record is the stored
       result of one period of the control loop of the arm. Nothing is interpolated.
     - A frame is left out if such a record is older than the period of the site's control loop
-      and also older than the period of the frames. Then its episode ends, and the next one
-      begins after the gap.
-    - Observations and actions are states of a site at the frame, as its own records have them.
-      The delays of links act on the samples of peers alone. The features `age_s` are the ages
-      of these samples.
-    - Numbers are float32. An orientation is six numbers, which never jump (see
+      and also older than the period of the frames. In that case the episode ends, and the next
+      episode begins after the gap.
+    - Observations and actions are states of a site at the time of the frame, from the site's
+      own records. Link delays therefore affect only the samples of peers. The features `age_s`
+      are the ages of these samples.
+    - Numbers are float32. An orientation consists of six numbers, which never jump (see
       `trilat_net.log.orientations`).
     - With the setting `actions`, actions have the names and units of `action_features` of the
       plugin `lerobot_robot_trilat`, so that a trained program can command the plugin. With
-      `observations=plugin`, the same holds for the observations. A test compares them.
-    - There is no column `intervention` unless a program moves the arm of a user of a log.
+      `observations=plugin`, the observations also have the names and units of the plugin. A
+      test compares them.
+    - There is a column `intervention` only if a program moves the arm of a user in some log.
 """
 
 import json
@@ -60,8 +61,8 @@ _MEANINGS = {
     ),
     "observation.environment_state": "the same numbers, for policies that need this name",
     "action": (
-        "where the arm of the leading user is at the frame; action.USER is where the arm of "
-        "each user is: angles, rad, or a position, m, and an orientation"
+        "pose of the arm of the leading user at the frame; action.USER is the pose of the arm "
+        "of each user: angles, rad, or a position, m, and an orientation"
     ),
     "r11.rot": (
         "an orientation is six entries of the rotation matrix, its first and second column"
@@ -100,20 +101,20 @@ _INDEX_TABLE = {
     "columns": [_INDEX],
 }
 _PANDAS = {"pandas": json.dumps(_INDEX_TABLE)}
-"""Metadata with which pandas, which LeRobot uses, reads the texts of tasks as an index."""
+"""Metadata that make pandas, which LeRobot uses, read the texts of tasks as an index."""
 _QUANTILES = (0.01, 0.1, 0.5, 0.9, 0.99)
 """Quantiles that LeRobot expects among the statistics of a feature."""
 ACTIONS = ("tip", "joints")
 """Kinds of actions: positions of the end effector, or joint angles.
 
-These are also the modes of the LeRobot plugin that moves an arm to a position. Without one of
-them, actions are the values that the sites exchange.
+These are also the modes of the LeRobot plugin that moves an arm to a position. Without the
+setting, actions are the values that the sites exchange.
 """
 OBSERVATIONS = ("slave", "reference", "plugin")
 """Kinds of observations.
 
-They are the slave's joints, these joints with the reference that the slave follows, or what the
-LeRobot plugin observes.
+The kinds are the slave's joints, these joints with the reference that the slave follows, or the
+observation of the LeRobot plugin.
 """
 EPISODES = ("log", "marks")
 """Divisions into episodes: one for each log, or by the marks of `session.episode`."""
@@ -123,18 +124,18 @@ NO_PROGRAM = "none"
 _EPISODE_MARK = re.compile(r"episode (.+) (begins|ended|succeeded|failed)", re.DOTALL)
 _OUTCOMES = {"succeeded": True, "failed": False}
 Names = dict[str, list[str]]
-"""Names of the numbers of each feature."""
+"""Names of the components of each feature."""
 Columns = dict[str, NDArray[Any]]
 """Columns of frames by the names of their features, shape (F, n) or (F,)."""
 
 
 class _Feature(NamedTuple):
-    """A vector of n numbers in each frame of a dataset, such as the joint angles of an arm.
+    """A vector with n components per frame of a dataset, such as the joint angles of an arm.
 
     Attributes:
         key: Name of the feature in the dataset.
-        values: The numbers, shape (F, n).
-        names: Names of the n numbers.
+        values: The values, shape (F, n).
+        names: Names of the n components.
     """
 
     key: str
@@ -145,13 +146,13 @@ class _Feature(NamedTuple):
 class _Attempt(NamedTuple):
     """A part of a run that becomes an episode of the dataset: one attempt at a task.
 
-    Marks of a program, `session.episode`, enclose the part.
+    Marks that a program sets with `session.episode` enclose the part.
 
     Attributes:
         name: Name of the episode. Empty for a run without marks.
         begin_ns: First time of the part, in ns since the start of the session.
-        end_ns: Time after the part. None if it lasts until the end of the log.
-        succeeded: Whether the task was done. None if no mark says so.
+        end_ns: Time after the part. `None` if it lasts until the end of the log.
+        succeeded: Whether the task was done. `None` if no mark states the outcome.
     """
 
     name: str
@@ -217,12 +218,11 @@ def _write(
         fps: Number of frames per second.
         program: Name of the user that is the program, or `NO_PROGRAM`. Empty to find it in
             each log.
-        actions: Kind of the actions, one of `ACTIONS`. Empty for the actions of the plugin if
-            the observations are those of the plugin, otherwise for the values that sites
-            exchange.
+        actions: Kind of the actions, one of `ACTIONS`. If empty, the actions are those of the
+            plugin if the observations are, and otherwise the values that sites exchange.
         observations: Kind of the observations, one of `OBSERVATIONS`.
-        site: Name of the user whose arm the plugin will hold. Empty for the program, or
-            without a program for the last user.
+        site: Name of the user whose arm the plugin will move. If empty, it is the program, or
+            without a program the last user.
         environment_state: "yes" to store the observation also under the name
             `observation.environment_state`, without which some policies do not work.
         task: Text of the task. Empty for the title of the scenario.
@@ -356,7 +356,7 @@ def _write(
 
 
 def _check_choice(name: str, value: str, choices: Sequence[str]) -> None:
-    """Checks that a user gave one of the possible values for a setting.
+    """Checks that a setting has one of the possible values.
 
     Args:
         name: Name of the setting.
@@ -373,15 +373,15 @@ def _check_choice(name: str, value: str, choices: Sequence[str]) -> None:
 def _choose_plugin_site(log: Log, settings: _Settings) -> str:
     """Chooses the user's arm that the LeRobot plugin, a learnt policy, will move later.
 
-    It is the arm that the settings name, or else that of the program, or else that of the last
-    user.
+    The settings may name the user. Otherwise the arm of the program is chosen, or without a
+    program the arm of the last user.
 
     Args:
         log: Log of a run with at least one user.
         settings: Settings of the export, with the program of this log.
 
     Raises:
-        UsageError: There is no user with the name in the settings.
+        UsageError: The settings name a user that does not exist.
     """
     users = find_users(log.scenario)[1]
     program = settings.program if settings.program != NO_PROGRAM else ""
@@ -395,8 +395,8 @@ def _choose_plugin_site(log: Log, settings: _Settings) -> str:
 def _find_attempts(log: Log) -> list[_Attempt]:
     """Finds the episodes that the user has marked in a log while the session was running.
 
-    `session.episode` writes a mark at the begin and at the end of an episode. An episode
-    without a mark at its end lasts until the next one begins.
+    `session.episode` writes a mark at the beginning and at the end of an episode. An episode
+    without a mark at its end lasts until the next episode begins.
 
     Args:
         log: Log of the run.
@@ -426,7 +426,7 @@ def _find_attempts(log: Log) -> list[_Attempt]:
 
 
 def _find_successes(frames: _Frames) -> NDArray[np.bool_]:
-    """Returns whether an attempt ends with success at each frame, shape (F,)."""
+    """Marks the frames at which an attempt ends with success, shape (F,)."""
     succeeded = np.array([attempt.succeeded is True for attempt in frames.attempts])
     is_last = np.diff(frames.attempt, append=len(frames.attempts)) != 0
     successes: NDArray[np.bool_] = is_last & succeeded[frames.attempt]
@@ -449,8 +449,8 @@ def _write_json(folder: Path, files: dict[str, Any]) -> None:
 def _describe_session(log: Log, frames: _Frames, program: str) -> dict[str, Any]:
     """Returns the facts about a log that the manifest of a dataset states.
 
-    They are the session and its scenario, the program that moved an arm, the marked episodes
-    with their outcomes, and the numbers of frames that were left out.
+    The facts are the session and its scenario, the program that moved an arm, the marked
+    episodes with their outcomes, and the number of frames that were left out.
     """
     outcomes = {True: "succeeded", False: "failed", None: "not stated"}
     episodes = []
@@ -503,7 +503,7 @@ def _choose_frames(log: Log, fps: int, attempts: list[_Attempt]) -> _Frames:
     """Chooses the times of the frames of a log, and the records of each frame.
 
     The first frame is at the first time for which every site has a record. Records of a site
-    that has diverged do not count.
+    that has diverged are not used.
 
     Args:
         log: Log of the run that is exported.
@@ -597,7 +597,7 @@ def _read_columns(
         settings: Settings of the export, with the program of this log.
 
     Returns:
-        The columns of the features, and the names of the numbers of each vector. Without a
+        The columns of the features, and the names of the components of each vector. Without a
         program, the column `intervention` is false.
 
     Raises:
@@ -677,9 +677,9 @@ def _read_sample_ages(
     """Returns the ages of the messages with which the slave and its users follow each other.
 
     The age of a message (sample) is the delay that a control loop experiences. A trained
-    program may need it to judge how old its view of the other arm is. The feature `age_s` has
-    the ages at the slave, one per user. The feature `age_s.USER` has the age of the slave's
-    message at a user. Sites that do not follow each other have no such feature.
+    program may need it to judge how old its view of the other arm is. The feature `age_s`
+    contains the ages at the slave, one per user. The feature `age_s.USER` contains the age of
+    the slave's message at a user. Sites that do not follow each other have no such feature.
 
     Args:
         log: Log of the run that is exported.
@@ -703,8 +703,9 @@ def _read_sample_ages(
 def _read_ages(log: Log, receiver: str, sender: str) -> Array:
     """Returns the age of the sample in use at each record of the receiver, in s, shape (K,).
 
-    Before the first sample, it is the time since the start of the session, as a program that
-    holds an arm sees it (`PeerView`). It is not NaN, because statistics of NaN are not numbers.
+    Before the first sample, the age is the time since the start of the session, as for a
+    program that moves an arm (`PeerView`). NaN is not used, because statistics with NaN are
+    NaN.
 
     Args:
         log: Log of the run that is exported.
@@ -719,7 +720,7 @@ def _read_ages(log: Log, receiver: str, sender: str) -> Array:
 
 
 def _read_reference(log: Log, slave: str, rows: Ints) -> tuple[Array, list[str]]:
-    """Returns the pose that the slave arm follows in each frame, and the names of its numbers.
+    """Returns the pose that the slave arm follows in each frame, with its component names.
 
     A learning program takes this reference q_des as the action of the demonstrator.
 
@@ -758,7 +759,7 @@ def _read_commands(
         actions: Kind of the actions, one of `ACTIONS`, or empty.
 
     Returns:
-        The commands of each user, shape (F, n), and the names of their n numbers.
+        The commands of each user, shape (F, n), and the names of their n components.
 
     Raises:
         LogError: The users' arms have different joints, so the users have no common action.
@@ -861,12 +862,13 @@ def _describe_dataset(
 ) -> dict[str, Any]:
     """Returns the contents of meta/info.json, the file that describes a LeRobot data set.
 
-    LeRobot is a library for learning from demonstrations of robots. It reads there how many
-    episodes there are, where they are stored, and which numbers (features) each frame contains.
+    LeRobot is a library for learning from demonstrations of robots. LeRobot reads from this
+    file how many episodes there are, where they are stored, and which features each frame
+    contains.
 
     Args:
         fps: Number of frames per second.
-        names: Names of the numbers of each feature.
+        names: Names of the components of each feature.
         columns: Columns of all frames.
         episodes: Number of episodes.
         tasks: Number of tasks.
@@ -930,14 +932,14 @@ def _describe_episode(
 def _compute_statistics(column: NDArray[Any]) -> dict[str, list[float]]:
     """Computes the statistics of a feature with which LeRobot normalises it.
 
-    LeRobot is a library for learning from demonstrations. Features of different size are
-    normalised before they are learned.
+    LeRobot is a library for learning from demonstrations. Features of different magnitude are
+    normalised before training.
 
     Args:
         column: Feature in F frames, shape (F, n) or (F,).
 
     Returns:
-        Each statistic by name, with n numbers.
+        Each statistic by name, with n values.
     """
     frame_rows = column.reshape(len(column), -1).astype(np.float64)
     statistics = {

@@ -1,9 +1,10 @@
 """Exports a log as a MATLAB file (.mat) with a struct per arm and an array per column.
 
-For example, `m1.q1_rad` has the angle of the first joint of the arm m1 in each period of its
-control loop, and `m1.link.age_s_us` is a column of the statistics of its network connections.
-The struct `events` has the events of the session. The text `about_json` describes all columns,
-and the text `scenario_toml` is the scenario, the description of the experiment.
+For example, `m1.q1_rad` contains the angle of the first joint of the arm m1 in each period of
+its control loop, and `m1.link.age_s_us` is a column of the statistics of its network
+connections. The struct `events` contains the events of the session. The text `about_json`
+describes all columns, and the text `scenario_toml` is the scenario, the description of the
+experiment.
 """
 
 from pathlib import Path
@@ -18,7 +19,7 @@ from ..export import ExportFormat, Written, name_inside, read_texts, store_table
 
 _EXTRA = ("scipy.io", "mat", "MAT files")
 _MAX_EXACT_INTEGER = 2**53
-"""Largest integer up to which all integers are exact as doubles, MATLAB's usual numbers."""
+"""Limit up to which all integers are exact as doubles, the usual type in MATLAB."""
 _KEYWORDS = {
     "break", "case", "catch", "classdef", "continue", "else", "elseif", "end", "for",
     "function", "global", "if", "otherwise", "parfor", "persistent", "return", "spmd", "switch",
@@ -46,7 +47,7 @@ def _write(log: Log, path: Path, written: Written) -> None:
         Args:
             table: Table of the log, such as the records of a site.
             table_name: Name of the table: "m1" for the records of the site m1, and "m1.link"
-                for a further table of this site, which becomes a field of its struct.
+                for another table of this site, which becomes a field of its struct.
         """
         struct = _build_struct(table)
         site, _, kind = table_name.partition(".")
@@ -73,7 +74,7 @@ def _write(log: Log, path: Path, written: Written) -> None:
 def _name_table(table: Table) -> str:
     """Returns the name under which a table is stored in the MATLAB file.
 
-    A name that is a keyword of MATLAB, such as "end", gets the ending "_site".
+    If the name is a keyword of MATLAB, such as "end", the suffix "_site" is appended.
     """
     name = f"{table.name}_site" if table.name in _KEYWORDS else table.name
     return name_inside(table, name, ".")
@@ -89,9 +90,9 @@ def _build_struct(table: Table) -> dict[str, Any]:
 def _convert_column(column: Column, table: Table) -> Any:
     """Converts the values of a column to a type that is convenient in MATLAB.
 
-    Texts become rows of characters, and in the table of events cells. Integers become doubles,
-    with which MATLAB computes, if all of them are exact as doubles. Time stamps in ns stay
-    integers, because most of them are too large for doubles.
+    Texts become rows of characters, or cells in the table of events. Integers become doubles,
+    the type with which MATLAB computes, if all of them are exact as doubles. Time stamps in ns
+    stay integers, because most of them are too large for doubles.
     """
     if column.is_text:
         is_event_table = not table.kind

@@ -29,7 +29,7 @@ def _write(log: Log, path: Path, written: Written) -> None:
 
         Args:
             table: Table of the log, such as the records of a site.
-            table_name: Name of the table, with which the names of its arrays begin.
+            table_name: Name of the table, which is the first part of the names of its arrays.
         """
         for column in table.columns:
             arrays[f"{table_name}/{column.name}"] = _build_array(column)

@@ -1,4 +1,4 @@
-"""Exports a log as a folder of Parquet files, a file per table.
+"""Exports a log as a folder of Parquet files, with one file per table.
 
 A table contains, for instance, the records of one arm, with a row per period of its control
 loop. Parquet is a compressed column format that pandas, polars and DuckDB read. Two more files

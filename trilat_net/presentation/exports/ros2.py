@@ -5,7 +5,7 @@ the live bridge to ROS 2 would have published during the run.
 
 Invariant:
     - A bag has every record, the stored result of one tick (period) of an arm's control loop,
-      exactly once, with its numbers and times. Nothing is decimated.
+      exactly once, with its values and times. No record is left out.
     - The names and types of the topics are those of the live bridge
       (`trilat_net.log.ros2.published`).
     - The stamp of a header is the nominal time of its tick. The publish time of a message is
@@ -66,7 +66,7 @@ def export_ros2(
 
     Topics of sites are `/<session>/<site>/joint_states` and others. Topics of the session are
     `/<session>/events`, `/<session>/log`, `/tf` and `/diagnostics`. The metadata of the
-    channels have units, names and representations of orientations. An existing file is
+    channels contain units, names and representations of orientations. An existing file is
     replaced.
 
     Args:
@@ -179,7 +179,7 @@ class _SiteBag:
         """Yields the ROS messages about the motion of a site's arm, such as its joint states.
 
         The messages are in the order in which the records arrived in the log, as a bag needs.
-        The first ones also contain the description of the robot.
+        The first messages also contain the description of the robot.
         """
         records = self._log[self._site]
         dominance = trace_dominance(self._log, self._site, records.t_s)
@@ -203,15 +203,15 @@ class _SiteBag:
             yield log_ns[row], publish_ns[row], messages
             is_last = count == len(records)
             if is_last or count % _RECORDS_PER_REPORT == 0:
-                # The last report can have fewer records than the others.
+                # The last report may cover fewer records than the others.
                 new_records = (count - 1) % _RECORDS_PER_REPORT + 1
                 self._progress(new_records)
 
     def iterate_statistics(self) -> Iterator[TimedMessages]:
         """Yields the ROS messages about the delays and losses of the links to the site.
 
-        Each item has the time of arrival in the log and the time of publication, both in ns,
-        and the messages. The items are sorted by the time of arrival, which a bag needs.
+        Each item contains the time of arrival in the log and the time of publication, both in
+        ns, and the messages. The items are sorted by the time of arrival, which a bag needs.
         """
         timed = self._log.timed_link_stats(self._site)
         log_times_ns = timed.log_ns.tolist()
@@ -225,7 +225,7 @@ class _SiteBag:
 
 
 def _find_epoch_ns(log: Log) -> int:
-    """Returns the Unix time of a session's common start, in ns. It is 0 in virtual time."""
+    """Returns the Unix time of a session's common start, in ns, or 0 in virtual time."""
     epoch_text = log.session.get("epoch_unix_ns", "0")
     return int(epoch_text)
 

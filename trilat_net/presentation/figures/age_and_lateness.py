@@ -1,9 +1,9 @@
 """Draws figures of network delays, and of the timing of control loops.
 
 An arm publishes its state, a sample, in each period of its control loop (tick). These figures
-answer whether the network and the computers were fast enough. They show three times:
+show whether the network and the computers were fast enough. They show three times:
 
-- The delay of a sample is the time that it needs on its way.
+- The delay of a sample is the time that it needs from sender to receiver.
 - The age of a sample is the time since it was sent. At a receiver it grows until a newer sample
   arrives.
 - The lateness is the time by which a tick started after it was due.
@@ -44,14 +44,14 @@ _POINTS = 400
 _RARE_RATIO = 6.0
 """An axis is logarithmic if the largest value exceeds the 95th percentile by this factor."""
 _STEP_MS = 1.5
-"""An age that falls by more than this from one tick to the next counts as a fluctuation.
+"""If an age falls by more than this from one tick to the next, it counts as a fluctuation.
 
 If two samples arrive in the same tick of 1 ms, the age falls by about 1 ms, which is normal.
 """
 NO_LOOP_CLOCK = "virtual time: no clock was read, so no loop was late and no tick was timed"
 NO_LOOP_TIMES = "no lateness and no computing time in this log"
 _BINS_PER_DECADE = 20
-"""Number of bins of a histogram between 1 us and 10 us, and so on."""
+"""Number of bins of a histogram per decade, for example between 1 us and 10 us."""
 
 
 @draws("sample_age", "age of the samples in use, per link", in_report=True)
@@ -134,9 +134,9 @@ def _add_link_panels(
 
 
 def has_varying_delay(log: Log) -> bool:
-    """Tells whether the delays of a run vary, so that their distribution is of interest.
+    """Returns True if the delays of a run vary and their distribution is therefore of interest.
 
-    Figures and pages leave the distribution out otherwise.
+    If the delays do not vary, figures and pages leave the distribution out.
 
     Args:
         log: Log of the run.
@@ -194,7 +194,7 @@ def _draw_delay_distributions(log: Log, form: FigureSize = REPORT_SIZE) -> Figur
 
 
 def _list_link_models(log: Log) -> dict[str, list[StatedModel]]:
-    """Returns the models of every link: the first one, and one after every change."""
+    """Returns the delay models of every link: the initial model, and one after every change."""
     changes = list_changes(log)
     return {link: list_stated_models(log, link, changes) for link in log.scenario.links}
 
@@ -340,10 +340,10 @@ def explain_missing_loop_times(log: Log) -> str:
 
 
 def choose_bin_edges_us(log: Log) -> Array:
-    """Chooses the bins of the histograms of the lateness and computing time of control loops.
+    """Chooses the bins for histograms of the lateness and computing time of control loops.
 
-    The bins have equal widths on a logarithmic axis, from 1 us to above the longest time of the
-    log.
+    The bins have equal widths on a logarithmic axis, from 1 us to just above the longest time
+    in the log.
 
     Args:
         log: Log of the run.
@@ -365,7 +365,7 @@ def choose_bin_edges_us(log: Log) -> Array:
 def bin_loop_times(times_us: Ints, edges_us: Array) -> Ints:
     """Counts how many times lie in each bin of a histogram of control loop timing.
 
-    Times below 1 us count in the first bin.
+    Times below 1 us are counted in the first bin.
 
     Args:
         times_us: Times in us, shape (K,).

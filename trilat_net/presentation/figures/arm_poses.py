@@ -8,7 +8,8 @@ draw the same poses, which `find_pose` computes.
 
 Invariant:
     - The positions of the joints are those of the simulation kernel's forward kinematics.
-    - The reference pose of each arm, which its control law aims at, is drawn with dashed lines.
+    - The reference pose of each arm, which its control law tries to reach, is drawn with dashed
+      lines.
 """
 
 from collections.abc import Iterable, Sequence
@@ -32,7 +33,7 @@ from .figure_entry import draws
 INSTANTS = 6
 """Number of times at which the arms are drawn."""
 _NARROW_INSTANTS = 3
-"""The same in a figure that is as wide as one column of a paper."""
+"""Number of times in a figure that is as wide as one column of a paper."""
 _PATH_POINTS = 400
 """Largest number of points of the path of an end effector."""
 _AZIMUTH = np.deg2rad(-50.0)
@@ -56,7 +57,7 @@ PictureBox = tuple[float, float, float, float]
 _CORNERS_ON_PATH = np.array([0, 1, 3, 2, 0, 4, 5, 1, 5, 7, 3, 7, 6, 2, 6, 4])
 """Numbers of a box's corners along a path that visits all of its edges.
 
-The bits of a number tell on which side of the box the corner lies, along x, y and z.
+The bits of a number state on which side of the box the corner lies, along x, y and z.
 """
 _BOX_PATH = 0.5 - (_CORNERS_ON_PATH[:, np.newaxis] >> np.arange(3) & 1)
 """The path as points of a box with sides of length 1 around the origin, shape (16, 3)."""
@@ -157,7 +158,7 @@ def project_arm_m(arm: ArmModel, points: Array, *, onto_floor: bool = False) -> 
 
     Args:
         arm: Model of the arm.
-        points: Points in the frame of the base, in m, shape (..., 3). Those of a planar arm
+        points: Points in the frame of the base, in m, shape (..., 3). Points of a planar arm
             have the shape (..., 2), and are returned unchanged.
         onto_floor: True to return the shadows of the points on a floor at the base.
 
@@ -230,7 +231,7 @@ def find_pose(log: Log, site: str, t_s: float) -> _ArmPose | None:
         t_s: The time, in s.
 
     Returns:
-        The points to draw, in m. None if the site has no record until then.
+        The points to draw, in m. `None` if the site has no record up to this time.
     """
     records = log[site]
     arm = log.scenario.arms[site]
@@ -269,7 +270,7 @@ def compute_pose_box_m(poses: Sequence[_ArmPose | None]) -> PictureBox:
     strips.
 
     Args:
-        poses: The poses. None entries are ignored.
+        poses: The poses. Entries that are `None` are ignored.
 
     Returns:
         Left, right, bottom and top of the box, in m.
@@ -340,7 +341,7 @@ def draw_arms(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
 
 
 def _draw_pose(axes: Axes, pose: _ArmPose | None, colour: str) -> None:
-    """Draws a pose into a panel, or a note if `pose` is None because there is no record yet."""
+    """Draws a pose into a panel, or a note if `pose` is `None` for lack of a record."""
     axes.set_aspect("equal")
     if pose is None:
         style.annotate_empty_panel(axes, "no record")
@@ -412,7 +413,7 @@ def _measure_picture(
     The page of the report contains such a picture for each arm, at a few times.
 
     Args:
-        pose: The pose in units of the picture. None for a picture without an arm.
+        pose: The pose in units of the picture. `None` for a picture without an arm.
         index: Index of the site, on which its colour depends.
         bounds: Left, right, bottom and top of the picture.
         label: Description of the picture for screen readers.

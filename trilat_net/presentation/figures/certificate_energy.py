@@ -7,7 +7,7 @@ There are two figures:
   the parts of V, the contribution of each arm, the energy that was dissipated, the work that
   was done on the arms, and the residual: the change of V that dissipation and work do not
   explain.
-- `draw_observed_energy` is for control laws that prove their passivity by bookkeeping: they
+- `draw_observed_energy` is for control laws that prove their passivity by energy accounts: they
   record how much energy they have received and supplied. The figure draws these energies.
 
 Invariant:
@@ -22,7 +22,13 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from ...analysis import Certificate, EnergyBalance, ObservedEnergy, certify, find_unjudged_spans
+from ...analysis import (
+    Certificate,
+    EnergyBalance,
+    ObservedEnergy,
+    certify_log,
+    find_unjudged_spans,
+)
 from ...core import Array
 from ...log import Log
 from .. import style
@@ -34,7 +40,7 @@ _PART_LABELS = {
     "kinetic": "r'Mr / 2",
     "parameter": "parameter error",
     "position": "e'ΛKd e / 2",
-    "delay": "under way",
+    "delay": "in transit",
 }
 _DISSIPATION_LABELS = {
     "damping": "taken: r'Kp r",
@@ -58,8 +64,8 @@ _DISSIPATED: dict[str, Any] = {"color": style.REFERENCE, "linestyle": style.DASH
 _HEIGHTS = (1.5, 1.2, 1.3, 1.0)
 """Relative heights of the panels of V."""
 _OBSERVED_PANELS = {
-    "line": "in the lines (J)",
-    "known": "known of them (J)",
+    "line": "in transit (J)",
+    "known": "known in transit (J)",
     "store": "stored (J)",
     "given": "given, taken (J)",
 }
@@ -74,10 +80,10 @@ def draw_functional(
 ) -> Figure:
     """Draws the energy function V of the stability proof and its balance, in J over time.
 
-    V decreases if the controllers dissipate more than the operators put in. The panels are,
-    from the top: V and the contribution of each site; the parts of V; dissipation and work; and
-    the residual of the balance, the part of V that they do not explain. Without a balance the
-    figure shows the reason.
+    V decreases if the controllers dissipate more energy than the operators supply. The panels
+    are, from the top: V and the contribution of each site; the parts of V; dissipation and
+    work; and the residual of the balance, the part of V that these energies do not explain.
+    Without a balance the figure shows the reason.
 
     Args:
         log: Log of the run.
@@ -97,7 +103,7 @@ def draw_functional(
         _draw_work(work_panel, balance, form)
         _draw_residual(residual_panel, balance, form)
         for axes in (total_panel, parts_panel, work_panel, residual_panel):
-            # The lower panels have a legend where the numbers of the changes would be.
+            # The lower panels have a legend in place of the numbers of the changes.
             plot.mark(axes, log.sites, numbered=axes is total_panel)
             for from_s, to_s in find_unjudged_spans(balance):
                 axes.axvspan(from_s, to_s, **_UNJUDGED)
@@ -109,31 +115,31 @@ def draw_functional(
 
         entries = [*style.site_legend_entries(log, log.sites), ("V", _TOTAL)]
         if certificate.paper_balance is not None:
-            entries.append(("V with the paper's ones", _PAPER_TOTAL))
+            entries.append(("V with the paper's weights", _PAPER_TOTAL))
         plot.finish([residual_panel], entries)
     return plot.figure
 
 
 @draws(
     "certificate",
-    "V, its parts, who changed it, the energy balance",
+    "V, its parts and causes, the energy balance",
     lambda log: explain_no_functional(log.scenario),
     in_report=True,
 )
 def _draw_certificate(log: Log, form: FigureSize) -> Figure:
     """Draws the energy function V of the stability proof over the time of a run.
 
-    V must never rise by energy that nobody supplied. This function is called through the
-    registry of figures.
+    V must never rise without supplied energy. This function is called through the registry of
+    figures.
     """
     own_laws = log.may_run_user_laws
-    return draw_functional(log, certify(log, own_laws=own_laws), form)
+    return draw_functional(log, certify_log(log, own_laws=own_laws), form)
 
 
 def draw_observed_energy(
     log: Log, observed: ObservedEnergy, form: FigureSize = REPORT_SIZE
 ) -> Figure:
-    """Draws energies that the control laws keep account of, in J over time.
+    """Draws the energies for which the control laws keep accounts, in J over time.
 
     Some control laws ensure stability by never returning more energy than they received, and
     record this account. The figure has a panel for each kind of energy: in transit between
@@ -232,8 +238,9 @@ def _draw_total(axes: Axes, log: Log, certificate: Certificate, balance: EnergyB
 def _draw_parts(axes: Axes, balance: EnergyBalance, form: FigureSize) -> None:
     """Draws the parts of the energy function V over time, in J.
 
-    V is the function that a stability proof needs. Its parts are the kinetic energy, the errors
-    of parameters and positions, and the energy of messages that are under way.
+    V is the energy function of the stability proof. Its parts are the kinetic energy, the
+    energies of the errors of parameters and positions, and the energy of messages that are in
+    transit.
     """
     for (name, values), dashes in zip(balance.parts.items(), style.DASHES, strict=True):
         _draw_line(
@@ -249,7 +256,7 @@ def _draw_parts(axes: Axes, balance: EnergyBalance, form: FigureSize) -> None:
 
 
 def _draw_work(axes: Axes, balance: EnergyBalance, form: FigureSize) -> None:
-    """Draws where the energy of a run went (dissipation) and where it came from (work), in J.
+    """Draws the energy that was dissipated in a run, and the work that supplied it, in J.
 
     The work of all links between sites is drawn as one line. Sources with negligible work are
     left out.
@@ -282,9 +289,10 @@ def _draw_residual(axes: Axes, balance: EnergyBalance, form: FigureSize) -> None
     """Draws the residual of the energy balance, which shows whether the log fits the model.
 
     The solid line is the residual: the change of the energy function V that neither dissipation
-    ("taken") nor the work on the arms ("given") explains. Some of it arises because the control
-    law is executed in ticks ("sampling"). The dotted line is what remains without this part.
-    The value axis is logarithmic, so that the residual can be compared with the largest energy.
+    ("taken") nor the work on the arms ("given") explains. Part of the residual arises because
+    the control law is executed in ticks ("sampling"). The dotted line is the residual without
+    this part. The value axis is logarithmic, so that the residual can be compared with the
+    largest energy.
 
     Args:
         axes: Panel of the figure, as Matplotlib axes.
@@ -297,7 +305,7 @@ def _draw_residual(axes: Axes, balance: EnergyBalance, form: FigureSize) -> None
     dotted = (0, (1, 1))
     residuals = (
         ("V - V(0) + taken - given", balance.residual, solid),
-        ("with sampling booked", balance.unexplained, dotted),
+        ("without sampling", balance.unexplained, dotted),
     )
     for label, values, dashes in residuals:
         magnitude = np.maximum(np.abs(values), floor)

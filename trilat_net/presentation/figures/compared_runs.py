@@ -38,8 +38,8 @@ class _ComparedSignal(NamedTuple):
         name: Name for the labels of the value axes.
         find_unit: Function that returns the unit of the signal in a log.
         compute: Function that returns the signal of a site, shape (K, n).
-        shares_poses: True if the columns are what the sites exchange: in task space axes of the
-            end effectors in place of joints.
+        shares_poses: True if the columns are the coordinates that the sites exchange. In task
+            space these are axes of the end effectors instead of joints.
     """
 
     name: str
@@ -178,7 +178,7 @@ def label_runs(logs: Mapping[str, Log], form: FigureSize) -> dict[str, str]:
             if difference.concerns_link:
                 settings.append(f"{difference} {value}")
             elif len(difference.owners) == len(first_scenario.sites):
-                # All sites have the same value, so that their names can be left out.
+                # All sites have the same value, so their names can be left out.
                 settings.append(f"{difference.key} = {value}")
             else:
                 settings.append(f"{difference} = {value}")

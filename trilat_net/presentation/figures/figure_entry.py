@@ -1,4 +1,4 @@
-"""Lets a function register itself as a figure of a log, under a name.
+"""Registers functions as figures of a log, by name.
 
 A module of this folder adds a figure by decorating a function:
 
@@ -8,9 +8,9 @@ A module of this folder adds a figure by decorating a function:
 The command `trilat figure` and the report then offer the figure under this name.
 
 Invariant:
-    - Every name has one figure.
-    - Figures are listed in the order in which a paper would have them, whatever the order in
-      which the modules are imported.
+    - Every name belongs to exactly one figure.
+    - Figures are listed in the order in which they would appear in a paper, independently of
+      the order in which the modules are imported.
 """
 
 from collections.abc import Callable
@@ -22,7 +22,7 @@ from ...log import Log
 from ..appearance import FigureSize
 
 Draw = Callable[[Log, FigureSize], Figure]
-"""Function that draws a figure of a log in a size."""
+"""Function that draws a figure of a log with a given size."""
 Absent = Callable[[Log], str]
 """Function that returns the reason why the figure of a log would be empty, or an empty text."""
 Drawing = TypeVar("Drawing", bound=Callable[..., Figure])
@@ -35,8 +35,8 @@ class FigureEntry(NamedTuple):
     Attributes:
         about: Description of the contents, for lists of figures.
         draw: Function that draws the figure.
-        absent: Function that returns the reason why the figure of a log would be empty. It
-            returns an empty text if there is something to draw.
+        absent: Function that returns the reason why the figure of a log would be empty. The
+            function returns an empty text if there is something to draw.
         in_report: True if the report of a run contains the figure.
     """
 
@@ -59,7 +59,7 @@ _PAPER_ORDER = (
 def draws(
     name: str, about: str, absent: Absent = lambda _: "", *, in_report: bool = False
 ) -> Callable[[Drawing], Drawing]:
-    """Registers a function as a figure that can be drawn from a log. It is a decorator.
+    """Decorator that registers a function as a figure that can be drawn from a log.
 
     The function receives a log and the size of the figure, and returns a Matplotlib figure.
 

@@ -43,7 +43,7 @@ from .figure_entry import draws, unless
 _ROW_IN = 1.2
 """Height of every further row of panels, in inches."""
 _TRANSPOSED = {"col": "row", "none": "none"}
-"""Which panels share their value axis after rows and columns have been exchanged."""
+"""Setting for shared value axes after rows and columns have been exchanged."""
 _LEAST_RAD = 1e-3 * SETTLED_ERROR_RAD
 """Smallest lower end of the axis of errors, in rad."""
 _PLANES = ((0, 1), (0, 2), (1, 2))
@@ -51,13 +51,13 @@ _PLANES = ((0, 1), (0, 2), (1, 2))
 _LOOP_PT = 0.8
 """Width of a line that crosses itself, in pt."""
 _PATH_STEP = 0.01
-"""Distance between two points of a thinned path, as a share of the extent of the path."""
+"""Distance between two points of a thinned path, relative to the extent of the path."""
 _LINK_PANEL_PT = 5.5
 """Type size of titles and time labels in the figure of link parameters, in pt."""
 NO_OPERATOR = "no site has an operator in this run"
 
 explain_absent_operator = unless(plot_signals.sites_with_operator, NO_OPERATOR)
-"""Returns the reason why a log has no torque of an operator. Empty if it has one."""
+"""Returns the reason why a log has no torque of an operator. Empty if it has such a torque."""
 
 
 @draws(
@@ -119,7 +119,7 @@ def draw_operator_displacement(
     Args:
         log: Log of the run.
         form: Width, type sizes and resolution of the figure.
-        twin: The run without operators. None to simulate it.
+        twin: The run without operators. `None` to simulate it.
     """
     run_without_operators = simulate_without_operators(log) if twin is None else twin
     return _draw_joints(
@@ -135,8 +135,8 @@ def draw_operator_displacement(
 def draw_control_torques(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
     """Draws the torques that the controllers command at the joints of all arms, in N m.
 
-    They do not include the torques of operators and walls. If a controller reached its torque
-    limit, the limit is drawn too.
+    These torques do not include the torques of operators and walls. If a controller reached its
+    torque limit, the limit is drawn too.
 
     Args:
         log: Log of the run.
@@ -286,7 +286,7 @@ def draw_operation(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
 def choose_height_in(log: Log, two_joints_in: float) -> float:
     """Returns the height of a figure with panels per joint, in inches.
 
-    More than two joints have a row each, see `add_joint_rows`.
+    If arms have more than two joints, each joint has a row of panels, see `add_joint_rows`.
 
     Args:
         log: Log of the run.
@@ -465,9 +465,9 @@ def _has_changing_estimates(log: Log) -> bool:
 def draw_parameter_estimates(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
     """Draws the estimates of the arms' inertial parameters over time, with the true values.
 
-    Adaptive control laws estimate these parameters while the arm moves. The figure has the
-    estimates of all sites, whereas Fig. 6 of the paper has those of master 1. An arm in space
-    (a chain) has a row of panels per link, or two rows per link in a narrow figure.
+    Adaptive control laws estimate these parameters while the arm moves. The figure shows the
+    estimates of all sites, whereas Fig. 6 of the paper shows only those of master 1. An arm in
+    space (a chain) has a row of panels per link, or two rows per link in a narrow figure.
 
     Args:
         log: Log of the run.
@@ -495,7 +495,7 @@ def _draw_link_estimates(log: Log, form: FigureSize) -> Figure:
     """Draws the estimates of the inertial parameters of arms in space, over time.
 
     A link has `LINK_PARAMETERS` parameters, such as its mass, and each has a panel. The panels
-    of a link fill one row, or two rows of a narrow figure. A panel has the estimates of all
+    of a link fill one row, or two rows of a narrow figure. A panel shows the estimates of all
     sites whose arms have that link.
 
     Args:
@@ -582,8 +582,8 @@ def _draw_estimate(
 def draw_phase_portrait(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
     """Draws the tracking errors of each joint against their rates of change (phase portrait).
 
-    Each joint has a panel. The horizontal axis has the error q - q_des, the actual minus the
-    desired joint angle. The vertical axis has the velocity error qd - qd_des. A stable motion
+    Each joint has a panel. The horizontal axis shows the error q - q_des, the actual minus the
+    desired joint angle. The vertical axis shows the velocity error qd - qd_des. A stable motion
     spirals to the origin. A ring marks the start of a site's motion, and a disc its end.
 
     Args:
@@ -717,7 +717,7 @@ def thin_path(path: Array) -> Array:
 def list_sites_with_changing_dominance(log: Log) -> list[str]:
     """Lists the arms whose dominance factors change during the run, in scenario order.
 
-    A dominance factor is the weight with which an arm follows another one.
+    A dominance factor is the weight with which an arm follows another arm.
 
     Args:
         log: Log of the run.
@@ -734,8 +734,8 @@ def list_sites_with_changing_dominance(log: Log) -> list[str]:
 def draw_authority(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
     """Draws how the authority over the arms changes during a run, and how the arms move.
 
-    The upper panels have the dominance factors: the weights with which a site follows each of
-    the other sites. The lower panels have the displacements of the joints from the start, in
+    The upper panels show the dominance factors: the weights with which a site follows each of
+    the other sites. The lower panels show the displacements of the joints from the start, in
     rad. A reader sees whether the arms move smoothly while the authority passes from one
     operator to another.
 
@@ -792,7 +792,7 @@ def _list_sites_with_walls(log: Log) -> list[str]:
 def draw_contact(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
     """Draws the force and the depth of the contact between the arms and the virtual walls.
 
-    The panels have the normal force of every wall, in N, and the depth to which the end
+    The panels show the normal force of every wall, in N, and the depth to which the end
     effector has entered the wall, in mm.
 
     Args:

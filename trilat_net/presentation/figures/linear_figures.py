@@ -3,7 +3,7 @@
 A linear model describes small motions of the coupled arms around a pose of rest.
 
 - `draw_port_impedance` draws the impedance that operators feel at the joints that they move,
-  and `draw_port_passivity` whether the arms could supply energy to operators.
+  and `draw_port_passivity` shows whether the arms could supply energy to operators.
 - `draw_root_map` draws the characteristic roots of the linear model, in continuous time and as
   executed in ticks (periods of the control loop). A root with a positive real part means that
   the arms are unstable.
@@ -47,16 +47,18 @@ _PROOF: dict[str, Any] = {
     "linestyle": (0, (5, 1.5, 1, 1.5)),
 }
 _MAX_SHOWN_PARAMETER = 2.5
-"""Upper end of the axis of Llewellyn's parameter. All values far above 1 mean the same."""
+"""Upper end of the axis of Llewellyn's parameter. Differences between values far above 1 do not
+matter.
+"""
 _CROWDED_TICKS_HZ = (0.1, 1.0, 10.0)
-"""Ticks of a narrow panel. Labels at its ends would overlap those of the next panel."""
+"""Axis ticks of a narrow panel. Labels at its ends would overlap those of the next panel."""
 
 
 def draw_port_impedance(ports: PortAnalysis, size: FigureSize = REPORT_SIZE) -> Figure:
     """Draws the impedance that operators feel along every joint over frequency.
 
-    The impedance is the ratio of force to velocity. A joint has a panel of the magnitude above
-    a panel of the phase. The panels of many joints are arranged in several rows.
+    The impedance is the ratio of force to velocity. For each joint, a panel of the magnitude is
+    above a panel of the phase. The panels of many joints are arranged in several rows.
 
     Args:
         ports: Analysis of the ports, the places at which operators hold the arms.
@@ -176,12 +178,12 @@ def _convert_to_hz(w_rad_s: Array) -> Array:
 def draw_port_passivity(ports: PortAnalysis, size: FigureSize = REPORT_SIZE) -> Figure:
     """Draws over frequency whether the loop is passive, and stable with any passive operators.
 
-    The upper panel has the smallest eigenvalue of Y + Y^H, divided by its bound 2 norm(Y),
+    The upper panel shows the smallest eigenvalue of Y + Y^H, divided by its bound 2 norm(Y),
     where Y is the admittance matrix of the ports: velocities over forces. A negative value
     means that the loop can generate energy. With the value -1 it returns all energy that an
-    operator puts in.
+    operator supplies.
 
-    The lower panel has the criterion for stability with any passive operators: for two sites
+    The lower panel shows the criterion for stability with any passive operators: for two sites
     Llewellyn's parameter of each joint, which must be at least 1; for more sites the margin
     under the best weights, which must be positive.
 
@@ -340,7 +342,7 @@ def _plot_roots(axes: Axes, spectrum: Spectrum, mark: str, colour: str, label: s
 
     Args:
         axes: Panel of the figure, as Matplotlib axes.
-        spectrum: The roots, of which each complex pair is listed once.
+        spectrum: The roots. Each complex pair is listed once.
         mark: Marker of Matplotlib.
         colour: Colour of the markers.
         label: Text in the legend.
@@ -362,7 +364,7 @@ def _plot_roots(axes: Axes, spectrum: Spectrum, mark: str, colour: str, label: s
 _MARKS = ("o", "s", "^", "v")
 _LOST: Any = {"marker": "x", "color": "#cc3311", "linestyle": "none", "markersize": 5.0}
 _TRANSPORT_STEP = 0.22
-"""Distance between the transports of one case, in distances between cases."""
+"""Distance between the transports of one case, relative to the distance between cases."""
 
 
 def draw_network_delays(facts: Mapping[str, Any]) -> Figure:
@@ -434,8 +436,8 @@ def _list_network_handles(
 def _plot_case(axes: Axes, x: float, row: Mapping[str, Any], transport: int) -> None:
     """Draws the delays of one transport in one case, and a cross if messages were lost.
 
-    A mark is the median. A thick line leads from there to the 99th percentile, and a thin line
-    to the largest delay.
+    A mark is the median. A thick line leads from the median to the 99th percentile, and a thin
+    line to the largest delay.
 
     Args:
         axes: Panel of the figure, as Matplotlib axes.

@@ -36,13 +36,13 @@ for _module in pkgutil.iter_modules(import_module(__package__).__path__):
     import_module(f"{__package__}.{_module.name}")
 
 FIGURES = list_figures()
-"""All figures by name, in the order in which a paper has them."""
+"""All figures by name, in the order in which they would appear in a paper."""
 
 
 def figure(
     log: str | Path | Log, name: str = "positions", width_in: float = COLUMN_IN
 ) -> Figure:
-    """Returns a figure of a log for a paper, with type of 8 pt.
+    """Returns a figure of a log for a paper, with a type size of 8 pt.
 
     A notebook displays the figure as a picture. The command line has `trilat figure` for this.
 
@@ -139,8 +139,8 @@ def write_overlay(
     Args:
         logs: The logs, by their names in the legend.
         folder: Folder of the files. It is created if it does not exist.
-        names: Names of the figures: overlay, positions, tracking_errors or control_torques.
-            Empty for all of them, or for overlay alone if the others cannot show the runs.
+        names: Names of the figures: overlay, positions, tracking_errors or control_torques. If
+            empty, all of them are written, or only overlay if the others cannot show the runs.
         width_in: Width of the figures, 3.5 or 7 in.
         formats: Formats of the files, of `FIGURE_FORMATS`.
         force: True to overwrite existing files.
@@ -190,9 +190,10 @@ def write_report_figures(
         log: Log of the run.
         folder: Folder of the files. It is created if it does not exist.
         twin: Log of the same run, repeated without operators, the people or programs that move
-            the arms. None to leave out the figure that shows how far operators moved the arms.
+            the arms. `None` to leave out the figure that shows how far operators moved the
+            arms.
         progress: Function that is called with the number of drawn figures and of all figures.
-        pushed: How small pushes grow in repetitions of the run. None to compute this here.
+        pushed: How small pushes grow in repetitions of the run. `None` to compute this here.
 
     Returns:
         The paths of the files.
@@ -203,7 +204,7 @@ def write_report_figures(
         if entry.in_report:
             drawings[name] = partial(entry.draw, log, REPORT_SIZE)
 
-    # These two figures need further runs, which the caller may have executed already.
+    # These two figures need additional runs, which the caller may have executed already.
     if twin is None:
         drawings.pop("hands_moved", None)
     else:
@@ -227,7 +228,7 @@ def _write(
     """Draws figures, and writes each of them in all formats.
 
     All formats and file names are checked before the first figure is drawn, so that an error
-    does not leave half of the files behind.
+    does not leave an incomplete set of files.
 
     Args:
         drawings: Functions that draw the figures, by the names of the files.

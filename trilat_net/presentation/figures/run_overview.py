@@ -6,8 +6,8 @@ the age of a state is the time since it was sent.
 
 Invariant:
     - In the figure of one run, each line is an arm.
-    - In the figure of several runs, each line is a run. It shows the largest value of all arms
-      of the run at any time.
+    - In the figure of several runs, each line is a run. The line shows the largest value of all
+      arms of the run at each time.
 """
 
 import textwrap
@@ -36,7 +36,9 @@ from .figure_entry import draws
 _HEIGHT_IN = 3.9
 _NARROW_HEIGHT_IN = 5.6
 _DECADES = 6.0
-"""Number of decades on the axis of errors. Smaller errors are far below the limit."""
+"""Number of decades on the axis of errors. Errors below this range are far below the limit of
+settled sites.
+"""
 _LETTERS_PER_IN = 15.0
 """Average number of letters of the title per inch."""
 _MAX_SPANS = 1_000
@@ -99,7 +101,7 @@ _PANELS = (
 def draw_overview(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
     """Draws the most important quantities of one run in four panels, with a line per arm.
 
-    The title has the judgement whether the run was stable, and the settling time.
+    The title contains the judgement on whether the run was stable, and the settling time.
 
     Args:
         log: Log of the run.
@@ -211,14 +213,14 @@ def _style_run(number: int) -> dict[str, Any]:
 def _compute_envelope(panel: _Panel, log: Log) -> tuple[Array, Array]:
     """Returns the largest value of all arms of a run over time, as one curve per run.
 
-    Time is divided into equal spans, and the curve has a point per span. Several runs can be
-    compared in one panel in this way.
+    Time is divided into equal spans, and the curve has a point per span. In this way, several
+    runs can be compared in one panel.
 
     Returns:
         Middles of the spans in s, and largest values, each of shape (S,). The value of a span
         without records is NaN.
     """
-    # Spans are long enough that each has at least two records of every site on average.
+    # Spans are so long that each has at least two records of every site on average.
     record_counts = [len(log[site]) for site in log.sites]
     span_count = max(1, min(_MAX_SPANS, min(record_counts) // 2))
     edges_s = np.linspace(0.0, recorded_end_s(log), span_count + 1)

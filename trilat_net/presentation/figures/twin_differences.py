@@ -1,14 +1,14 @@
 """Draws how a small disturbance of a run grows or decays over time.
 
 The run was repeated with a small push at some time. Such a repetition is called a twin. The
-upper panel has the differences of the joint velocities between twin and run on a logarithmic
-axis, on which exponential growth is a straight line. A dashed line beside them has the growth
-rate that the headline states, as its slope. The lower panel has the joint speeds of the run
+upper panel shows the differences between the joint velocities of twin and run on a logarithmic
+axis, on which exponential growth is a straight line. The slope of a dashed line next to them is
+the growth rate that the headline states. The lower panel shows the joint speeds of the run
 itself.
 
 Invariant:
     - The differences are drawn as they were measured.
-    - The dashed line covers the times to which its rate was fitted.
+    - The dashed line covers the times over which its rate was fitted.
     - If a twin was pushed again, because its difference had decayed to rounding errors, its
       line is interrupted there.
 """
@@ -128,7 +128,7 @@ def draw_twins(pushed: PushedTwins, form: FigureSize = REPORT_SIZE) -> Figure:
 
 
 def _explain_absent_twins(log: Log) -> str:
-    """Explains why a log has no twins. Empty if it has, as with laws that a user permitted."""
+    """Returns the reason why a log has no twins. Empty if it has twins."""
     return explain_not_repeatable(log, own_laws=log.may_run_user_laws)
 
 
@@ -150,7 +150,8 @@ def _list_lines(pushed: PushedTwins, twins: Twins) -> Iterator[_DifferenceLine]:
 
     Args:
         pushed: The run and its pushed twins.
-        twins: The twins of `pushed`, each with its push and the course of its difference.
+        twins: The twins of `pushed`, each with its push and its difference from the run over
+            time.
     """
     all_joints = list(range(len(twins.joints)))
     joint_styles = _style_joints(pushed.log, twins.joints)
@@ -210,8 +211,8 @@ def _draw_differences(
     """
     growth = pushed.growth
     drawn_s = growth.to_s - pushed.at_s
-    # A twin has `BUCKETS_PER_S` values a second. So many of them become one point of a line
-    # that a line has about `_POINTS` points.
+    # A twin has `BUCKETS_PER_S` values per second. They are grouped so that a line has about
+    # `_POINTS` points.
     intervals_per_point = max(1, int(drawn_s * BUCKETS_PER_S / _POINTS))
     axes.set_yscale("log")
     rated_traces = []  # times and values of the lines of the rated push
@@ -233,7 +234,7 @@ def _trace_amplitude(line: _DifferenceLine, to_s: float, step: int) -> tuple[Arr
     """Computes the points of a line that shows the difference between a run and its twin.
 
     A twin is a repetition of the run that received a small push. The difference is known in
-    intervals of 50 ms, and a point has the largest difference of several intervals. A
+    intervals of 50 ms, and a point shows the largest difference of several intervals. A
     difference that has decayed to rounding errors is pushed again. The line is interrupted
     between the parts (legs) from one push to the next.
 
@@ -272,7 +273,7 @@ def _draw_rate(
 ) -> None:
     """Draws a dashed line with the growth rate of a push, just above the differences.
 
-    The number of the rate is written beside the line. Nothing is drawn if the push has no rate
+    The value of the rate is written next to the line. Nothing is drawn if the push has no rate
     or no clear trend.
 
     Args:

@@ -4,8 +4,8 @@ A link carries the state of one arm to another arm. Its delay model computes how
 message takes, for example "uniform between 10 ms and 20 ms". Each model is one class in a file
 of this folder. There is no list of models: to add one, add a file.
 
-A model that the simulation kernel computes itself names a `DelayKind`. Any other model has a
-function of its own, which is compiled.
+A model that the simulation kernel computes itself names a `DelayKind`. Any other model has its
+own function, which is compiled.
 
 Invariant:
     - Each model states the mean and the standard deviation of its delay in closed form. The
@@ -72,8 +72,8 @@ _DETERMINISTIC_KINDS = (
 class _LossChain(NamedTuple):
     """Markov chain that decides which messages a simulated network loses, in bursts.
 
-    The network is either in a good or in a bad state (Gilbert's model). From message to message
-    it may change its state, and each state has its own probability of losing a message.
+    The network is either in a good or in a bad state (Gilbert's model). Its state may change
+    from message to message, and each state has its own probability of losing a message.
 
     Attributes:
         loss_good: Probability that a sample is lost in the good state.
@@ -100,7 +100,7 @@ class LinkBase(Frozen, frozen=True, tag_field="model", omit_defaults=True):
         loss_burst: Mean number of consecutive lost samples. 0 means that losses are
             independent.
         loss_bad: Fraction of the samples of a burst that are lost. Below 1, bursts have gaps.
-        duplicate: Fraction of samples that arrive twice. The copy has a delay of its own.
+        duplicate: Fraction of samples that arrive twice. The copy has its own delay.
         outages_s: Intervals in which all samples are lost, in s. A sample belongs to an
             interval by its send time.
         order: "newest": A newer sample replaces an older one that arrives later. "in_order": A
@@ -136,7 +136,7 @@ class LinkBase(Frozen, frozen=True, tag_field="model", omit_defaults=True):
         return None
 
     def _delay(self) -> LinkModel:
-        """Returns the delay of the link in the form that the compiled simulation reads.
+        """Returns the delay of the link in the format that the compiled simulation reads.
 
         Losses are not included; `to_core_model` adds them.
         """
@@ -168,7 +168,7 @@ class LinkBase(Frozen, frozen=True, tag_field="model", omit_defaults=True):
         """Mean and standard deviation of the random delay that a link is described with.
 
         A link is the one-way network connection between two sites, the processes of the arms.
-        The delay in a run can differ, because three effects are left out: the hold time
+        The delay in a run can differ, because three effects are not included: the hold time
         `playout_ms`, the enforced order of messages (`order`), and the upper limit of all
         delays, `MAX_DELAY_MS`.
         """
@@ -198,7 +198,7 @@ class LinkBase(Frozen, frozen=True, tag_field="model", omit_defaults=True):
         """Measured delays over time, for a link that repeats a recorded trace of delays.
 
         A link is the one-way network connection between two sites, the processes of the arms.
-        None for links whose delay is not recorded.
+        The value is None for links whose delay is not recorded.
         """
         return None
 
@@ -246,7 +246,7 @@ class LinkBase(Frozen, frozen=True, tag_field="model", omit_defaults=True):
         """Returns a contradiction between several keys of the link, if there is one.
 
         For example, an outage must not end before it starts. Problems of a single key are found
-        before, by the type of the key.
+        earlier, by the type of the key.
 
         Returns:
             The key and the reason. None if the keys agree with each other.
@@ -271,10 +271,10 @@ class LinkBase(Frozen, frozen=True, tag_field="model", omit_defaults=True):
         return None
 
     def _find_burst_problem(self) -> KeyProblem | None:
-        """Returns a problem if losses in bursts have impossible numbers.
+        """Returns a problem if the stated losses in bursts are impossible.
 
         The losses are modelled by a Markov chain, which alternates between good times and
-        bursts. None if such a chain can produce them.
+        bursts. The result is None if such a chain can produce the stated losses.
         """
         if self.loss_burst < 1.0:
             return KeyProblem(
@@ -323,8 +323,8 @@ class LinkBase(Frozen, frozen=True, tag_field="model", omit_defaults=True):
 class OwnDelay(LinkBase, frozen=True, kw_only=True):
     """Delay model that consists of a Python file with a function for the delay of one message.
 
-    To add a model, a contributor adds a file to this folder with a subclass. Its attributes are
-    the numerical settings of the model. The subclass defines
+    To add a model, a contributor adds a file to this folder with a subclass. The attributes of
+    the class are the numerical settings of the model. The subclass defines
 
     - `draw`, which computes the delay of one message,
     - `_moments`, which returns the mean and standard deviation of the delay in ms,
@@ -338,10 +338,11 @@ class OwnDelay(LinkBase, frozen=True, kw_only=True):
         A sample is the state that a site publishes in one tick. This method is compiled. It may
         use `now.sample`, the number of the sample, and `now.stamp_ns`, its send time. Random
         numbers must come from `core.links.delay.draw_pair`: they are a function of the key of
-        the link and an index, so that a repeated run draws the same numbers (L4).
+        the link and an index, so that a repeated run draws the same numbers (law L4 of
+        docs/develop/design.md).
 
         Args:
-            now: The sample, and the place for the result.
+            now: The sample, and the field for the result.
         """
         raise NotImplementedError
 
@@ -358,7 +359,7 @@ class OwnDelay(LinkBase, frozen=True, kw_only=True):
         return np.resize(numbers, (rows, 2)).view(np.int64)
 
     def _delay(self) -> LinkModel:
-        """Returns the delay in the form that the compiled simulation reads.
+        """Returns the delay in the format that the compiled simulation reads.
 
         The parameter `location` is the longest delay, in microseconds.
         """

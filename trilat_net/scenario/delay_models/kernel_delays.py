@@ -57,7 +57,7 @@ class UniformDelay(LinkBase, frozen=True, kw_only=True, tag="uniform"):
     def derive_keys(cls, table: TomlTable) -> TomlTable:
         """Returns the default width of the distribution: half of the mean to each side.
 
-        Therefore the description of a link may state the mean delay alone.
+        Because of this default, the description of a link may state the mean delay alone.
 
         Args:
             table: Settings of the link as the author of the scenario wrote them.
@@ -89,7 +89,7 @@ class UniformDelay(LinkBase, frozen=True, kw_only=True, tag="uniform"):
         return self.delay_ms + self.half_width_ms
 
     def _find_delay_problem(self) -> KeyProblem | None:
-        """Returns a problem if the half width exceeds the mean, so that delays are negative."""
+        """Returns a problem if the half width exceeds the mean, as delays would be negative."""
         if self.half_width_ms > self.delay_ms:
             return KeyProblem("half_width_ms", f"must be at most delay_ms = {self.delay_ms:g}")
         return None
@@ -164,7 +164,7 @@ class GammaDelay(MeanDeviationDelay, frozen=True, kw_only=True, tag="gamma"):
     """
 
     def _delay(self) -> LinkModel:
-        """Returns the distribution in the form in which the compiled simulation draws from it.
+        """Returns the parameters from which the compiled simulation draws the delays.
 
         For the mean m and the standard deviation s, the shape of the gamma distribution is m^2
         / s^2, and its scale is s^2 / m.
@@ -174,13 +174,13 @@ class GammaDelay(MeanDeviationDelay, frozen=True, kw_only=True, tag="gamma"):
 
 
 class LogNormalDelay(MeanDeviationDelay, frozen=True, kw_only=True, tag="lognormal"):
-    """Delay of each message whose logarithm is normal: mostly short, at times very long.
+    """Delay whose logarithm is normally distributed: mostly short, and very long at times.
 
     The author of a scenario states the mean and the standard deviation of the delay itself.
     """
 
     def _delay(self) -> LinkModel:
-        """Returns the distribution in the form in which the compiled simulation draws from it.
+        """Returns the parameters from which the compiled simulation draws the delays.
 
         For the mean m and the standard deviation s, the logarithm of the delay is normal with
         the variance sigma^2 = ln(1 + s^2 / m^2) and the mean mu = ln m - sigma^2 / 2.
@@ -235,7 +235,7 @@ class HyperExponentialDelay(LinkBase, frozen=True, kw_only=True, tag="hyperexpon
 
 
 class CorrelatedDelay(NormalDelay, frozen=True, kw_only=True, tag="ar1"):
-    """Delay that changes slowly: if one message is slow, the next one probably is too.
+    """Delay that changes slowly: if one message is slow, the next message is probably slow too.
 
     The delays are normally distributed and correlated from message to message. Negative delays
     become zero.
@@ -357,7 +357,7 @@ class SineDelay(LinkBase, frozen=True, kw_only=True, tag="sine"):
         return self.delay_ms + self.amplitude_ms
 
     def _find_delay_problem(self) -> KeyProblem | None:
-        """Returns a problem if the amplitude exceeds the mean, so that delays are negative."""
+        """Returns a problem if the amplitude exceeds the mean, as delays would be negative."""
         if self.amplitude_ms > self.delay_ms:
             return KeyProblem("amplitude_ms", f"must be at most delay_ms = {self.delay_ms:g}")
         return None
@@ -372,7 +372,7 @@ class TraceDelay(LinkBase, frozen=True, kw_only=True, tag="trace"):
     Attributes:
         trace: Points of the table as the text "t_us delay_us, t_us delay_us, ...". A lost
             sample has "lost" in place of its delay.
-        at_end: What happens after the last point. "hold": The last delay continues. "loop": The
+        at_end: What happens after the last point. "hold": The last delay is kept. "loop": The
             table is repeated.
     """
 
@@ -435,7 +435,7 @@ class NoInjectedDelay(LinkBase, frozen=True, kw_only=True, tag="measured"):
         return LinkModel(kind=DelayKind.MEASURED)
 
     def _moments(self) -> tuple[float, float]:
-        """Returns NaN twice, because the delay of the real network is not known beforehand."""
+        """Returns NaN twice, because the delay of the real network is not known in advance."""
         return math.nan, math.nan
 
     def _describe_delay(self) -> str:

@@ -56,7 +56,7 @@ class LowOrbit(OwnDelay, frozen=True, kw_only=True, tag="low_orbit"):
     def _moments(self) -> tuple[float, float]:
         """Returns the mean and the standard deviation of the delay, in ms, over many intervals.
 
-        An interval is the time of 15 s or so for which a terminal keeps its satellite. The
+        An interval is the time, about 15 s, for which a terminal keeps its satellite. The
         variances of the two independent random parts add up.
         """
         mean_ms = self.floor_ms + self.path_ms + self.jitter_ms

@@ -5,8 +5,8 @@ that acts on the arm. Each kind is one class in a file of this folder. There is 
 kinds: to add one, add a file. Its name in a scenario, the description of an experiment, is the
 tag of the class.
 
-Kinds that the simulation kernel computes itself name a `TorqueKind`. Any other kind has two
-functions of its own: `act`, which is compiled, and `effort`, which evaluates many rows at once.
+Kinds that the simulation kernel computes itself name a `TorqueKind`. Any other kind has its own
+two functions: `act`, which is compiled, and `effort`, which evaluates many rows at once.
 
 Invariant:
     - Torques and forces are those that act ON the arm. Times are seconds after the epoch, the
@@ -40,7 +40,7 @@ class HeldArm(NamedTuple):
     """Facts about an arm from which settings of its operators and environments follow.
 
     An operator moves the arm, and an environment is a body that the arm touches. For example,
-    the point to which an operator pulls the arm is at first the position of the arm.
+    the point to which an operator pulls the arm is initially the position of the arm.
 
     Attributes:
         counts: Numbers of joints, task coordinates and parameters of the arm.
@@ -71,14 +71,14 @@ class ActorBase(fields.Frozen, frozen=True, tag_field="kind"):
     """Permitted values of each key that `VALUE_TEXTS` does not describe, for error messages."""
 
     def _source(self) -> TorqueSource:
-        """Returns the operator or environment as the compiled simulation reads it."""
+        """Returns the operator or environment in the format of the compiled simulation."""
         raise NotImplementedError
 
     @property
     def actor(self) -> TorqueSource:
-        """Operator or environment as numbers, from which compiled code computes its torque.
+        """Numerical parameters of the operator or environment, which determine its torque.
 
-        The compiled code cannot use Python objects.
+        They are stored as numbers because compiled code cannot use Python objects.
         """
         return self._source()
 
@@ -125,7 +125,7 @@ class TimedActor(ActorBase, frozen=True, kw_only=True):
 
     Attributes:
         start_s: Start of the interval, in s after the start of the run.
-        end_s: End of the interval, in s. By default, the actor never stops.
+        end_s: End of the interval, in s. By default, the action lasts until the end of the run.
     """
 
     start_s: fields.NotNegative = 0.0
@@ -168,7 +168,7 @@ class OwnActor(SampledActor, frozen=True, kw_only=True):
         allowed.
 
         Args:
-            now: Time and motion at which the torque is needed, and the place for the result.
+            now: Time and motion at which the torque is needed, and the field for the result.
         """
         raise NotImplementedError
 
@@ -190,7 +190,7 @@ class OwnActor(SampledActor, frozen=True, kw_only=True):
         raise NotImplementedError
 
     def _source(self) -> TorqueSource:
-        """Returns the operator or environment as the compiled simulation reads it.
+        """Returns the operator or environment in the format of the compiled simulation.
 
         The simulation calls its compiled method `act`.
         """
@@ -363,14 +363,14 @@ def _check_values(
 
 
 def _describe_values(refused: _RefusedKey, kind: type[ActorBase], counts: VectorCounts) -> str:
-    """Returns what the author of a scenario may write as the value of a refused key.
+    """Returns the permitted values of a refused key, as text for the author of the scenario.
 
-    For example "one torque for both joints or two, ON the arm, N m".
+    An example is "one torque for both joints or two, ON the arm, N m".
 
     Args:
         refused: The key.
         kind: Class of the table.
-        counts: Lengths of the arm's vectors, which decide about words such as "both joints".
+        counts: Lengths of the arm's vectors, which determine words such as "both joints".
     """
     text = kind.value_texts.get(refused.key) or VALUE_TEXTS[refused.key]
     if refused.key == "points" and refused.indices:
@@ -388,7 +388,7 @@ def _find_refused_key(
 ) -> _RefusedKey | None:
     """Returns the first key of an operator's table whose value is missing or not valid.
 
-    The table must be complete. The result is None if it is valid.
+    The table must be complete. The result is None if the table is valid.
     """
     try:
         msgspec.convert(table, kind)

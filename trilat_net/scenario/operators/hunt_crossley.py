@@ -24,9 +24,9 @@ class HuntCrossley(OwnActor, frozen=True, kw_only=True, tag="hunt_crossley"):
 
     d is the depth and d' its rate of change. The elastic part is the contact of a sphere after
     Hertz. The damping is that of Hunt and Crossley, "Coefficient of restitution interpreted as
-    damping in vibroimpact", J. Applied Mechanics 42 (1975). With it, the force begins and ends
-    at zero; the force of a linear spring and damper would jump at contact and pull at release.
-    The body is passive, because its damping dissipates energy at every depth.
+    damping in vibroimpact", J. Applied Mechanics 42 (1975). With this damping, the force begins
+    and ends at zero. The force of a linear spring and damper would jump at contact and pull at
+    release. The body is passive, because its damping dissipates energy at every depth.
 
     Attributes:
         point_m: A point of the surface, in m.
@@ -63,7 +63,7 @@ class HuntCrossley(OwnActor, frozen=True, kw_only=True, tag="hunt_crossley"):
             normal_squared += self.normal[i] * self.normal[i]
             depth += (self.point_m[i] - now.at[i]) * self.normal[i]
             depth_rate -= now.speed[i] * self.normal[i]
-        # The length of the normal is divided out only in contact, which saves the square root.
+        # The normal is normalised only in contact, which saves a square root in free motion.
         if depth > 0.0:
             length = math.sqrt(normal_squared)
             depth = depth / length
@@ -91,7 +91,7 @@ class HuntCrossley(OwnActor, frozen=True, kw_only=True, tag="hunt_crossley"):
             speed: Velocities of the end effector, in m/s, shape (..., n).
 
         Returns:
-            Forces in N, shape (..., n). Zero where the end effector is outside of the body.
+            Forces in N, shape (..., n). Zero while the end effector is outside of the body.
         """
         normal = np.array(self.normal) / np.linalg.norm(self.normal)
         depth = (np.array(self.point_m) - position) @ normal

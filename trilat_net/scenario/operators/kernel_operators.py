@@ -9,7 +9,7 @@ for each kind.
 
 Invariant:
     - If the author of an experiment states no start for an operator, the operator holds the arm
-      at its start pose. Therefore the run starts without a jump.
+      at its start pose. The run therefore starts without a jump.
 """
 
 import math
@@ -34,7 +34,7 @@ RecordedPoint = Annotated[
     tuple[fields.Real, ...], Meta(min_length=2, max_length=1 + MAX_JOINTS)
 ]
 FARTHEST = 100.0
-"""Largest norm of the target of a live operator, in m or rad. No arm reaches farther."""
+"""Largest norm of a live operator's target, in m or rad, beyond the reach of any arm."""
 STRONGEST = 10.0
 """Largest force that a program may request, as a multiple of the operator's force limit.
 
@@ -73,7 +73,7 @@ class Pulse(ActorBase, frozen=True, tag="pulse"):
     peak_nm: fields.Joints
 
     def _source(self) -> TorqueSource:
-        """Returns the pulse of torque as the compiled simulation reads it."""
+        """Returns the pulse of torque in the format of the compiled simulation."""
         return TorqueSource(TorqueKind.PULSE, self.start_s, self.end_s, a=self.peak_nm)
 
 
@@ -94,8 +94,8 @@ class MovingSpring(ActorBase, frozen=True, kw_only=True):
 
     at_tip: ClassVar[bool]
 
-    # Not inherited from `SampledActor`: the order of the fields is the order of keys in a
-    # scenario's text, whose hash is in logs.
+    # The field is not inherited from `SampledActor`, because the order of the fields is the
+    # order of keys in a scenario's text, whose hash is stored in logs.
     move_start_s: fields.NotNegative = 0.0
     move_end_s: fields.NotNegative = 0.0
     start_s: fields.NotNegative = 0.0
@@ -113,7 +113,7 @@ class MovingSpring(ActorBase, frozen=True, kw_only=True):
         """Adds the start and end of the operator's motion, if the author left them out.
 
         The operator pulls the arm to a moving target. By default, the target starts where the
-        arm starts, and its end is its start.
+        arm starts, and stays there.
 
         Args:
             table: Settings of the operator, completed with other defaults. They are changed.
@@ -133,7 +133,7 @@ class MovingSpring(ActorBase, frozen=True, kw_only=True):
         The checks of the base class are included.
 
         Returns:
-            The setting that is wrong and the reason. None if there is no problem.
+            The wrong setting and the reason. None if there is no problem.
         """
         problem = super().find_problem()
         if problem is not None or self.move_end_s >= self.move_start_s:
@@ -145,7 +145,7 @@ class MovingSpring(ActorBase, frozen=True, kw_only=True):
         )
 
     def _source(self) -> TorqueSource:
-        """Returns the spring and its moving target as the compiled simulation reads them."""
+        """Returns the spring and its moving target in the format of the compiled simulation."""
         end_target, start_target, stiffness, damping = msgspec.structs.astuple(self)[:4]
         return TorqueSource(
             TorqueKind.TASK_HAND if self.at_tip else TorqueKind.HAND,
@@ -224,14 +224,14 @@ class RecordedTorque(ActorBase, frozen=True, tag="recorded"):
 
         Returns:
             The setting `points` and the reason. None if every time is later than the previous
-                one.
+            time.
         """
         if any(later[0] <= earlier[0] for earlier, later in pairwise(self.points)):
             return fields.KeyProblem("points", "must be in the order of their times")
         return None
 
     def _source(self) -> TorqueSource:
-        """Returns the recorded torques as the compiled simulation reads them."""
+        """Returns the recorded torques in the format of the compiled simulation."""
         return TorqueSource(TorqueKind.RECORDED, table=np.array(self.points, dtype=np.float64))
 
 
@@ -256,7 +256,7 @@ class Chirp(TimedActor, frozen=True, tag="chirp"):
     sweep_s: fields.Positive
 
     def _source(self) -> TorqueSource:
-        """Returns the sine of changing frequency as the compiled simulation reads it."""
+        """Returns the sine of changing frequency in the format of the compiled simulation."""
         return TorqueSource(
             TorqueKind.CHIRP,
             start_s=self.start_s,
@@ -272,7 +272,7 @@ class Multisine(TimedActor, frozen=True, tag="multisine"):
     """Operator whose torque is a sum of sines with equal amplitude, to excite an arm.
 
     Such a torque excites several frequencies at once, so that the response of the arm at each
-    of them can be measured in one run.
+    frequency can be measured in one run.
 
     Attributes:
         amplitude_nm: Amplitude of each sine on each joint, in N m.
@@ -293,7 +293,7 @@ class Multisine(TimedActor, frozen=True, tag="multisine"):
         """Checks that each sine has a phase, and that the end is not before the start.
 
         Returns:
-            The setting that is wrong and the reason. None if there is no problem.
+            The wrong setting and the reason. None if there is no problem.
         """
         count = len(self.frequencies_hz)
         if len(self.phases_rad) not in (0, count):
@@ -303,7 +303,7 @@ class Multisine(TimedActor, frozen=True, tag="multisine"):
         return super().find_problem()
 
     def _source(self) -> TorqueSource:
-        """Returns the sines in the form that the compiled simulation reads.
+        """Returns the sines in the format that the compiled simulation reads.
 
         Each sine is a row of its frequency in Hz and its phase in turns.
         """
@@ -346,14 +346,14 @@ class DeviceSettings(fields.Frozen, frozen=True, omit_defaults=True):
     jump_m_s: fields.Positive = 5.0
 
     def rows(self, axes: int) -> list[tuple[float, ...]]:
-        """Returns how the axes of an arm correspond to those of a haptic device.
+        """Returns how the axes of an arm correspond to the axes of a haptic device.
 
         The result has, for each axis of the arm, the direction in which the user of the device
         sees it.
 
         Args:
             axes: Number of axes of the arm: 2 for a planar arm, 3 in space. If the settings
-                state no directions, the number selects the default.
+                state no directions, this number selects the default directions.
 
         Returns:
             One unit vector per axis of the arm, in the coordinates of the user.
@@ -365,12 +365,12 @@ class LiveHand(ActorBase, frozen=True, tag="live", omit_defaults=True):
     """Operator who takes hold of the arm during a live session.
 
     The operator is a person with a mouse or a haptic device, or a program. Until the operator
-    takes hold, nobody holds the arm. In virtual time nobody ever holds it, except when a log is
-    run again in which somebody did.
+    takes hold, nobody holds the arm. In virtual time, nobody holds the arm, except in a rerun
+    of a log in which somebody held it.
 
     The force is computed once per tick and then constant until the next tick. In the mode
     "force", the operator commands the force itself. The work of such a force has an error of
-    first order in the tick period, because only the arm resists it.
+    first order in the tick period, because only the arm resists the force.
 
     Attributes:
         mode: "tip": A spring pulls the end effector towards a target that the operator moves.
@@ -418,7 +418,7 @@ class LiveHand(ActorBase, frozen=True, tag="live", omit_defaults=True):
 
         A live operator moves the arm by hand during the run. In the mode "tip" the operator
         moves the end effector, in "joint" the joints, and in "force" a force is applied. Each
-        mode has settings of its own. The defaults of the other modes are removed.
+        mode has its own settings. The defaults of the other modes are removed.
 
         Args:
             table: Settings of the operator, completed with defaults. They are changed.
@@ -506,7 +506,7 @@ class LiveHand(ActorBase, frozen=True, tag="live", omit_defaults=True):
 
 
 def _check_frame(frame: list[Any], axes: int, path: str) -> None:
-    """Refuses a stated view direction of a device that is not a valid choice of axes.
+    """Refuses directions for the axes of a device that are not a valid choice.
 
     The author of a scenario states how the axes of a haptic device correspond to those of the
     arm. Unknown, missing, superfluous or parallel axes are refused.
@@ -562,7 +562,7 @@ class ViscousEnvironment(SampledActor, frozen=True, tag="viscous"):
     damping_nm_s_rad: fields.NotNegativeJoints
 
     def _source(self) -> TorqueSource:
-        """Returns the damping of the joints as the compiled simulation reads it."""
+        """Returns the damping of the joints in the format of the compiled simulation."""
         return TorqueSource(
             TorqueKind.VISCOUS,
             self.start_s,
@@ -599,7 +599,8 @@ class Wall(SampledActor, frozen=True, tag="wall"):
     def _source(self) -> TorqueSource:
         """Returns the wall as the compiled simulation reads it, with a normal of length 1."""
         x, y, z = (*self.normal, 0.0)[:3]
-        # Unlike that of two numbers, `math.hypot` of three rounds differently between machines.
+        # `math.hypot` of three numbers, unlike that of two, is rounded differently on different
+        # machines.
         length = math.hypot(x, y) if len(self.normal) == 2 else math.sqrt(x * x + y * y + z * z)
         return TorqueSource(
             TorqueKind.WALL,

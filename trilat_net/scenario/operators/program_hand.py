@@ -5,12 +5,12 @@ The author of an experiment names the class of the program in the scenario:
     { kind = "own", class = "my_policy:Reach" }
 
 `ProgramHand` stores this table, and `HandPlayer` calls the program at a fixed rate during the
-run. Its actions apply in the control periods of the arm.
+run. The actions of the program take effect in control periods of the arm.
 
 Invariant:
     - Naming the class does not run any of its code.
     - If the program fails, it lets go of the arm at that tick, and is not called again. The run
-      goes on, and nothing else at this site or at other sites is affected.
+      continues, and nothing else at this site or at other sites is affected.
 """
 
 import math
@@ -51,10 +51,10 @@ PROGRAM_KEYS = ("class", "rate_hz", "delay_ms", "process", "source_sha256", "set
 """Keys that a program has in addition to the keys of a live operator."""
 
 POLICY = "policy"
-"""Name by which a trained program takes hold of an arm, as the log mentions it."""
+"""Name under which a trained program takes hold of an arm in the log."""
 
 FAILED_HAND = "failed at tick"
-"""Words by which the events of a log say that a program failed while it moved an arm."""
+"""Words in the events of a log for a program that failed while it moved an arm."""
 
 
 class ProgramHand(
@@ -171,7 +171,7 @@ class HandSite(NamedTuple):
         """Text by which an arm's process recognises the messages of this program.
 
         It consists of the class of the program and the hash of the experiment, for example
-        "my_policy:Reach 5cfbf3f16ec0c567". Both are cut to fit into a message.
+        "my_policy:Reach 5cfbf3f16ec0c567". Both parts are shortened to fit into a message.
         """
         return f"{self.program[:40]} {self.scenario.sha256[:16]}"
 
@@ -208,12 +208,13 @@ class HandSite(NamedTuple):
         """Creates the object that calls the program and applies its actions at the right times.
 
         The program is called `rate_hz` times a second. An action takes effect `delay_s` after
-        the observation on which it rests, rounded up to a whole control period.
+        the observation on which it is based, rounded up to a whole control period.
         """
         tick_rate_hz = self.scenario.sites[self.name].rate_hz
         arm = self.scenario.arms[self.name]
         locate: Any = list if self.spec.mode == "joint" else arm.end_effector
-        # Rounded first: in floating point 9 ms at 1000 Hz are a little more than 9 ticks.
+        # The product is rounded first, because in floating point 9 ms at 1000 Hz is slightly
+        # more than 9 ticks.
         delay_ticks = math.ceil(round(self.delay_s * tick_rate_hz, 6))
         return OwnHand(self.make_rules(), tick_rate_hz // self.rate_hz, delay_ticks, locate)
 
@@ -292,8 +293,8 @@ class HandPlayer:
     def track(self, site: Site, k: int) -> list[float]:
         """Returns the action of the program that operates the arm, in one control period.
 
-        The program is called if this is due; otherwise, its earlier action goes on. The method
-        must be called once for each control period, in order.
+        The program is called if a call is due. Otherwise its earlier action continues. The
+        method must be called once for each control period, in order.
 
         Args:
             site: The process of the arm, before the period.
@@ -315,7 +316,7 @@ class HandPlayer:
 
         Args:
             k: Number of the first control period.
-            end: Number of the control period before which the result ends at the latest.
+            end: Number of the first control period that is not included in any case.
             arrays: State of the arm's process before period `k`.
 
         Returns:
@@ -325,7 +326,7 @@ class HandPlayer:
         return self.hand.advance_span(k, end, self._prepare(k, arrays))
 
     def _prepare(self, k: int, arrays: SiteArrays) -> Callable[[], list[float]]:
-        """Lets the program that moves the arm decide, if a decision is due in control period k.
+        """Calls the program that moves the arm, if a decision is due in control period k.
 
         Returns:
             A function that returns the joint angles of the arm, in rad.
@@ -336,7 +337,7 @@ class HandPlayer:
         return angles.tolist
 
     def view(self, k: int, arrays: SiteArrays) -> HandView:
-        """Returns what the program observes in control period k, such as the arms' states.
+        """Returns the view of the program in control period k, such as the arms' states.
 
         Args:
             k: Number of the tick.
@@ -347,7 +348,7 @@ class HandPlayer:
     def request_action(self, k: int, arrays: SiteArrays) -> None:
         """Calls the program that moves the arm, and schedules the action that it returns.
 
-        The program receives what it observes in this control period. Its action applies later,
+        The program receives what it observes in this control period. Its action takes effect
         after the delay that its settings state.
 
         Args:
@@ -365,7 +366,7 @@ class HandPlayer:
     def fail(self, k: int, problem: str) -> None:
         """Makes the program let go of the arm for the rest of the run, because it failed.
 
-        The run goes on without it, and the reason is recorded.
+        The run continues without the program, and the reason is recorded.
 
         Args:
             k: Number of the tick in which it lets go.

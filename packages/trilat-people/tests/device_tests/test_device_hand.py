@@ -18,7 +18,7 @@ from tests.sites.sessions import Session, reach_session
 from trilat_net.app.input_device import DeviceState
 from trilat_net.core.life.live_hand import SILENCE_NS
 from trilat_net.errors import UsageError
-from trilat_net.execution.verification import verify
+from trilat_net.execution.verification import verify_log
 from trilat_net.log.log_reader import Log
 from trilat_net.net.bus import Bus
 from trilat_net.scenario import load_scenario
@@ -98,7 +98,7 @@ def test_devices_lead_arms_as_logs_repeat(tmp_path: Path) -> None:
     moved = session.target[-1] - session.target[0]
     assert moved == pytest.approx([0.0, 0.05], abs=1e-9)
     assert session.changes[0] == "m1: ScriptedDevice takes hold"
-    assert verify(session.log).passed
+    assert verify_log(session.log).passed
 
 
 @pytest.mark.parametrize(
@@ -161,13 +161,13 @@ def make_wrong_script(wrong: DeviceState) -> Script:
 @pytest.mark.parametrize(
     ("wrong", "counted"),
     [
-        (DeviceState((9.0, 9.0, 9.0), ZERO, HELD), "dropped 2 jumps, 0 unreadable"),
-        (DeviceState((1e300, -1e308, 0.0), ZERO, HELD), "dropped 2 jumps, 0 unreadable"),
-        (DeviceState((math.nan, 0.0, 0.0), ZERO, HELD), "dropped 0 jumps, 3 unreadable"),
-        (DeviceState((0.3, -0.12, math.inf), ZERO, HELD), "dropped 0 jumps, 3 unreadable"),
+        (DeviceState((9.0, 9.0, 9.0), ZERO, HELD), "dropped: 2 jumps, 0 unreadable"),
+        (DeviceState((1e300, -1e308, 0.0), ZERO, HELD), "dropped: 2 jumps, 0 unreadable"),
+        (DeviceState((math.nan, 0.0, 0.0), ZERO, HELD), "dropped: 0 jumps, 3 unreadable"),
+        (DeviceState((0.3, -0.12, math.inf), ZERO, HELD), "dropped: 0 jumps, 3 unreadable"),
         (
             DeviceState((0.3, -0.12, 0.15), (math.nan, 0.0, 0.0), HELD),
-            "dropped 0 jumps, 3 unreadable",
+            "dropped: 0 jumps, 3 unreadable",
         ),
     ],
 )
@@ -253,10 +253,11 @@ def test_silent_devices_need_their_button_anew(fault: str, tmp_path: Path) -> No
     held = part.t_s[part.hand[:, 2] > 0.0]
     (rest,) = np.flatnonzero(np.diff(held) > 0.1)
     assert 0.9 < held[rest + 1] - held[rest] < 1.3
-    assert verify(session.log).passed
+    assert verify_log(session.log).passed
     if fault == "raises":
         assert (
-            sum("the device is silent; the arm is let go" in line for line in session.said) == 1
+            sum("the device is silent; the arm is released" in line for line in session.said)
+            == 1
         )
         assert session.device.entered == 2
 
@@ -267,7 +268,7 @@ def test_lost_devices_are_reported_and_tried_again(tmp_path: Path) -> None:
 
     session = DeviceSession(tmp_path, script)
     assert [line for line in session.said if "no service" in line] == [
-        "m1: no service; the arm is let go, and the device is tried again"
+        "m1: no service; the arm is released, and the device is tried again"
     ]
     assert session.device.entered > 2
     assert session.changes == []
@@ -353,7 +354,7 @@ def test_repeated_clutching_keeps_the_target_within_reach(tmp_path: Path) -> Non
     # of 2 x 0.5 m/s for the rest of the session: no stroke has to be taken back
     assert back < -0.3
     assert t_s[begun] < 2.2
-    assert verify(session.log).passed
+    assert verify_log(session.log).passed
 
 
 LATER = [pytest.param(gaps, marks=pytest.mark.long) for gaps in ((150, 10), (30, 90))]

@@ -165,7 +165,7 @@ def test_learning_is_before_less_after(tmp_path: Path) -> None:
     assert {row["phase"] for row in analysis.rows} == {"after"}
     assert analysis.means["gain_after_error_rms_mm"][0].number == 1
     assert (
-        "the expert's part of the authority went from 0.9 to 0.1 (near), 0.5 to 0.5 (far)"
+        "the expert's share of the authority changed from 0.9 to 0.1 (near), 0.5 to 0.5 (far)"
         in analysis.study["training"]
     )
 

@@ -1,4 +1,4 @@
-"""Haply's Inverse3 at the arm of a real session, by a service of the test that speaks as the maker's."""
+"""An emulated service of a Haply Inverse3 moves an arm of a real session."""
 
 import math
 import signal
@@ -16,46 +16,52 @@ from trilat_net.log.log_reader import Log
 
 HANDS = 'sites.m1.hands=[{kind="live", device={force_limit_n=1.5}}]'
 LET_GO_S = 0.2
-"""From the last state of a service to the tick in which the arm is let go."""
-CIRCLE_M, TURN_S = 0.04, 2.0
+"""Longest time from the last state of a service to the tick that lets go of the arm."""
+CIRCLE_M = 0.04
+"""Radius of the circles of the device."""
+TURN_S = 2.0
+"""Duration of a circle."""
 
 
 @dataclass
-class Held:
-    """A session of which Haply's device leads m1, and the process that does so."""
+class DeviceSession:
+    """A session in which a Haply device moves m1, and the process of the device."""
 
     session: Session
     service: HaplyService
     process: Process
 
-    def circles(self) -> None:
-        """Whoever holds the device presses its first button, and leads it in circles."""
-        self.service.place_m = circle
+    def move_in_circles(self) -> None:
+        """Presses the first button of the device, and moves the device in circles."""
+        self.service.place_m = compute_circle_m
         self.service.pressed = {"a"}
 
-    def led(self) -> Log:
-        """Returns the log of the session, which is reproduced bit for bit."""
+    def reproduce(self) -> Log:
+        """Returns the log of the session after an exact re-execution."""
         return self.session.is_reproduced()
 
     @property
-    def said(self) -> list[str]:
+    def lines(self) -> list[str]:
+        """Lines that the process of the device has printed."""
         return self.process.text().splitlines()
 
 
-def circle() -> Vector:
+def compute_circle_m() -> Vector:
+    """Returns the present position on the circle."""
     angle = 2.0 * math.pi * time.perf_counter() / TURN_S
     return CIRCLE_M * math.cos(angle), -0.12, 0.15 + CIRCLE_M * math.sin(angle)
 
 
 @pytest.fixture
-def held(stage: Stage) -> Iterator[Held]:
+def held(stage: Stage) -> Iterator[DeviceSession]:
     with HaplyService() as service:
-        busy = "--set", "rate_hz=250"  # a machine of two cores has six processes here
-        session = Session(stage, "play", PAPER, "--duration", "20", "--set", HANDS, *busy)
+        # The low rate suits a machine of two cores, which runs six processes here.
+        settings = ["--set", HANDS, "--set", "rate_hz=250"]
+        session = Session(stage, "play", PAPER, "--duration", "20", *settings)
         session.all()
         session.begun()
         session.recording()
-        words = (
+        arguments = (
             "hand",
             "m1",
             "--session",
@@ -63,46 +69,48 @@ def held(stage: Stage) -> Iterator[Held]:
             "--device",
             f"haply_inverse3={service.address}",
         )
-        process = stage.start("device", *words, *connection_options(session.endpoints))
+        process = stage.start("device", *arguments, *connection_options(session.endpoints))
         session.processes["device"] = process
         process.prints("button 'a' takes hold")
-        yield Held(session, service, process)
+        yield DeviceSession(session, service, process)
 
 
-def last_moved(log: Log) -> tuple[float, float]:
-    """When the newest message came in that moved m1, and when its arm was let go after that, s."""
+def find_release_s(log: Log) -> tuple[float, float]:
+    """Returns the arrival of the last message that moved m1, and the following release, in s."""
     part = log["m1"]
-    newest = int(np.flatnonzero(np.diff(part.hand[:, 1]) > 0)[-1]) + 1
-    gone = newest + int(np.argmax(part.hand[newest:, 2] == 0.0))
-    assert part.hand[gone, 2] == 0.0
-    return float(part.t_s[newest]), float(part.t_s[gone])
+    message_tick = int(np.flatnonzero(np.diff(part.hand[:, 1]) > 0)[-1]) + 1
+    release_tick = message_tick + int(np.argmax(part.hand[message_tick:, 2] == 0.0))
+    assert part.hand[release_tick, 2] == 0.0
+    return float(part.t_s[message_tick]), float(part.t_s[release_tick])
 
 
 @pytest.mark.long
-def test_a_haply_leads_and_renders_its_reaction(held: Held) -> None:
-    """The target turns as the device does, and the service got the reaction of the arm, within its limit."""
-    held.service.presses_anew = True  # a busy machine may be silent, and let go, in between
-    held.circles()
+def test_a_haply_leads_and_renders_its_reaction(held: DeviceSession) -> None:
+    """The target follows the device, which receives the limited reaction force of the arm."""
+    # A busy machine may be silent for a while, and lose the hold.
+    held.service.presses_anew = True
+    held.move_in_circles()
     begun_s = time.perf_counter()
     until(
         lambda: held.service.asked and held.service.asked[-1][0] - begun_s > 2.0 * TURN_S, 60.0
     )
-    held.service.pressed, held.service.presses_anew = {"b"}, False
+    held.service.pressed = {"b"}
+    held.service.presses_anew = False
     until(lambda: held.service.forces[-1] == (0.0, 0.0, 0.0), 10.0)
-    log = held.led()
+    log = held.reproduce()
     part = log["m1"]
-    mine = part.hand[:, 2] > 0.0
-    target = part.hand[mine, 3:5]
-    across = (target.max(axis=0) - target.min(axis=0)) / 2.0
-    assert across == pytest.approx([CIRCLE_M, CIRCLE_M], rel=0.5)
-    numbers = part.hand[mine, 1]
-    per_s = np.ptp(numbers) / np.ptp(part.t_s[mine])
-    assert per_s > 100.0  # a thousand where the machine is idle
+    is_held = part.hand[:, 2] > 0.0
+    target = part.hand[is_held, 3:5]
+    radii_m = (target.max(axis=0) - target.min(axis=0)) / 2.0
+    assert radii_m == pytest.approx([CIRCLE_M, CIRCLE_M], rel=0.5)
+    message_numbers = part.hand[is_held, 1]
+    messages_per_s = np.ptp(message_numbers) / np.ptp(part.t_s[is_held])
+    assert messages_per_s > 100.0  # about 1000 on an idle machine
     forces = np.array(held.service.forces)
     assert np.linalg.norm(forces, axis=1).max() == pytest.approx(1.5)
     assert np.abs(forces[:, 1]).max() == 0.0
-    assert np.abs(part.tau_x[mine]).max() > 1.0
-    assert "from its place to the force of it p50" in held.said[-1]
+    assert np.abs(part.tau_x[is_held]).max() > 1.0
+    assert "round trip from device position to rendered force: p50" in held.lines[-1]
     texts = [event.text.partition(" at t")[0] for event in log.events if event.kind == "hand"]
     assert (texts[0], texts[-1]) == (
         "m1: HaplyInverse3 takes hold",
@@ -111,51 +119,52 @@ def test_a_haply_leads_and_renders_its_reaction(held: Held) -> None:
 
 
 @pytest.mark.long
-def test_silent_haply_lets_go_until_its_button(held: Held) -> None:
-    """150 ms after the last state of the service the program lets go."""
-    held.circles()
+def test_silent_haply_lets_go_until_its_button(held: DeviceSession) -> None:
+    """The program lets go of the arm 150 ms after the last state of the service."""
+    held.move_in_circles()
     until(lambda: len(held.service.asked) > 500, 60.0)
     held.service.silent.set()
-    held.process.prints("is silent; the arm is let go")
+    held.process.prints("is silent; the arm is released")
     held.service.silent.clear()
-    until(lambda: sum("takes hold" in line for line in held.said) == 2, 30.0)
-    log = held.led()
-    moved_s, gone_s = last_moved(log)
-    assert gone_s - moved_s <= LET_GO_S
-    assert not log["m1"].tau_x[log["m1"].t_s > gone_s + 0.11].any()  # its grip has faded
+    until(lambda: sum("takes hold" in line for line in held.lines) == 2, 30.0)
+    log = held.reproduce()
+    message_s, release_s = find_release_s(log)
+    assert release_s - message_s <= LET_GO_S
+    assert not log["m1"].tau_x[log["m1"].t_s > release_s + 0.11].any()  # the grip has faded
     texts = [event.text.partition(" at t")[0] for event in log.events if event.kind == "hand"]
     assert texts == ["m1: HaplyInverse3 takes hold", "m1: HaplyInverse3 lets go"]
 
 
 @pytest.mark.long
-def test_a_killed_service_leads_again_after_return(held: Held) -> None:
-    held.circles()
+def test_a_killed_service_leads_again_after_return(held: DeviceSession) -> None:
+    held.move_in_circles()
     until(lambda: len(held.service.asked) > 500, 60.0)
     held.service.kill()
-    held.process.prints("the arm is let go, and the device is tried again")
+    held.process.prints("the arm is released, and the device is tried again")
     with HaplyService(held.service.port) as again:
         until(lambda: len(again.asked) > 100, 60.0)
-        again.place_m, again.pressed = circle, {"a"}
+        again.place_m = compute_circle_m
+        again.pressed = {"a"}
         until(lambda: any(force != (0.0, 0.0, 0.0) for force in again.forces), 30.0)
-        log = held.led()
+        log = held.reproduce()
     texts = [event.text.partition(" at t")[0] for event in log.events if event.kind == "hand"]
     assert texts[:3] == [
-        f"m1: HaplyInverse3 {what}" for what in ("takes hold", "lets go", "takes hold")
+        f"m1: HaplyInverse3 {action}" for action in ("takes hold", "lets go", "takes hold")
     ]
     closed = f"m1: the service at {held.service.address} has closed the connection"
-    assert f"{closed}; the arm is let go, and the device is tried again" in held.said
+    assert f"{closed}; the arm is released, and the device is tried again" in held.lines
 
 
 @pytest.mark.long
-def test_a_killed_device_program_lets_go(held: Held) -> None:
-    """It has no heartbeat but the states of its device: the site hears it no more."""
-    held.circles()
+def test_a_killed_device_program_lets_go(held: DeviceSession) -> None:
+    """Without messages of the stopped program, the site lets go of the arm."""
+    held.move_in_circles()
     until(lambda: len(held.service.asked) > 500, 60.0)
     held.process.signal(signal.SIGSTOP)
     del held.session.processes["device"]
-    log = held.led()
-    moved_s, gone_s = last_moved(log)
-    assert gone_s - moved_s <= LET_GO_S + 0.01
+    log = held.reproduce()
+    message_s, release_s = find_release_s(log)
+    assert release_s - message_s <= LET_GO_S + 0.01
     assert (
         "is silent: let go" in [event.text for event in log.events if event.kind == "hand"][-1]
     )

@@ -14,7 +14,7 @@ from trilat_people.experiment.experiment_run import Experiment, open_experiment
 from tests.live.browsers import needs_browser, page_address, wait_until_page
 from tests.live.processes import Process, Stage, is_running
 from tests.net.waiting import until
-from trilat_net.execution.verification import verify
+from trilat_net.execution.verification import verify_log
 from trilat_net.log.log_reader import open_log
 
 from .participants import (
@@ -69,7 +69,7 @@ def assert_log_table_and_page_agree(
     assert len(list((folder / "logs").iterdir())) == len(rows)
     for n, row in enumerate(rows):
         log = open_log(folder / row["log"])
-        assert verify(log).passed
+        assert verify_log(log).passed
         succeeded, appears_s, ended_s = judge_log(done, row)
         assert (row["succeeded"], float(row["completion_s"])) == (
             str(int(succeeded)),
@@ -167,7 +167,7 @@ def test_two_people_perform_other_tasks(what: str, stage: Stage) -> None:
     assert (pages[0]["target"]["at"] != pages[1]["target"]["at"]) == (what == "settle")
     assert row["succeeded"] == "1", row
     assert float(row[measure]) >= 0.0
-    assert verify(open_log(folder / row["log"])).passed
+    assert verify_log(open_log(folder / row["log"])).passed
 
 
 @pytest.mark.long

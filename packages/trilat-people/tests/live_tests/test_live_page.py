@@ -1,4 +1,4 @@
-"""`trilat live` in a real browser: what the page shows is the session, and its button ends it in order."""
+"""The page of `trilat live` in a real browser shows the session, and can end the session in order."""
 
 import contextlib
 import os
@@ -48,42 +48,43 @@ from trilat_net.scenario import load_scenario
 pytestmark = needs_browser
 
 
-def live(stage: Stage, scenario: str, *options: str) -> Process:
+def start_live(stage: Stage, scenario: str, *options: str) -> Process:
+    """Starts `trilat live` without a browser of its own."""
     return stage.start(
         "live", "live", scenario, "--no-browser", "--out", str(stage.folder / "out"), *options
     )
 
 
-def assert_energies_are_those_of(log: Log, energies: list[list[float]]) -> None:
-    """V on the page is that of `certify` at the same instants."""
+def assert_energies_match(log: Log, energies: list[list[float]]) -> None:
+    """Asserts that the energies on the page are those of `certify` at the same times."""
     balance = compute_energy_balance(compute_site_energies(log))
     t_s, V, supplied = np.array(energies).T
     rows = np.searchsorted(balance.t_s, t_s - 1e-9)
-    inside = rows < len(balance.t_s)
-    assert inside.sum() > 40
-    most = np.abs(balance.V).max()
-    assert (
-        np.abs(V - balance.V[np.minimum(rows, len(balance.t_s) - 1)])[inside].max()
-        <= 1e-9 * most
-    )
-    gave = balance.external_work[np.minimum(rows, len(balance.t_s) - 1)]
-    assert np.abs(supplied - gave)[inside].max() <= 1e-9 * most
+    is_recorded = rows < len(balance.t_s)
+    assert is_recorded.sum() > 40
+    recorded_rows = rows[is_recorded]
+    tolerance_j = 1e-9 * np.abs(balance.V).max()
+    V_errors = V[is_recorded] - balance.V[recorded_rows]
+    work_errors = supplied[is_recorded] - balance.external_work[recorded_rows]
+    assert np.abs(V_errors).max() <= tolerance_j
+    assert np.abs(work_errors).max() <= tolerance_j
 
 
 def end_by_button(page: Page) -> None:
+    """Ends the session by the button on the page, and confirms the dialog."""
     page.on("dialog", lambda dialog: dialog.accept())
     page.click("#end")
 
 
-def grips(log: Log, site: str) -> "np.ndarray[tuple[int, int], np.dtype[np.float64]]":
-    """Time, s, grip and number of the message in force at every tick."""
+def list_grips(log: Log, site: str) -> "np.ndarray[tuple[int, int], np.dtype[np.float64]]":
+    """Returns time in s, grip, and number of the message in force, with a row for every tick."""
     part = log[site]
     return np.column_stack([part.t_s, part.hand[:, 0], part.hand[:, 1]])
 
 
 def test_people_see_hold_change_and_end_sessions(stage: Stage) -> None:
-    # drawing takes what a machine of two cores has
-    running = live(stage, "play", "--set", "rate_hz=100")
+    # A machine of two cores can draw the page beside loops of this rate.
+    running = start_live(stage, "play", "--set", "rate_hz=100")
     with browser_page(page_address(running)) as page:
         wait_until_page(page, "trilat.frame && trilat.frame.t > 1 && trilat.takesPart")
         assert page.locator(".arm").count() == 3
@@ -92,7 +93,7 @@ def test_people_see_hold_change_and_end_sessions(stage: Stage) -> None:
         take_hold(page, 0, 60.0, 10.0)
         wait_until_page(page, "trilat.frame.holds.includes('m1')")
         wait_until_page(page, f"trilat.frame.sites.m1.points.at(-1)[0] > {before[0]} + 0.02")
-        # once it is drawn
+        # The page states the hold once the frame is drawn.
         wait_until_page(
             page, "document.querySelector('.arm').innerText.includes('you hold it')"
         )
@@ -111,35 +112,41 @@ def test_people_see_hold_change_and_end_sessions(stage: Stage) -> None:
     assert running.code() == 130
     log = open_log(stage.folder / "out" / "run.mcap")
     assert_executed_again(log)
-    assert_energies_are_those_of(log, energies)
+    assert_energies_match(log, energies)
     assert len({event.command for event in log.events if event.kind == "change"}) == 6
     assert [event.text for event in log.events if event.kind == "mark"] == ["felt it"]
-    first = next(event.text for event in log.events if event.kind == "hand")
-    assert first.startswith("m1: page 1 takes hold")
-    assert grips(log, "m1")[:, 1].max() == 1.0
+    first_hold = next(event.text for event in log.events if event.kind == "hand")
+    assert first_hold.startswith("m1: page 1 takes hold")
+    assert list_grips(log, "m1")[:, 1].max() == 1.0
 
 
-OF_SOME_ROLES = ("hello", "hello.stage", "stage", "sites.*", "links.*.stated.*")
-"""Fields that a page may read although they are not sent to every role, or not of every link."""
+PARTIAL_FIELDS = ("hello", "hello.stage", "stage", "sites.*", "links.*.stated.*")
+"""Fields that a page may read although not every role receives them, or not for every link."""
 
 
 @pytest.mark.long
 @pytest.mark.parametrize("who", ["experimenter", "user m1", "watcher"])
 def test_every_view_of_a_session_is_whole(who: str, stage: Stage) -> None:
-    """With delays that vary: no error, no empty frame, and every line of every plot is drawn."""
-    varied = ("rate_hz=250", "link.model=uniform", "link.delay_ms=120", "link.half_width_ms=60")
-    running = live(stage, "play", *chain.from_iterable(("--set", one) for one in varied))
+    """With varying delays, the page has no error and no empty frame, and draws every line of its plots."""
+    settings = (
+        "rate_hz=250",
+        "link.model=uniform",
+        "link.delay_ms=120",
+        "link.half_width_ms=60",
+    )
+    options = chain.from_iterable(("--set", setting) for setting in settings)
+    running = start_live(stage, "play", *options)
     with sync_playwright() as playwright, watched_page(launch_browser(playwright)) as watched:
         watched.page.goto(role_address(running, who))
         wait_until_page(watched.page, "window.trilat?.frame?.t > 3")
-        watched.assert_whole(OF_SOME_ROLES)
+        watched.assert_whole(PARTIAL_FIELDS)
     running.signal(signal.SIGINT)
     running.prints("checking the log")
 
 
 @pytest.mark.long
 def test_a_finger_drags_an_arm_on_a_phone(stage: Stage) -> None:
-    running = live(stage, "play", "--set", "rate_hz=100")
+    running = start_live(stage, "play", "--set", "rate_hz=100")
     phone = {"viewport": {"width": 390, "height": 844}, "has_touch": True, "is_mobile": True}
     with browser_page(page_address(running), **phone) as page:
         wait_until_page(
@@ -160,13 +167,13 @@ def test_a_finger_drags_an_arm_on_a_phone(stage: Stage) -> None:
         assert page.evaluate("trilat.frame.holds") == ["m1"]
         touch("touchEnd")
         wait_until_page(page, "trilat.frame.sites.m1.grip === 0 && !trilat.frame.holds.length")
-        # the page does not scroll under a finger that leads an arm
+        # The page does not scroll while a finger moves an arm.
         assert page.evaluate("scrollY") == 0
     running.signal(signal.SIGINT)
     running.prints("checking the log")
 
 
-KEEP_DRAWN = """
+STORE_DRAWN_FRAMES = """
 const arms = trilat.parts.arms, draw = arms.draw.bind(arms);
 window.drawn = [];
 arms.draw = (frame) => {
@@ -191,16 +198,16 @@ PICTURE = ("link.delay_ms=50", "sites.m1.view.delay_ms=300", "sites.m1.view.loss
 def test_a_users_page_draws_what_the_log_says(
     count: int, delays: tuple[str, ...], stage: Stage
 ) -> None:
-    """At 300 ms, while the user moves: every frame that the browser draws, held against the log."""
-    running = live(
-        stage, "play", *chain.from_iterable(("--set", one) for one in ("rate_hz=250", *delays))
-    )
+    """Every frame that the browser draws equals the log, with delays of 300 ms and a moving user."""
+    settings = ("rate_hz=250", *delays)
+    options = chain.from_iterable(("--set", setting) for setting in settings)
+    running = start_live(stage, "play", *options)
     with browser_page(role_address(running, "user m1")) as page:
         wait_until_page(page, "trilat.frame && trilat.frame.t > 1 && trilat.takesPart")
-        page.evaluate(KEEP_DRAWN)
+        page.evaluate(STORE_DRAWN_FRAMES)
         take_hold(page, 0, 60.0, 10.0)
         wait_until_page(page, f"drawn.length >= {count}", 180.0)
-        drawn = page.evaluate("drawn")
+        drawn_frames = page.evaluate("drawn")
         wait_until_page(page, "trilat.frame.sites.s.age_ms >= 300")
         with page_client(page_address(running)) as experimenter:
             experimenter.take()
@@ -213,17 +220,18 @@ def test_a_users_page_draws_what_the_log_says(
     running.signal(signal.SIGINT)
     running.prints("checking the log")
     log = open_log(stage.folder / "out" / "run.mcap")
-    ages, shown = [], log.shown("m1")
-    for frame in drawn:
-        own = frame["m1"][0]
+    ages_ticks = []
+    shown_ticks = log.shown("m1")
+    for frame in drawn_frames:
+        own_tick = frame["m1"][0]
         for name, (tick, points) in frame.items():
-            assert tick == (own if name == "m1" else shown[name][own])
+            expected_tick = own_tick if name == "m1" else shown_ticks[name][own_tick]
             q = np.array([log[name].states[tick].q])
-            assert (
-                points == np.round(joint_positions_m(log.scenario.arms[name], q)[0], 5).tolist()
-            )
-        ages.append(own - frame["s"][0])
-    assert min(ages) >= 75  # 300 ms of 250 ticks a second
+            logged_points_m = joint_positions_m(log.scenario.arms[name], q)[0]
+            assert tick == expected_tick
+            assert points == np.round(logged_points_m, 5).tolist()
+        ages_ticks.append(own_tick - frame["s"][0])
+    assert min(ages_ticks) >= 75  # 300 ms at 250 Hz
 
 
 PAD = """
@@ -236,8 +244,8 @@ window.pad = pad;
 
 @pytest.mark.long
 def test_a_gamepad_leads_the_chosen_arm(stage: Stage) -> None:
-    """The browser's own interface, with a pad that is none: no machine of the tests has one."""
-    running = live(stage, "play", "--set", "rate_hz=250")
+    """The gamepad interface of the browser is replaced, because test machines have no gamepad."""
+    running = start_live(stage, "play", "--set", "rate_hz=250")
     with browser_page(page_address(running)) as page:
         wait_until_page(
             page, "trilat.frame && trilat.takesPart && trilat.parts.arms.cards[1].graspable"
@@ -268,8 +276,8 @@ pad.vibrationActuator = { playEffect: (kind, how) => {
 
 @pytest.mark.long
 def test_gamepads_rumble_as_arms_meet_walls(stage: Stage) -> None:
-    """Ten times a second at most, as strong as the wall pushes; not before, and not once it is let go."""
-    running = live(stage, "play", "--set", "rate_hz=250")
+    """A held arm makes the gamepad rumble at most ten times per second, in proportion to the wall force."""
+    running = start_live(stage, "play", "--set", "rate_hz=250")
     with browser_page(page_address(running)) as page:
         wait_until_page(
             page, "trilat.frame && trilat.takesPart && trilat.parts.arms.cards[2].graspable"
@@ -288,10 +296,11 @@ def test_gamepads_rumble_as_arms_meet_walls(stage: Stage) -> None:
         rumbles = page.evaluate("rumbles")
         wait_until_page(page, "trilat.frame.n > 30")
         assert page.evaluate("rumbles.length") == len(rumbles)
-    assert min(np.diff([one["at"] for one in rumbles])) >= 100.0
-    for one in rumbles:
-        assert one["kind"] == "dual-rumble"
-        assert one["strongMagnitude"] == pytest.approx(min(1.0, one["wall"] / 40.0))
+    times_ms = [rumble["at"] for rumble in rumbles]
+    assert min(np.diff(times_ms)) >= 100.0
+    for rumble in rumbles:
+        assert rumble["kind"] == "dual-rumble"
+        assert rumble["strongMagnitude"] == pytest.approx(min(1.0, rumble["wall"] / 40.0))
     running.signal(signal.SIGINT)
     running.prints("checking the log")
 
@@ -299,11 +308,11 @@ def test_gamepads_rumble_as_arms_meet_walls(stage: Stage) -> None:
 @pytest.mark.long
 @pytest.mark.parametrize("killed", ["browser", "server"])
 def test_arms_are_free_after_their_page_dies(killed: str, stage: Stage) -> None:
-    """The force is 0 at most 320 ms after the last message, and the log says that the hand let go."""
+    """The force is zero within 320 ms of the last message, and the log states that the hand let go."""
     session = Session(stage, "play", PAPER, "--duration", "60", "--set", "rate_hz=250")
     session.all()
-    ways = connection_options(session.endpoints)
-    page_server = stage.start("page", "live", "--session", "t", "--no-browser", *ways)
+    options = connection_options(session.endpoints)
+    page_server = stage.start("page", "live", "--session", "t", "--no-browser", *options)
     with sync_playwright() as playwright:
         browser = launch_browser(playwright)
         page = browser.new_page()
@@ -314,9 +323,11 @@ def test_arms_are_free_after_their_page_dies(killed: str, stage: Stage) -> None:
         os.kill(page_server.pid if killed == "server" else chromium_pid(), signal.SIGKILL)
     session.ends_well()
     log = open_log(session.log)
-    t_s, grip, number = grips(log, "m1").T
-    last_message_s = t_s[np.flatnonzero(np.diff(number) > 0)[-1] + 1]
-    free_s = t_s[np.flatnonzero(grip > 0.0)[-1] + 1]
+    t_s, grip, message_number = list_grips(log, "m1").T
+    last_message_tick = np.flatnonzero(np.diff(message_number) > 0)[-1] + 1
+    first_free_tick = np.flatnonzero(grip > 0.0)[-1] + 1
+    last_message_s = t_s[last_message_tick]
+    free_s = t_s[first_free_tick]
     assert free_s - last_message_s < 0.32
     assert "hand" in {event.kind for event in log.events}
     assert all(log.missing(site) == 0 for site in log.sites)
@@ -324,8 +335,8 @@ def test_arms_are_free_after_their_page_dies(killed: str, stage: Stage) -> None:
 
 @pytest.mark.long
 def test_a_hostile_page_costs_the_loops_nothing(stage: Stage) -> None:
-    """A flood, ten megabytes, NaN, a target a kilometre away: refused and counted, every record is there."""
-    running = live(stage, "play", "--set", "rate_hz=250")
+    """Floods, large messages, NaN and far targets are refused and counted, and no record is missing."""
+    running = start_live(stage, "play", "--set", "rate_hz=250")
     address = page_address(running)
     with browser_page(address) as page:
         wait_until_page(page, "trilat.frame && trilat.frame.t > 1")
@@ -350,29 +361,31 @@ def test_a_hostile_page_costs_the_loops_nothing(stage: Stage) -> None:
     assert running.code(180.0) == 0, running
     log = open_log(stage.folder / "out" / "run.mcap")
     assert all(log.missing(site) == 0 for site in log.sites)
-    assert grips(log, "m1")[:, 1].max() == 0.0
+    assert list_grips(log, "m1")[:, 1].max() == 0.0
     assert log.link_stats("m1")[-1].dropped["hand: out of range"] > 0
+
+
+COUNT_OPAQUE_PIXELS = """(card) => {
+  const canvas = document.querySelectorAll('.arm canvas')[card];
+  const { width, height } = canvas;
+  const bytes = canvas.getContext('2d').getImageData(0, 0, width, height).data;
+  let count = 0;
+  for (let k = 3; k < bytes.length; k += 4) count += bytes[k] > 200;
+  return count;
+}"""
 
 
 @pytest.mark.long
 @pytest.mark.parametrize("gl", [True, False], ids=["WebGL", "no WebGL"])
 def test_three_arms_are_drawn_with_webgl_and_without(gl: bool, stage: Stage) -> None:
-    running = live(stage, "paper", "--duration", "30")
+    running = start_live(stage, "paper", "--duration", "30")
     with browser_page(with_query(page_address(running), "webgl"), gl=gl) as page:
         wait_until_page(page, "trilat.frame && trilat.frame.t > 2")
         until(
             lambda: page.inner_text("#painter").startswith("drawn with" if gl else "no WebGL")
         )
-        for n in range(3):  # something of the arm's colour is drawn in every card
-            assert (
-                page.evaluate(
-                    """(n) => { const c = document.querySelectorAll('.arm canvas')[n];
-                const d = c.getContext('2d').getImageData(0, 0, c.width, c.height).data;
-                let seen = 0; for (let k = 3; k < d.length; k += 4) seen += d[k] > 200; return seen; }""",
-                    n,
-                )
-                > 500
-            )
+        for card in range(3):
+            assert page.evaluate(COUNT_OPAQUE_PIXELS, card) > 500
     running.signal(signal.SIGINT)
     assert running.code(180.0) == 0, running
     assert "ok   executed again" in running.text()
@@ -380,7 +393,7 @@ def test_three_arms_are_drawn_with_webgl_and_without(gl: bool, stage: Stage) -> 
 
 @pytest.mark.long
 def test_a_second_page_only_watches_until_it_asks(stage: Stage) -> None:
-    running = live(stage, "two_sites", "--duration", "30")
+    running = start_live(stage, "two_sites", "--duration", "30")
     address = page_address(running)
     with browser_page(address) as first:
         wait_until_page(first, "trilat.frame && trilat.takesPart")
@@ -405,20 +418,20 @@ card.numbers({ ...trilat.frame.sites[card.name], e: 100, tau: large, pull: large
 
 @pytest.mark.long
 def test_stopped_arms_and_lost_peers_are_shown(stage: Stage) -> None:
-    glide = ("rate_hz=250", "on_stale.action=glide", "on_stale.align_limit_rad=3")
-    options = chain.from_iterable(("--set", one) for one in glide)
-    running = live(stage, "two_sites", "--duration", "60", *options)
+    settings = ("rate_hz=250", "on_stale.action=glide", "on_stale.align_limit_rad=3")
+    options = chain.from_iterable(("--set", setting) for setting in settings)
+    running = start_live(stage, "two_sites", "--duration", "60", *options)
     with browser_page(page_address(running)) as page:
         wait_until_page(page, "trilat.frame && trilat.frame.sites.s.mode === 'run'")
         assert page.locator("#alarms .raised").count() == 0
-        arm = page.locator(".arm").first.bounding_box()
-        ways = connection_options(re.findall(r"tcp/127\.0\.0\.1:\d+", running.text())[:2])
+        arm_box = page.locator(".arm").first.bounding_box()
+        endpoints = re.findall(r"tcp/127\.0\.0\.1:\d+", running.text())[:2]
+        connection = connection_options(endpoints)
         name = page.evaluate("trilat.hello.session")
-        stop = stage.start("stop", "stop", "--session", name, "s", *ways)
+        stop = stage.start("stop", "stop", "--session", name, "s", *connection)
         assert stop.code() == 0, stop
         page.wait_for_selector("#alarms .raised")
-        words = page.inner_text("#alarms .raised")
-        assert "s STOPPED" in words
+        assert "s STOPPED" in page.inner_text("#alarms .raised")
         wait_until_page(
             page,
             "document.querySelector('#alarms .raised').innerText.includes('ordered by the operator')",
@@ -429,16 +442,16 @@ def test_stopped_arms_and_lost_peers_are_shown(stage: Stage) -> None:
         assert box is not None
         assert box["height"] > 50.0
         assert 0.0 < box["y"] < page.evaluate("innerHeight") - box["height"]
-        # what somebody holds stays under the pointer
-        assert page.locator(".arm").first.bounding_box() == arm
+        # A held arm stays under the pointer.
+        assert page.locator(".arm").first.bounding_box() == arm_box
         wait_until_page(page, "document.querySelector('#state').textContent === 's STOPPED'")
         page.evaluate(
             "document.querySelector('#state').textContent = 's STOPPED, m STOPPED, and more'"
         )
-        assert page.locator(".arm").first.bounding_box() == arm
-        drawn = page.locator(".arm canvas").first.bounding_box()
+        assert page.locator(".arm").first.bounding_box() == arm_box
+        canvas_box = page.locator(".arm canvas").first.bounding_box()
         page.evaluate(LARGE)
-        assert page.locator(".arm canvas").first.bounding_box() == drawn
+        assert page.locator(".arm canvas").first.bounding_box() == canvas_box
         if "TRILAT_PICTURES" in os.environ:
             page.screenshot(path=f"{os.environ['TRILAT_PICTURES']}/stopped.png")
         page.click("#alarms button")
@@ -471,7 +484,7 @@ def test_stopped_arms_and_lost_peers_are_shown(stage: Stage) -> None:
     ],
 )
 def test_every_role_stops_every_arm(who: str, way: str, stage: Stage) -> None:
-    running = live(stage, "play", "--set", "rate_hz=250")
+    running = start_live(stage, "play", "--set", "rate_hz=250")
     phone = {"viewport": {"width": 390, "height": 844}, "has_touch": True, "is_mobile": True}
     link = role_address(running, who)
     with browser_page(link, **(phone if way == "finger" else {})) as page:
@@ -496,7 +509,7 @@ def test_every_role_stops_every_arm(who: str, way: str, stage: Stage) -> None:
 
 
 def test_browsers_get_in_by_their_links_token() -> None:
-    """It stands in the fragment, which the page hands to its socket; a wrong one is said."""
+    """The token is in the fragment of the link. The page shows an error for a wrong token."""
     said: list[str] = []
     options = PageOptions(host="0.0.0.0", insecure=True)
     with PageServer(

@@ -1,4 +1,4 @@
-"""What a page's server would send of a session of `play`, and browsers that are sent it."""
+"""Records the messages of a page server about a session, and replays them to browsers."""
 
 import json
 import math
@@ -46,13 +46,15 @@ Json = dict[str, Any]
 
 @dataclass
 class RecordedSession:
-    """Hellos and frames of every role.
+    """First messages and frames of a session for the page of every role.
 
     Attributes:
-        user: site of the user's page.
-        cut: true: pages get nothing more.
-        sent: what pages have sent besides that they have drawn a frame.
-        last: the frame that a page gets again and again; a test may change it.
+        user: Site of the user's page.
+        hellos: First message to the page of each role.
+        frames: Frames for the page of each role.
+        cut: True to send no further frame to a page.
+        sent: Messages of the pages, without those that acknowledge a frame.
+        last: Last frame, which a page receives repeatedly. A test may change it.
     """
 
     user: str = "m1"
@@ -66,10 +68,15 @@ class RecordedSession:
     def shown(
         self, browser: Browser, address: str, role: str, screen: str, scheme: str, **last: Any
     ) -> Iterator[Page]:
-        """A page that has drawn all frames, and gets the last one again until the session is cut off.
+        """Opens a page that has drawn all frames, and receives the last one until `cut` is set.
 
         Args:
-            last: what the last frame has besides.
+            browser: The browser.
+            address: Address of the page.
+            role: Role of the page, one of `ROLES`.
+            screen: Size of the screen, a key of `SCREENS`.
+            scheme: Colour scheme, "light" or "dark".
+            **last: Fields of the last frame that differ from the recorded ones.
         """
         with self.watched(browser, address, role, screen, scheme, **last) as watched:
             yield watched.page
@@ -78,10 +85,10 @@ class RecordedSession:
     def watched(
         self, browser: Browser, address: str, role: str, screen: str, scheme: str, **last: Any
     ) -> Iterator[WatchedPage]:
-        """The same page with the means to check it; at its end it has had no error."""
-        *before, end = self.frames[role]
-        self.last = {**end, **last, "points": [], "energies": [], "events": []}
-        frames = chain(before, repeat(self.last))
+        """Opens the same page as `shown`, and checks that the page reports no error until its end."""
+        *first_frames, last_frame = self.frames[role]
+        self.last = {**last_frame, **last, "points": [], "energies": [], "events": []}
+        frames = chain(first_frames, repeat(self.last))
         self.sent.clear()
 
         def send(route: WebSocketRoute) -> None:
@@ -108,7 +115,7 @@ class RecordedSession:
 
 
 def record_session(folder: Path, duration_s: float = 4.0) -> RecordedSession:
-    """Returns a session at 300 ms in which somebody leads m1."""
+    """Runs a session with delays of 300 ms, in which an operator moves m1."""
     scenario = load_scenario(
         "play", {"duration_s": duration_s, "rate_hz": 200, "link.delay_ms": 300}
     )
@@ -118,23 +125,23 @@ def record_session(folder: Path, duration_s: float = 4.0) -> RecordedSession:
 def record_views(
     session: Session, user: str, *, leads: bool = False, stage: Stage | None = None
 ) -> RecordedSession:
-    """Runs a session and returns what pages of every role would be sent of it.
+    """Runs a session, and records the messages to the pages of every role.
 
     Args:
-        session: the session, with its sites and its recorder.
-        user: site of the user's page.
-        leads: true: somebody leads that site's arm by a live hand.
-        stage: of an experiment, of which the session is a trial.
+        session: The session, with its sites and its recorder.
+        user: Site of the user's page.
+        leads: True if an operator moves the arm of that site by a live hand.
+        stage: Stage of the experiment, of which the session is a trial. None for no experiment.
     """
-    found = RecordedSession(user)
+    recorded = RecordedSession(user)
     scenario = session.scenario
-    session.stranger(partial(_record, found, scenario, leads=leads, stage=stage))
+    session.stranger(partial(_record, recorded, scenario, leads=leads, stage=stage))
     session.play()
-    return found
+    return recorded
 
 
 def _record(
-    found: RecordedSession,
+    recorded: RecordedSession,
     scenario: Scenario,
     bus: Bus,
     clock: RelayClock,
@@ -144,41 +151,53 @@ def _record(
 ) -> None:
     view = SessionView(bus, clock, SESSION)
     pages = SessionFrames(view)
-    hand = open_hand(bus, clock, SESSION, found.user, scenario, "Ada") if leads else None
-    points = energies = events = n = 0
+    hand = open_hand(bus, clock, SESSION, recorded.user, scenario, "Ada") if leads else None
+    point_count = 0
+    energy_count = 0
+    event_count = 0
+    frame_number = 0
     while not view.ended:
         view.poll()
         frame = pages.make_frame()
         if stage is not None:
-            stage.poll(view, [(site, n) for n, site in enumerate(stage.users, 1)])
+            stage.poll(view, [(site, number) for number, site in enumerate(stage.users, 1)])
         if frame is not None and 1.0 < frame["t"] < scenario.duration_s - 0.2:
-            n += 1
-            turn = 2.0 * frame["t"]
+            frame_number += 1
+            angle_rad = 2.0 * frame["t"]
             if hand is not None:
-                hand.move(1.0 + 0.15 * math.sin(turn), 0.6 + 0.25 * math.cos(turn))
+                hand.move(1.0 + 0.15 * math.sin(angle_rad), 0.6 + 0.25 * math.cos(angle_rad))
             added = {
-                "points": pages.points.since(points, 10_000),
-                "energies": pages.energies.since(energies, 10_000),
-                "events": [render_event(event) for event in view.events.since(events, 100)],
+                "points": pages.points.since(point_count, 10_000),
+                "energies": pages.energies.since(energy_count, 10_000),
+                "events": [
+                    render_event(event) for event in view.events.since(event_count, 100)
+                ],
             }
-            points, energies, events = (
-                pages.points.count,
-                pages.energies.count,
-                view.events.count,
+            point_count = pages.points.count
+            energy_count = pages.energies.count
+            event_count = view.events.count
+            common = {"n": frame_number, **_ABOUT_PAGES}
+            nothing_added: Json = {key: [] for key in added}
+            user_frame = pages.describe_as(frame, recorded.user, ages=True)
+            recorded.frames["experimenter"].append(
+                {**common, **frame, **added, "takes_part": True}
             )
-            every = {"n": n, **_ABOUT_PAGES}
-            nothing: Json = {key: [] for key in added}
-            known = pages.describe_as(frame, found.user, ages=True)
-            found.frames["experimenter"].append({**every, **frame, **added, "takes_part": True})
-            found.frames["watcher"].append({**every, **frame, **added, "takes_part": False})
-            found.frames["user"].append({**every, **known, **nothing, "takes_part": True})
-            about, narrow = pages.describe(), pages.describe_session_as_user()
-            for role, of in (("experimenter", about), ("watcher", about), ("user", narrow)):
-                site = found.user if role == "user" else ""
-                who = {"role": role, "as": site, "ends": role == "experimenter"}
+            recorded.frames["watcher"].append({**common, **frame, **added, "takes_part": False})
+            recorded.frames["user"].append(
+                {**common, **user_frame, **nothing_added, "takes_part": True}
+            )
+            description = pages.describe()
+            descriptions = {
+                "experimenter": description,
+                "watcher": description,
+                "user": pages.describe_session_as_user(),
+            }
+            for role, role_description in descriptions.items():
+                site = recorded.user if role == "user" else ""
+                page_role = {"role": role, "as": site, "ends": role == "experimenter"}
                 staged: Json = {}
                 if stage is not None:
                     staged = {"stage": stage.describe(role, site, _PAGES[role], frame["t"])}
-                found.frames[role][-1].update(staged)
-                found.hellos[role] = {**of, **who, **staged, "n": 0}
+                recorded.frames[role][-1].update(staged)
+                recorded.hellos[role] = {**role_description, **page_role, **staged, "n": 0}
         clock.sleep_until(clock.monotonic_ns() + 33_333_333)

@@ -35,7 +35,7 @@ from trilat_net.analysis.certificate.running_energy import RecordWindow
 from trilat_net.app.demo_session import SessionResult
 from trilat_net.core.step.ticks import NS_PER_S
 from trilat_net.errors import LogRefused, UsageError
-from trilat_net.execution.verification import verify
+from trilat_net.execution.verification import verify_log
 from trilat_net.log.log_reader import open_log
 from trilat_net.net.clock import SystemClock
 
@@ -73,7 +73,7 @@ def assert_whole(experiment: Experiment) -> None:
     rows = open_experiment(experiment.folder).to_rows()
     assert [row["trial_number"] for row in rows] == [1, 2]
     assert {row["people"] for row in rows} == {1}
-    assert all(verify(open_log(experiment.folder / row["log"])).passed for row in rows)
+    assert all(verify_log(open_log(experiment.folder / row["log"])).passed for row in rows)
     assert len(list((experiment.folder / "logs").iterdir())) == 2
     answers = [
         (row["participant"], row["block"], row["item"])

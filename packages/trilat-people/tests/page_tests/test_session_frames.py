@@ -1,4 +1,4 @@
-"""Frames of a running session: what a page shows as one site is what that site had, and nothing newer."""
+"""Frames of a running session show a user the data that the user's site had, and no newer data."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -21,7 +21,7 @@ from trilat_net.net.connection import Connection
 from trilat_net.scenario import load_scenario
 
 FRAME_NS = 33_333_333
-KNOWN_OF_PEERS = {"points", "q", "tick", "bodies", "age_ms"}
+PEER_FIELDS = {"points", "q", "tick", "bodies", "age_ms"}
 JITTER = {
     "model": "gamma",
     "delay_ms": 260.0,
@@ -32,25 +32,26 @@ JITTER = {
 Frames = list[dict[str, Any]]
 
 
-def looking(
+def make_frame_collector(
     frames: Frames, site: str, *, ages: bool = True
 ) -> Callable[[Bus, RelayClock], None]:
-    """A page's server without sockets, which keeps what it would show as a site."""
+    """Returns a page server without sockets, which appends the frames of a site's page to a list."""
 
     def look(bus: Bus, clock: RelayClock) -> None:
         view = SessionView(bus, clock, SESSION)
         pages = SessionFrames(view)
         while not view.ended:
             view.poll()
-            if (frame := pages.make_frame()) is not None:
+            frame = pages.make_frame()
+            if frame is not None:
                 frames.append(pages.describe_as(frame, site, ages=ages))
             clock.sleep_until(clock.monotonic_ns() + FRAME_NS)
 
     return look
 
 
-def drawn(log: Log, site: str, tick: int) -> list[Any]:
-    """The points of an arm at a tick, as frames round them."""
+def compute_points(log: Log, site: str, tick: int) -> list[Any]:
+    """Returns the points of an arm at a tick, rounded as in frames."""
     q = log[site].states[tick].q if tick >= 0 else log.scenario.sites[site].q0_rad
     points = joint_positions_m(log.scenario.arms[site], np.array([q], dtype=np.float64))[0]
     return np.round(points, 5).tolist()  # type: ignore[no-any-return]
@@ -77,73 +78,76 @@ def test_peers_are_drawn_as_logged(
     keys = {"duration_s": 2.5, "link.delay_ms": 300, **links}
     session = Session.whole(load_scenario(scenario, keys), tmp_path)
     frames: Frames = []
-    session.stranger(looking(frames, site))
+    session.stranger(make_frame_collector(frames, site))
     log = session.run()
-    moved = set()
-    shown = log.shown(site)
+    different_points = set()
+    shown_ticks = log.shown(site)
     for frame in frames:
         own = frame["sites"][site]
-        assert own["points"] == drawn(log, site, own["tick"])
+        assert own["points"] == compute_points(log, site, own["tick"])
         assert frame["t"] == own["t"]
         for peer in peers:
-            known = frame["sites"][peer]
-            assert known["tick"] == shown[peer][own["tick"]]
-            assert known["points"] == drawn(log, peer, known["tick"])
-            moved.add(str(known["points"]))
+            shown_peer = frame["sites"][peer]
+            assert shown_peer["tick"] == shown_ticks[peer][own["tick"]]
+            assert shown_peer["points"] == compute_points(log, peer, shown_peer["tick"])
+            different_points.add(str(shown_peer["points"]))
     assert len(frames) > 60
-    assert len(moved) > 50
+    assert len(different_points) > 50
     assert frames[-1]["sites"][peers[0]]["age_ms"] >= 100.0
 
 
 def test_a_user_is_shown_how_its_law_pulls(tmp_path: Path) -> None:
-    """The torque beyond what carries the arm does the work of a force at its end, N."""
+    """The torque without gravity compensation equals that of the shown force at the end effector."""
     keys = {"duration_s": 1.5, "arm.g_m_s2": 9.81, "sites.m1.q0_rad": [0.3, 1.2]}
     session = Session.whole(load_scenario("paper", keys), tmp_path)
     frames: Frames = []
-    session.stranger(looking(frames, "m1"))
+    session.stranger(make_frame_collector(frames, "m1"))
     log = session.run()
     arm = build_arm_rows(log.scenario, "m1")
-    largest = 0.0
-    for own in (frame["sites"]["m1"] for frame in frames):
+    largest_pull_n = 0.0
+    for frame in frames:
+        own = frame["sites"]["m1"]
         record = log["m1"].states[own["tick"]]
         q = np.array([record.q])
         J = arm.place_end_effector(q, np.zeros_like(q)).J[0]
         torque = np.array(record.tau) - arm.gravity_torque(q)[0]
         if np.linalg.svd(J, compute_uv=False)[-1] > 0.1 * np.linalg.norm(J):
             assert J.T @ np.array(own["pull"]) == pytest.approx(torque, abs=5e-3)
-            largest = max(largest, np.linalg.norm(own["pull"]))
-    assert largest > 1.0
+            largest_pull_n = max(largest_pull_n, np.linalg.norm(own["pull"]))
+    assert largest_pull_n > 1.0
 
 
 def test_peers_stay_until_their_record_has_come(tmp_path: Path) -> None:
-    """Never a newer one, and the one in use again once it can be had."""
+    """A lost record is never replaced by a newer one, and the shown record catches up later."""
     session = Session.whole(
         load_scenario("two_sites", {"duration_s": 3.0, "link.delay_ms": 20}), tmp_path
     )
     session.lose("m", f"trilat/{SESSION}/s/state", 2_500_000_000, 3_000_000_000)
     frames: Frames = []
-    session.stranger(looking(frames, "m"))
+    session.stranger(make_frame_collector(frames, "m"))
     log = session.run()
-    behind = []
+    lags_ticks = []
     for frame in frames:
-        known, own = frame["sites"]["s"], frame["sites"]["m"]
-        behind.append(log["m"].states[own["tick"]].used["s"] - known["tick"])
-        assert known["points"] == drawn(log, "s", known["tick"])
-        if known["age_ms"] is not None:
-            assert known["age_ms"] == pytest.approx(own["tick"] - known["tick"])
-    assert min(behind) == 0
-    assert max(behind) > 50
-    assert behind[-1] == 0
+        shown_peer = frame["sites"]["s"]
+        own = frame["sites"]["m"]
+        used_tick = log["m"].states[own["tick"]].used["s"]
+        lags_ticks.append(used_tick - shown_peer["tick"])
+        assert shown_peer["points"] == compute_points(log, "s", shown_peer["tick"])
+        if shown_peer["age_ms"] is not None:
+            assert shown_peer["age_ms"] == pytest.approx(own["tick"] - shown_peer["tick"])
+    assert min(lags_ticks) == 0
+    assert max(lags_ticks) > 50
+    assert lags_ticks[-1] == 0
 
 
 def test_users_are_told_only_what_they_know(tmp_path: Path) -> None:
     keys = {"duration_s": 1.5, "rate_hz": 200, "link.delay_ms": 100}
     session = Session.whole(load_scenario("paper", keys), tmp_path)
     frames: Frames = []
-    session.stranger(looking(frames, "m1", ages=False))
+    session.stranger(make_frame_collector(frames, "m1", ages=False))
     session.run()
     for frame in frames:
-        assert {*frame["sites"]["s"]} == {*frame["sites"]["m2"]} == KNOWN_OF_PEERS - {"age_ms"}
+        assert {*frame["sites"]["s"]} == {*frame["sites"]["m2"]} == PEER_FIELDS - {"age_ms"}
         assert frame["links"] == frame["shares"] == {}
         assert {*frame} == {"t", "sites", "links", "shares", "energy", "ended", "silent_s"}
     assert frames
@@ -154,12 +158,13 @@ def test_bodies_are_as_old_as_their_arm(tmp_path: Path) -> None:
     keys = {"sites.s.plant": plant, "duration_s": 1.5, "link.delay_ms": 300}
     session = Session.whole(load_scenario("paper", keys), tmp_path)
     frames: Frames = []
-    session.stranger(looking(frames, "m1"))
+    session.stranger(make_frame_collector(frames, "m1"))
     log = session.run()
     for frame in frames:
-        known = frame["sites"]["s"]
-        there = [] if known["tick"] < 0 else log["s"].states[known["tick"]].bodies
-        assert known["bodies"] == np.round(there, 5).tolist()
+        shown_peer = frame["sites"]["s"]
+        tick = shown_peer["tick"]
+        recorded_bodies = [] if tick < 0 else log["s"].states[tick].bodies
+        assert shown_peer["bodies"] == np.round(recorded_bodies, 5).tolist()
     assert len({str(frame["sites"]["s"]["bodies"]) for frame in frames}) > 20
 
 
@@ -167,32 +172,33 @@ def test_bodies_are_as_old_as_their_arm(tmp_path: Path) -> None:
 def test_pages_terminals_and_programs_know_the_same(
     view: dict[str, Any], tmp_path: Path
 ) -> None:
-    """A page as m1 beside `trilat watch --as m1` and `states(as_site="m1")`, at the same moments."""
+    """The page of m1, `trilat watch --as m1` and `states(as_site="m1")` agree at all times."""
     keys = {"duration_s": 1.5, "rate_hz": 500, "link.delay_ms": 150, "link.loss": 0.2, **view}
     session = Session.whole(load_scenario("paper", keys), tmp_path)
-    compared: list[int] = []
+    compared_sites: list[int] = []
 
     def look(bus: Bus, clock: RelayClock) -> None:
         watch = SessionWatch(bus, clock, SESSION, "m1")
         view = watch.view
         pages = SessionFrames(view)
-        with RunningSession(SESSION, Connection(), bus, clock).states(as_site="m1") as find:
+        with RunningSession(SESSION, Connection(), bus, clock).states(
+            as_site="m1"
+        ) as find_records:
             while not view.ended:
                 watch.update()
-                found = find()
-                if (frame := pages.make_frame()) is not None:
+                records = find_records()
+                frame = pages.make_frame()
+                if frame is not None:
                     sites = pages.describe_as(frame, "m1", ages=True)["sites"]
-                    assert sites["m1"]["tick"] == found["m1"].tick
-                    ticks = {name: sites[name]["tick"] for name in found}
-                    assert ticks == {name: record.tick for name, record in found.items()}
-                    rows = {row["site"]: row["angles"] for row in watch.rows()}
-                    assert {name: rows[name] for name in found} == {
-                        name: StatusRow.of_pose(name, 0.0, record.q)["angles"]
-                        for name, record in found.items()
-                    }
-                    compared.append(len(found))
+                    assert sites["m1"]["tick"] == records["m1"].tick
+                    angles = {row["site"]: row["angles"] for row in watch.rows()}
+                    for name, record in records.items():
+                        row = StatusRow.of_pose(name, 0.0, record.q)
+                        assert sites[name]["tick"] == record.tick
+                        assert angles[name] == row["angles"]
+                    compared_sites.append(len(records))
                 clock.sleep_until(clock.monotonic_ns() + FRAME_NS)
 
     session.stranger(look)
     session.run()
-    assert compared.count(3) > 30
+    assert compared_sites.count(3) > 30

@@ -1,4 +1,4 @@
-"""When an onlooker calls a session silent, and when ended."""
+"""A view of a session reports silent sites, and the end of the session."""
 
 from trilat_people.live_page.session_view import SessionView, SiteView
 
@@ -18,30 +18,31 @@ BOOT = 7
 
 
 class WatchedSession:
-    """A session of two sites that run, each of which was heard just now."""
+    """A session of two running sites, from each of which a message has just arrived."""
 
     def __init__(self) -> None:
-        self.clock, self._network = ManualClock(1), LocalNetwork()
+        self.clock = ManualClock(1)
+        self._network = LocalNetwork()
         scenario = load_scenario("two_sites")
         self.view = SessionView(self._network.join(), self.clock, "t")
         self.view.scenario = scenario
         for name in scenario.names:
             window = RecordWindow(scenario, name)
             self.view.sites[name] = SiteView(self.view.bus, "t", scenario, name, BOOT, window)
-            self.hear(name, "setup", n=0)
+            self.publish_event(name, "setup", n=0)
 
-    def hear(self, name: str, kind: str, *, n: int) -> None:
-        """Lets an event of a site arrive now."""
+    def publish_event(self, name: str, kind: str, *, n: int) -> None:
+        """Publishes an event of a site, which arrives at once."""
         event = Event(member=name, boot=BOOT, kind=kind, text=f"{name}: {kind}", n=n)
         self._network.join().publisher(f"trilat/t/{name}/event")(encode(event))
         self.view.poll()
 
     def join(self) -> Bus:
-        """A connection of another member."""
+        """Returns a network connection of another member."""
         return self._network.join()
 
     def wait(self, seconds: float) -> None:
-        """Lets time pass, in which nothing arrives."""
+        """Advances the clock. No message arrives in this time."""
         self.clock.sleep_until(self.clock.monotonic_ns() + int(seconds * NS_PER_S))
 
 
@@ -50,17 +51,17 @@ def test_silence_is_no_end() -> None:
     session.wait(600.0)
     assert not session.view.ended
     assert session.view.session_silence_s == 600.0
-    session.hear("s", "hand", n=1)  # on a busy machine messages come again
+    session.publish_event("s", "hand", n=1)  # on a busy machine messages come again
     assert session.view.session_silence_s == 0.0
     assert session.view.silence_s(session.view.sites["m"]) == 600.0
 
 
 def test_the_last_end_message_ends_a_session() -> None:
     session = WatchedSession()
-    session.hear("m", "end", n=1)
+    session.publish_event("m", "end", n=1)
     assert session.view.sites["m"].ended
     assert not session.view.ended
-    session.hear("s", "end", n=1)
+    session.publish_event("s", "end", n=1)
     assert session.view.ended
     session.wait(60.0)
     assert [session.view.silence_s(site) for site in session.view.sites.values()] == [0.0, 0.0]
@@ -76,9 +77,10 @@ def test_members_running_sites_may_report_the_end() -> None:
 
 
 def test_sessions_end_when_all_sites_have_left() -> None:
-    """The network reports that they are gone, as after a kill; a token of a recorder is no site."""
+    """The network reports that a killed site has left. The token of a recorder does not count."""
     session = WatchedSession()
-    site, recorder = session.join(), session.join()
+    site = session.join()
+    recorder = session.join()
     site.announce(liveliness_token("t", "s", BOOT))
     recorder.announce(liveliness_token("t", topics.RECORDER, BOOT))
     session.wait(2.0 * AWAY_NS / NS_PER_S)

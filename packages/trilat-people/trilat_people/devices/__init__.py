@@ -1,8 +1,8 @@
 """Drivers of the input devices that a person holds to move an arm, one file for each device.
 
 For example, `trilat hand m1 --device spacemouse` opens the class in the file spacemouse.py. A
-driver is a class with the interface `Device`. `open_device` finds it by the name of its file,
-so that a new driver needs a new file and no other change.
+driver is a class with the interface `Device`. `open_device` finds a driver by the name of its
+file. Adding a driver therefore requires only a new file.
 """
 
 from importlib import import_module
@@ -32,7 +32,8 @@ def open_device(text: str) -> Device:
 
     module = import_module(f"{__name__}.{name}")
 
-    # The class of the file spacemouse.py is SpaceMouse: equal except for capitals and "_".
+    # The class in the file spacemouse.py is SpaceMouse: the names differ only in capitals and
+    # "_".
     class_name = name.replace("_", "")
     members = vars(module).items()
     device_class = next(

@@ -23,7 +23,7 @@ from trilat_net.net import check_hosts
 SILENCE_S = 0.15
 """Silence of the service after which the connection is closed, in s.
 
-It is shorter than the silence after which the site releases the arm.
+This time is shorter than the silence after which the site releases the arm.
 """
 _NO_POSITION = (math.nan, math.nan, math.nan)
 """Position of a state that could not be parsed."""
@@ -35,7 +35,7 @@ _PARSE_ERRORS = (
     OverflowError,
     msgspec.MsgspecError,
 )
-"""Errors that a message with an unexpected content may cause."""
+"""Errors that a message with unexpected content may cause."""
 _CONNECT_OPTIONS: dict[str, Any] = {
     "compression": None,
     "proxy": None,
@@ -46,7 +46,7 @@ _CONNECT_OPTIONS: dict[str, Any] = {
 
 
 class HaplyInverse3:
-    """An Inverse3 of Haply, a haptic device, as an input device that applies forces.
+    """The haptic device Inverse3 of Haply, as an input device that applies forces.
 
     The device and its wireless grip are reached through version 3 of the maker's service, a
     program that must run on this machine or another.
@@ -70,8 +70,8 @@ class HaplyInverse3:
         self._was_connected = False
 
     def __enter__(self) -> Self:
-        # The address is checked before the first connection only: later the service may be
-        # away for a while.
+        # The address is checked only before the first connection, because later the service may
+        # be unavailable for a while.
         if not self._was_connected:
             check_hosts([self._address])
 
@@ -117,7 +117,7 @@ class HaplyInverse3:
             return DeviceState(_NO_POSITION, _NO_POSITION, {})
 
     def _parse_state(self, message: Any) -> DeviceState:
-        """Returns position, velocity and buttons of a haptic device, from a message about it.
+        """Returns position, velocity and buttons of the device from a message of its service.
 
         The device is the first Inverse3 in the message. The buttons are those of all grips.
 

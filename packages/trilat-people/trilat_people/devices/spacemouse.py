@@ -2,8 +2,8 @@
 
 A SpaceMouse is an input device whose cap is pushed and turned by hand. The cap can only be
 deflected from its rest position. The deflection is interpreted as a velocity, which is
-integrated to a position. If no report has arrived for `STILL_NS`, the cap is at rest, because a
-deflected cap reports continuously.
+integrated to obtain a position. If no report has arrived for `STILL_NS`, the cap is at rest,
+because a deflected cap reports continuously.
 """
 
 import os
@@ -45,14 +45,14 @@ def find_spacemouse(devices: Path = Path("/sys/class/hidraw")) -> str:
 class SpaceMouse:
     """A SpaceMouse, a cap that is deflected by hand, as an input device without forces.
 
-    The deflection of the cap is integrated to a position. The first two buttons are "a" and
-    "b".
+    The deflection of the cap is integrated to obtain a position. The first two buttons are "a"
+    and "b".
 
     >>> tn.session("play").lead("m1", tn.SpaceMouse("/dev/hidraw3"))  # doctest: +SKIP
 
     Args:
-        address: File of the device. Empty uses the first SpaceMouse that is connected.
-        clock: Clock of this machine. None creates one.
+        address: File of the device. If empty, the first SpaceMouse that is connected is used.
+        clock: Clock of this machine. If `None`, a clock is created.
     """
 
     rate_hz: ClassVar[int] = 125
@@ -79,7 +79,7 @@ class SpaceMouse:
     def read(self) -> DeviceState:
         """Returns the present state of the device, whose cap a person pushes by hand.
 
-        The deflection of the cap is a velocity. The method integrates the velocity to a
+        The deflection of the cap is a velocity. The method integrates the velocity to obtain a
         position.
 
         Returns:

@@ -2,5 +2,5 @@
 
 `protocol` plans the trials, `experiment_run` runs them and stores their results,
 `movement_measures` computes measures of each trial, and `experiment_analysis` compares the
-conditions of the experiment by statistics.
+conditions of the experiment statistically.
 """

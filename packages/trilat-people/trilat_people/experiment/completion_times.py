@@ -6,10 +6,10 @@ limit, the task was never completed. Both count as longer than every measured ti
 
 This is enough for order statistics. The median of Kaplan and Meier is exact if more than half
 of the trials were completed. Otherwise the median was not reached. A mean would need the times
-themselves, and replacing them by the limit would make different conditions look alike.
+themselves. Replacing unknown times with the limit would make different conditions look alike.
 
 Invariant:
-    - The limit never enters a sum or a difference.
+    - The limit is never used in a sum or a difference.
     - Trials are summarised per unit (a participant or a pair) and condition before units are
       compared, so that more trials do not count as more participants.
 
@@ -30,26 +30,28 @@ from .statistics import CONFIDENCE, Row, correct_holm, import_scipy_stats, read_
 COMPLETION = "completion_s"
 """Column of the completion times."""
 SUCCESS = "succeeded"
-"""Column that tells whether a trial was completed."""
+"""Column that states whether a trial was completed."""
 
 
 class CompletionTime(NamedTuple):
     """Completion time of the trials under one condition.
 
     Some trials may end without success at a time limit. Their completion time is not known,
-    only that it is longer (it is censored). Therefore medians are used instead of means.
+    except that it is longer than the limit (censored). Therefore medians are used instead of
+    means.
 
     Attributes:
         condition: Name of the condition.
-        trials: Number of trials that count.
-        censored: Number of trials that were not completed: `timed_out` and those that failed
-            sooner.
+        trials: Number of trials that are evaluated.
+        censored: Number of trials that were not completed, because they reached the time limit
+            (`timed_out`) or failed earlier.
         timed_out: Number of trials that reached the time limit.
         number: Number of units (participants or pairs).
-        median: Median over units of each unit's median time, in s. None if it was not reached.
-        interval: Interval of the median, of 95 % or more, by order statistics, in s. The upper
-            end is None if it was not reached. The whole interval is None if there are too few
-            units, or if the lower end was not reached either.
+        median: Median over units of each unit's median time, in s. `None` if it was not
+            reached.
+        interval: Confidence interval of the median, with a level of at least 95 %, by order
+            statistics, in s. The upper end is `None` if it was not reached. The whole interval
+            is `None` if there are too few units, or if the lower end was not reached either.
     """
 
     condition: str
@@ -62,9 +64,9 @@ class CompletionTime(NamedTuple):
 
 
 class CompletionComparison(NamedTuple):
-    """Comparison of how long a task takes under two conditions of an experiment.
+    """Comparison of the completion times of a task under two conditions of an experiment.
 
-    It uses a sign test, because trials that were not completed have no exact time.
+    The comparison uses a sign test, because trials that were not completed have no exact time.
 
     Attributes:
         first: Name of the first condition.
@@ -73,9 +75,9 @@ class CompletionComparison(NamedTuple):
         longer: Number of units whose median was longer under the second condition.
         shorter: Number of units whose median was shorter under the second condition. The other
             units are ties, for example if both medians were not reached.
-        difference: Median over units of second minus first, in s. None if it depends on medians
-            that were not reached.
-        p: p value of the two-sided exact sign test without the ties. None for fewer than two
+        difference: Median over units of second minus first, in s. `None` if it depends on
+            medians that were not reached.
+        p: p value of the two-sided exact sign test without the ties. `None` for fewer than two
             units that differ.
         p_holm: p corrected for all comparisons.
     """
@@ -91,7 +93,7 @@ class CompletionComparison(NamedTuple):
 
 
 def is_completed(row: Row) -> bool:
-    """Returns True if a trial was completed, so that its completion time is known.
+    """Returns True if a trial was completed and its completion time is therefore known.
 
     Args:
         row: The trial, with values or with the texts of a CSV file. A row without the key
@@ -115,7 +117,7 @@ def find_median(times_s: Sequence[float]) -> float:
     """
     sorted_s = sorted(times_s)
     count = len(sorted_s)
-    # An odd number of times has a single middle, and both indices are equal.
+    # For an odd number of times, there is a single middle value, and both indices are equal.
     lower_middle_s = sorted_s[(count - 1) // 2]
     upper_middle_s = sorted_s[count // 2]
     return (lower_middle_s + upper_middle_s) / 2.0
@@ -160,7 +162,8 @@ def summarise_times(
     """Returns the median completion time, and its interval, under each condition.
 
     The median is first taken over the trials of each participant (or pair), and then over the
-    participants. It is None if it was not reached, because too many trials were not completed.
+    participants. The median is `None` if it was not reached, because too many trials were not
+    completed.
 
     Args:
         rows: Trials as mappings with the keys `condition`, `completion_s`, `succeeded`, and the
@@ -195,7 +198,7 @@ def summarise_times(
 
 
 def find_median_interval(times_s: Sequence[float]) -> tuple[float, float | None] | None:
-    """Returns an interval of at least 95 % for a median, by order statistics.
+    """Returns a confidence interval of at least 95 % for a median, by order statistics.
 
     The r-th smallest and the r-th largest time enclose the median with probability 1 - 2 P(B <
     r), where B is binomial with p = 1/2. r is the largest rank for which this probability is 95
@@ -205,8 +208,8 @@ def find_median_interval(times_s: Sequence[float]) -> tuple[float, float | None]
         times_s: Times, in s. They are infinite for trials that were not completed.
 
     Returns:
-        Lower and upper end, in s. The upper end is None if it was not reached. The whole
-        interval is None if there is no such rank, which holds for fewer than six times.
+        Lower and upper end, in s. The upper end is `None` if it was not reached. The whole
+        interval is `None` if there is no such rank, which is the case for fewer than six times.
     """
     sorted_s = sorted(times_s)
     tail_probability = (1.0 - CONFIDENCE) / 2.0
@@ -231,7 +234,7 @@ def compare_times(
 
     The comparison is made within each unit (a participant, or a pair of participants). A unit
     counts for the condition under which its median is longer. A median that was not reached is
-    longer than any that was reached. Two medians that were not reached are a tie.
+    longer than any median that was reached. Two medians that were not reached are a tie.
 
     Args:
         rows: Trials, as for `find_unit_medians`.
@@ -263,7 +266,8 @@ def _compare(
     Args:
         first: Name of the first condition.
         second: Name of the second condition.
-        pairs: Medians of each unit under both conditions, in s. Infinite if not reached.
+        pairs: Medians of each unit under both conditions, in s. A median that was not reached
+            is infinite.
     """
     longer = sum(second_s > first_s for first_s, second_s in pairs)
     shorter = sum(second_s < first_s for first_s, second_s in pairs)
@@ -285,7 +289,7 @@ def _compare(
 
 
 def _find_median_difference(pairs: Sequence[tuple[float, float]]) -> float | None:
-    """Returns the median of the differences of two conditions, in s.
+    """Returns the median of the differences between two conditions, in s.
 
     A median that was not reached may have any value above 0. Therefore each difference lies
     between two bounds. The median difference is known if the medians of both bounds agree.
@@ -294,7 +298,7 @@ def _find_median_difference(pairs: Sequence[tuple[float, float]]) -> float | Non
         pairs: Medians of each unit under both conditions, in s.
 
     Returns:
-        The median difference. None if it depends on medians that were not reached.
+        The median difference. `None` if it depends on medians that were not reached.
     """
     if not pairs:
         return None
@@ -313,7 +317,7 @@ def _find_median_difference(pairs: Sequence[tuple[float, float]]) -> float | Non
 
 
 def _replace_infinity(time_s: float) -> float | None:
-    """Returns a median for a result: None instead of infinity, if it was not reached."""
+    """Returns a median for a result: `None` instead of infinity if it was not reached."""
     return time_s if math.isfinite(time_s) else None
 
 

@@ -2,10 +2,11 @@
 
 `draw_conditions` shows a measure by condition, and `draw_learning` shows it over the trials of
 a block. If some trials were not completed in time, their completion time is only known to
-exceed the limit. Then a mean does not exist, and `draw_times` shows medians instead.
+exceed the limit. A mean does not exist in this case, and `draw_times` shows medians instead.
 
 Invariant:
-    - Each participant is drawn: a point for each condition with data, joined by a thin line.
+    - For each participant, a point is drawn for each condition with data, and a thin line joins
+      the points.
     - Means with their intervals are drawn on top.
     - Equal rows give equal bytes.
 """
@@ -84,7 +85,7 @@ def draw_times(rows: Sequence[Row], limit_s: float, *, unit: str = "participant"
     """Draws the completion times under each condition, for trials with a time limit.
 
     The points are the medians of each participant or pair. An open marker on the line of the
-    limit stands for a median beyond the limit.
+    limit represents a median beyond the limit.
 
     Args:
         rows: A row per trial, as for `completion_times`.
@@ -133,8 +134,7 @@ def _list_unit_lines(
         values: A value by condition and unit. Each condition is a column of the figure.
 
     Yields:
-        The indices of the columns, and the values there. Conditions without a value are left
-        out.
+        The indices of the columns, and their values. Conditions without a value are left out.
     """
     all_units = chain.from_iterable(values.values())
     for unit in dict.fromkeys(all_units):
@@ -199,7 +199,7 @@ def _mark_beyond_limit(
         axes: The panel.
         positions: Horizontal positions of the markers.
         limit_s: Time limit of a trial, in s.
-        look: Plot options of the condition, from which the markers get form and colour.
+        look: Plot options of the condition, which determine shape and colour of the markers.
     """
     open_marker: Look = {
         "marker": look["marker"],
@@ -228,7 +228,7 @@ def draw_learning(
         unit: "participant" or "pair", for which means are computed first.
         limit_s: Time limit of a trial, in s, if some trials were not completed in time. The
             figure then shows medians, and open markers on the line of the limit for medians
-            beyond it. None if all trials were completed.
+            beyond it. `None` if all trials were completed.
     """
     if limit_s is not None:
         return _draw_learning_times(rows, limit_s, unit)
@@ -239,7 +239,7 @@ def draw_learning(
         for condition, look in styles_by_condition.items():
             summaries: dict[Any, ConditionMean] = {}
             for trial, trial_rows in _group_by_trial(rows, condition).items():
-                # The rows of one condition have one mean, or none without data.
+                # The rows of one condition have one mean, or no mean without data.
                 for summary in summarise_conditions(trial_rows, measure, unit=unit):
                     summaries[trial] = summary
             interval_style = {**look, "marker": "", "alpha": 0.5}
@@ -285,7 +285,7 @@ def _group_by_trial(rows: Sequence[Row], condition: str) -> dict[Any, list[Row]]
 def _draw_learning_times(rows: Sequence[Row], limit_s: float, unit: str) -> Figure:
     """Draws how the median completion time changes over the trials of a block.
 
-    The task has a time limit, and some trials were not completed, so that means do not exist. A
+    The task has a time limit, and some trials were not completed, so means do not exist. A
     median beyond the limit has an open marker on the line of the limit.
 
     Args:
@@ -329,12 +329,12 @@ def _add_panel(figure: Figure, measure: str) -> Axes:
 
 
 def _plot_interval(axes: Axes, position: float, mean: ConditionMean, look: Look) -> None:
-    """Draws the vertical line of a confidence interval, or a point if there is no interval.
+    """Draws a confidence interval as a vertical line, or a point if there is no interval.
 
     Args:
         axes: The panel.
         position: Horizontal position of the condition.
-        mean: Mean of the condition. With a single participant it has no interval.
+        mean: Mean of the condition. With a single participant, there is no interval.
         look: Plot options.
     """
     ends = mean.interval or (mean.mean, mean.mean)

@@ -5,10 +5,10 @@ tables, figures and a report into the folder of the experiment. `compute_experim
 called before an experiment, to plan the number of participants.
 
 Invariant:
-    - The analysis follows from the stored results alone.
-    - Practice and catch trials do not count.
-    - A trial that was not completed counts. Its completion time is censored: it is longer than
-      that of any completed trial (see `completion_times`).
+    - The analysis depends only on the stored results.
+    - Practice and catch trials are not evaluated.
+    - A trial that was not completed is evaluated. Its completion time is censored: it counts as
+      longer than that of any completed trial (see `completion_times`).
     - Every number in a figure or a sentence is also in a table.
 """
 
@@ -79,7 +79,7 @@ NOT_REACHED = "not reached"
 
 
 class _MissingAnswers(NamedTuple):
-    """How many answers are missing in the questionnaires under one condition.
+    """Number of answers that are missing in the questionnaires under one condition.
 
     Attributes:
         questionnaire: Name of the questionnaire.
@@ -101,8 +101,8 @@ class _MissingAnswers(NamedTuple):
 def _format_fact(value: Any, name: str = "") -> str:
     """Returns a fact of a study as text, for example "delay 50 ms" for {"delay_ms": 50}.
 
-    A number gets the unit at the end of its name, and has all digits. Several entries or items
-    are joined by commas, and conditions by semicolons.
+    A number is followed by the unit at the end of its name, and has all digits. Several entries
+    or items are joined by commas, and conditions by semicolons.
 
     Args:
         value: The fact: a number, a text, a mapping or a sequence.
@@ -130,17 +130,18 @@ class ExperimentAnalysis(Result):
 
     Creating this object computes everything except the figures, which `write` draws. A unit is
     a participant or a pair, whichever is sampled independently. Every measure that trials have
-    is summarised, also if all its values are equal. If numbers of a measure are missing, their
-    number is stated.
+    is summarised, even if all of its values are equal. If values of a measure are missing,
+    their number is stated.
 
     Args:
         experiment: The experiment in its folder.
-        exclude: Participants or pairs whose data do not count, with the reasons.
+        exclude: Participants or pairs whose data are left out, with the reasons.
 
     Attributes:
         unit: "participant" or "pair", which is sampled independently.
-        rows: Trials that count, as a table. With a training, only those after it.
-        learning_rows: Trials that count, in all phases of a training.
+        rows: Evaluated trials, as a table. If there is a training, only trials after it are
+            included.
+        learning_rows: Evaluated trials in all phases of a training.
         throughput_rows: Throughput (speed and accuracy in one number) of each unit and
             condition.
         gain_rows: Improvement by a training, of each unit and condition.
@@ -152,15 +153,15 @@ class ExperimentAnalysis(Result):
         time_comparisons: Comparison of the completion times of each pair of conditions, if some
             trials were not completed.
         missing_answers: Missing answers of each questionnaire and condition.
-        absent: For each measure that this experiment could have but that no trial has a number
-            for, the reason.
+        absent: For each measure that this experiment could have but that has no value in any
+            trial, the reason.
         models: Mixed models of the forces of users within pairs.
         study: Facts of the study that a paper states: participants, conditions with the
             measured delays, law, gains, seed, and the analyses that were computed.
         paths: Files that were written.
 
     Raises:
-        UsageError: No trial that counts is done, or an excluded participant or pair does not
+        UsageError: No evaluated trial is finished, or an excluded participant or pair does not
             exist.
     """
 
@@ -171,7 +172,7 @@ class ExperimentAnalysis(Result):
         self.unit = experiment.unit
         self._check_excluded()
 
-        # The trials that count: not for practice, and not of excluded participants.
+        # The evaluated trials: without practice trials, and without excluded participants.
         counted = [row for row in experiment.to_rows() if self._is_counted(row)]
         self.learning_rows = self._sort_by_condition(counted)
         self.rows = [
@@ -183,7 +184,7 @@ class ExperimentAnalysis(Result):
                 "catch trials and trials of excluded participants do not count"
             )
 
-        # Values that the analysis derives from the trials, one row for each participant.
+        # Values that the analysis computes from the trials, one row for each participant.
         self.throughput_rows = list(self._find_throughput())
         self.gain_rows = list(self._find_gains())
         self.threshold_rows = self._sort_by_condition(list(self._find_thresholds()))
@@ -213,10 +214,11 @@ class ExperimentAnalysis(Result):
     def _check_excluded(self) -> None:
         """Checks that the participants or pairs that the user excludes exist.
 
-        A misspelled name would otherwise exclude nobody, without an error.
+        Otherwise a misspelled name would have no effect, and no error would be raised.
 
         Raises:
-            UsageError: An excluded name is not in the plan. The error lists the names that are.
+            UsageError: An excluded name is not in the plan. The error lists the names in the
+                plan.
         """
         groups = self._experiment.plan.protocol.groups
         names = {"-".join(group) for group in groups}
@@ -231,7 +233,7 @@ class ExperimentAnalysis(Result):
     def _is_counted(self, row: Mapping[str, Any]) -> bool:
         """Returns True if a trial enters the statistics.
 
-        Trials for practice, catch trials (which check attention), and the trials of excluded
+        Practice trials, catch trials (which check attention), and the trials of excluded
         participants do not.
 
         Args:
@@ -249,7 +251,7 @@ class ExperimentAnalysis(Result):
         return sorted(rows, key=lambda row: conditions.index(row["condition"]))
 
     def _list_unit_measures(self) -> list[str]:
-        """Lists the measures of which a participant has only one value per condition.
+        """Lists the measures that have only one value per participant and condition.
 
         Examples are gains by a training and perception thresholds, with names that begin with
         "gain_" or "threshold_". In an experiment with pairs, a pair has one value.
@@ -260,13 +262,14 @@ class ExperimentAnalysis(Result):
     def _compare_measure(self, measure: str) -> None:
         """Stores the means of a measure per condition, and the tests between conditions.
 
-        A measure without a number in any trial is left out. So are completion times of which
-        some are censored (known only to exceed the limit), because their mean would be biased.
+        A measure without a value in any trial is left out. Completion times are also left out
+        if some of them are censored (known only to exceed the limit), because their mean would
+        be biased.
 
         Args:
             measure: Name of the measure, for example "path_m".
         """
-        # A mean of censored times is biased: `times` has their medians instead.
+        # A mean of censored times is biased, so `times` contains their medians instead.
         if measure == COMPLETION and self._has_censored_times():
             return
         rows = self.of(measure)
@@ -296,21 +299,21 @@ class ExperimentAnalysis(Result):
     def _summarise_times(self) -> None:
         """Stores the median completion time of each condition.
 
-        If some trials were not completed, it also compares the conditions by sign tests,
-        because a t test needs means.
+        If some trials were not completed, the method also compares the conditions by sign
+        tests, because a t test needs means.
         """
         self.times = summarise_times(self.rows, self._limit_s, unit=self.unit)
         if self._has_censored_times():
             self.time_comparisons = compare_times(self.rows, unit=self.unit)
 
     def _find_absent(self, forms: Sequence[str]) -> dict[str, str]:
-        """Explains measures that this experiment could have and lacks, for the report.
+        """Explains in the report why measures that this experiment could have are missing.
 
         Args:
             forms: Names of the questionnaires that are answered after each block.
 
         Returns:
-            The reason by the name of the measure, for example {"tlx": "nobody has answered
+            The reasons by the names of the measures, for example {"tlx": "nobody has answered
             it"}.
         """
         reasons = {}
@@ -337,7 +340,7 @@ class ExperimentAnalysis(Result):
         experiment, belongs to no condition. Its condition is the empty text.
 
         Yields:
-            The counts for each questionnaire and condition. Excluded participants do not count.
+            The counts for each questionnaire and condition, without excluded participants.
         """
         protocol = self._experiment.plan.protocol
         when_answered = {form.name: form.after for form in protocol.questionnaires}
@@ -425,7 +428,7 @@ class ExperimentAnalysis(Result):
                 }
 
     def _find_gains(self) -> Iterator[dict[str, Any]]:
-        """Yields how much each participant (or pair) improved by a training, by condition.
+        """Yields the improvement of each participant (or pair) by a training, by condition.
 
         A gain is the mean before the training minus the mean right after it (transfer), or
         minus the mean in the later test (retention).
@@ -450,8 +453,8 @@ class ExperimentAnalysis(Result):
     def _is_censored(self, measure: str) -> bool:
         """Returns True if a measure is the completion time and some trials were not completed.
 
-        The trials of all phases of a training count here, in contrast to `_has_censored_times`.
-        The answer decides between means and medians.
+        In contrast to `_has_censored_times`, the trials of all phases of a training are
+        considered. The result decides whether means or medians are computed.
 
         Args:
             measure: Name of a measure.
@@ -466,7 +469,7 @@ class ExperimentAnalysis(Result):
     ) -> dict[str, dict[str, float]]:
         """Returns the mean of a learning measure for each condition and participant or pair.
 
-        If some trials were not completed, medians take the place of means. A median that was
+        If some trials were not completed, medians are used instead of means. A median that was
         not reached is left out.
         """
         if not self._is_censored(measure):
@@ -483,7 +486,7 @@ class ExperimentAnalysis(Result):
 
         A staircase procedure changes a difference until the participant just perceives it.
         Blocks with too few reversals of the staircase have no threshold, and protocols without
-        a staircase have none at all.
+        a staircase have no thresholds at all.
 
         Yields:
             Rows with the name, the condition, and the threshold under the name of its measure.
@@ -494,7 +497,7 @@ class ExperimentAnalysis(Result):
         if staircase is None:
             return
 
-        # Each block has a staircase, which its first trial stands for.
+        # Each block has a staircase, which is identified by the first trial of the block.
         first_trials = [trial for trial in plan.trials if trial.trial == 1]
         for planned in first_trials:
             are_right = plan.judge_choices(planned, choices)
@@ -508,14 +511,15 @@ class ExperimentAnalysis(Result):
                 }
 
     def _collect_study(self) -> dict[str, Any]:
-        """Returns the facts of the study that a paper states.
+        """Returns the facts of the study that a paper should state.
 
-        Facts that do not apply, such as `pairs` with single users, are missing.
+        Facts that do not apply, such as `pairs` in an experiment with single users, are left
+        out.
 
         Returns:
             Plain values by name. `conditions` maps each condition to the mean of the measured
             delays, `delay_ms`. `excluded` is the number of participants of the plan whose data
-            do not count. `computed` lists the analyses, for example "t tests".
+            are left out. `computed` lists the analyses, for example "t tests".
         """
         plan = self._experiment.plan
         protocol = plan.protocol
@@ -681,9 +685,9 @@ class ExperimentAnalysis(Result):
         A mixed model accounts for the fact that the two users of a pair are not independent.
 
         Yields:
-            One model for each of the two measures, as soon as it is fitted. There are none if
-            participants act alone, if there are too few pairs, or if the package statsmodels is
-            not installed.
+            One model for each of the two measures, as soon as it is fitted. There are no models
+            if participants act alone, if there are too few pairs, or if the package statsmodels
+            is not installed.
         """
         pairs = {row[self.unit] for row in self.rows}
         has_pairs = self.unit == "pair" and len(pairs) >= 2
@@ -691,7 +695,7 @@ class ExperimentAnalysis(Result):
             return
 
         for measure in ("force_mean", "force_peak"):
-            # A trial of a pair becomes a row for each of the two users.
+            # A trial of a pair becomes two rows, one for each user.
             rows: list[Row] = []
             for row in self.rows:
                 for user, name in enumerate(row["pair"].split("-"), 1):
@@ -709,7 +713,7 @@ class ExperimentAnalysis(Result):
         return rows
 
     def to_rows(self) -> list[dict[str, Any]]:
-        """Returns a table of how the conditions differ, one row per measure and pair of them.
+        """Returns a table of the comparisons, one row per measure and pair of conditions.
 
         The file comparisons.csv and the data frame of this result have these rows.
         """
@@ -744,7 +748,7 @@ class ExperimentAnalysis(Result):
 
         The parts are a summary of completed trials, the means and comparisons of the measures,
         the fitted models, the number of missing questionnaire answers, the reasons why a
-        measure has no number, and the facts of the study. With a single participant or pair
+        measure has no value, and the facts of the study. With a single participant or pair
         there are no comparisons, and one table has all measures.
         """
         yield from self._write_time_blocks()
@@ -931,13 +935,13 @@ def analyse_experiment(
 
     Args:
         folder: Folder of the experiment.
-        out: Folder for tables and figures. By default the folder `analysis` in the experiment's
+        out: Folder for tables and figures. Default: the folder `analysis` in the experiment's
             folder.
-        exclude: Participants or pairs whose data do not count, with the reasons.
+        exclude: Participants or pairs whose data are left out, with the reasons.
 
     Raises:
-        UsageError: There is no experiment, no trial is done, or an excluded participant or pair
-            does not exist.
+        UsageError: There is no experiment, no trial is finished, or an excluded participant or
+            pair does not exist.
     """
     experiment = open_experiment(folder)
     analysis = ExperimentAnalysis(experiment, exclude)
@@ -953,15 +957,15 @@ class PowerOfExperiment(Result):
 
     Args:
         d_z: Size of the effect.
-        participants: Planned number of participants, or None.
+        participants: Planned number of participants, or `None`.
         seed: Seed of the simulated experiments.
 
     Attributes:
         d_z: Size of the effect: mean over standard deviation of the differences within
             participants.
         least: Smallest number of participants for each desired power.
-        participants: Planned number of participants. None without a plan.
-        power: Power with the planned number, by the noncentral t distribution.
+        participants: Planned number of participants. `None` if no number is planned.
+        power: Power with the planned number, computed with the noncentral t distribution.
         simulated: Power with the planned number from simulated experiments, with its 95 %
             interval.
     """
@@ -1030,7 +1034,7 @@ class PowerOfExperiment(Result):
 def compute_experiment_power(
     effect: float, participants: int | None = None, *, seed: int = 1
 ) -> PowerOfExperiment:
-    """Computes the number of participants that an effect needs.
+    """Computes the number of participants that are needed to detect an effect.
 
     The command is `trilat experiment power`.
 
@@ -1068,8 +1072,8 @@ def _list_points(rows: Sequence[Row], name: str) -> Array:
 def _format_interval(interval: tuple[float, float | None] | None) -> str:
     """Returns a confidence interval as text, for example "[3.06, 3.22]".
 
-    An upper end of None lies beyond the time limit, and is written as `NOT_REACHED`. Without an
-    interval the text is "-".
+    An upper end of `None` lies beyond the time limit, and is written as `NOT_REACHED`. Without
+    an interval, the text is "-".
     """
     if interval is None:
         return "-"

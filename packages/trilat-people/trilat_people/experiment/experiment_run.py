@@ -9,7 +9,7 @@ Invariant:
     - A folder belongs to the plan whose digest it contains.
     - A trial in the journal is never run again, and an interrupted trial is repeated as a
       whole. Nothing is stored twice or lost, whenever the process was killed.
-    - The tables follow from the journals.
+    - The tables are computed from the journals.
     - People and synthetic participants never share a folder.
 """
 
@@ -66,7 +66,7 @@ class Note(msgspec.Struct, frozen=True):
         number: Number of the trial to which the event belongs.
         unix_s: Time on the machine's clock, in s.
         text: Name of a questionnaire, or the reason why a trial was aborted.
-        answers: Answers by item. None for a missing answer.
+        answers: Answers by item. A missing answer is `None`.
         seed: Always 0. The field exists because journal entries of other studies have a seed.
     """
 
@@ -81,12 +81,12 @@ class Note(msgspec.Struct, frozen=True):
 
 
 class _ExperimentStatus(NamedTuple):
-    """How many trials of an experiment are done, and which one is next.
+    """Progress of an experiment: the number of finished trials, and the next trial.
 
     Attributes:
         done: Number of trials in the journal.
         total: Number of trials of the plan.
-        next: The first trial that is not done. None if all are done.
+        next: The first unfinished trial. `None` if all trials are finished.
     """
 
     done: int
@@ -97,7 +97,7 @@ class _ExperimentStatus(NamedTuple):
 class Experiment(Result):
     """An experiment in its folder: the plan, the trials that were run, and their results.
 
-    `begin` and `open_experiment` create this object.
+    `Experiment.begin` and `open_experiment` create this object.
 
     Args:
         folder: Folder with the plan, journals and logs of the experiment.
@@ -119,12 +119,11 @@ class Experiment(Result):
         """Opens the journal with the results of the finished trials.
 
         An experiment must not mix trials of people with trials of synthetic participants, which
-        are models of people. Therefore a caller who wants to add trials declares their kind
-        here.
+        are models of people. Therefore, a caller that adds trials must declare their kind here.
 
         Args:
             people: True to add trials of people, False to add trials of synthetic participants.
-                None to read only.
+                `None` to read only.
 
         Raises:
             UsageError: The finished trials are of the other kind.
@@ -155,16 +154,17 @@ class Experiment(Result):
     def read_entries(self) -> dict[int, TrialEntry]:
         """Returns the results of the finished trials, by their numbers in the plan.
 
-        Example: {1: TrialEntry(...), 2: TrialEntry(...)}. Empty before the first trial.
+        Example: {1: TrialEntry(...), 2: TrialEntry(...)}. The mapping is empty before the first
+        trial.
         """
         with self.open_trials() as journal:
             return {entry.cell: entry for entry in journal.done.values()}
 
     def read_notes(self) -> list[Note]:
-        """Returns everything that the journal notes besides finished trials, in order of time.
+        """Returns all entries of the journal of events, in order of time.
 
         Each entry is a consent, the answers to a questionnaire, or a trial that was aborted.
-        Empty if nothing has been noted yet.
+        The list is empty if nothing has been recorded yet.
         """
         if not (self.folder / NOTES_FILE).exists():
             return []
@@ -175,7 +175,7 @@ class Experiment(Result):
         """Returns the choices of participants in the perception test of the experiment.
 
         A staircase presents pairs of trials, and asks in which one the quantity was larger. The
-        choices decide how different the next pair is.
+        choices determine the difference in the next pair.
 
         Returns:
             The chosen trial, 1 or 2, by the number of the second trial of the pair. Empty
@@ -191,15 +191,14 @@ class Experiment(Result):
         return choices
 
     def _draw_choices(self, staircase: Staircase) -> None:
-        """Notes the choices of synthetic participants for all pairs of a staircase.
+        """Records the choices of synthetic participants for all pairs of a staircase.
 
         A staircase is a perception test with pairs of trials. A quantity has its standard value
-        in one trial of a pair, and a larger value in the other one, the comparison trial. After
-        the second trial, the participant chooses the trial with the larger value. The
+        in one trial of a pair, and a larger value in the other trial, the comparison trial.
+        After the second trial, the participant chooses the trial with the larger value. The
         difference of a pair depends on whether the earlier choices of the block were right.
 
-        The choices follow from the plan. Therefore the choices can be drawn before any trial is
-        run.
+        The choices depend only on the plan, and can therefore be drawn before any trial is run.
 
         Args:
             staircase: Settings of the test. It also contains the model of the participant's
@@ -215,7 +214,8 @@ class Experiment(Result):
 
                 second_trial = step.planned
                 were_right = self.plan.judge_choices(second_trial, choices)
-                # The last difference is that of this pair, whose choice is not made yet.
+                # The last difference belongs to this pair, for which no choice has been made
+                # yet.
                 difference = staircase.list_differences(were_right)[-1]
                 comparison_trial = 2 if second_trial.phase == COMPARISON else 1
 
@@ -234,9 +234,9 @@ class Experiment(Result):
                 notes.add(note)
 
     def status(self) -> _ExperimentStatus:
-        """Returns the progress of the experiment: how many trials are done, and which is next.
+        """Returns the progress of the experiment: the finished trials, and the next trial.
 
-        It is read from the journal on disk, so that another process may be running the
+        The progress is read from the journal on disk, so another process may be running the
         experiment.
         """
         done = self.read_entries()
@@ -251,13 +251,13 @@ class Experiment(Result):
 
         A simulated person, or synthetic participant, is a model that moves the arms like a
         person. The trials run in virtual time. Trials that are in the journal already are not
-        repeated. In the end, the tables of the experiment are written.
+        repeated. Finally, the tables of the experiment are written.
 
         Args:
-            jobs: Number of processes. None uses one process per core.
+            jobs: Number of processes. If `None`, there is one process per core.
             show: Function that is called with the numbers of finished and of all trials.
-            on: Address of a Dask scheduler, or an executor that runs the trials. None uses
-                processes on this machine.
+            on: Address of a Dask scheduler, or an executor that runs the trials. If `None`,
+                they run in processes on this machine.
 
         Returns:
             This experiment.
@@ -331,15 +331,15 @@ class Experiment(Result):
         }
 
     def _describe_pair(self, planned: PlannedTrial, choices: Choices) -> dict[str, Any]:
-        """Returns the two further columns of a trial in a perception test (staircase).
+        """Returns two additional columns for a trial in a perception test (staircase).
 
         Such trials come in pairs that differ in one quantity, and the participant chooses the
         trial in which the quantity was larger.
 
         Returns:
             "difference", between the two trials of the pair, and "right", 1 if the choice was
-            right and 0 if not. Both are None for practice, and "right" is None before the
-            choice.
+            right and 0 if not. Both are `None` for practice trials, and "right" is `None`
+            before the choice.
         """
         if planned.practice:
             return {"difference": None, "right": None}
@@ -350,7 +350,7 @@ class Experiment(Result):
     def list_answers(self) -> list[dict[str, Any]]:
         """Returns the participants' answers, one row per item of each questionnaire.
 
-        The file questionnaires.csv has these rows. The value of a missing answer is None.
+        The file questionnaires.csv has these rows. The value of a missing answer is `None`.
         """
         rows: list[dict[str, Any]] = []
         for columns, note in self._read_answer_notes():
@@ -368,8 +368,8 @@ class Experiment(Result):
     def list_scores(self) -> list[dict[str, Any]]:
         """Returns the scores of the completed questionnaires, one row per questionnaire.
 
-        The column of the score has the name of the questionnaire. A score is None if an answer
-        is missing.
+        The column of the score has the name of the questionnaire. A score is `None` if an
+        answer is missing.
         """
         forms = {form.name: form.find_form() for form in self.plan.protocol.questionnaires}
         rows: list[dict[str, Any]] = []
@@ -382,12 +382,12 @@ class Experiment(Result):
     def _read_answer_notes(self) -> Iterator[tuple[dict[str, Any], Note]]:
         """Yields the notes with answers to a questionnaire, each with columns that identify it.
 
-        These columns say whose answers they are, in which block they were given, and which
-        condition the block had. Choices in a perception test are such notes, too.
+        These columns identify the participant, the block and the condition of the block.
+        Choices in a perception test are also such notes.
         """
         conditions: dict[tuple[tuple[str, ...], int], str] = {}
         for trial in self.plan.trials:
-            if not trial.catch:  # a catch trial has another condition than its block
+            if not trial.catch:  # the condition of a catch trial differs from that of its block
                 conditions[trial.group, trial.block] = trial.condition
 
         for note in self.read_notes():
@@ -439,7 +439,7 @@ class Experiment(Result):
         """Returns the progress of the experiment as plain values, for JSON.
 
         `trilat experiment status --json` prints them. "trials" is the number of planned trials,
-        and "done" that of finished ones.
+        and "done" the number of finished trials.
         """
         status = self.status()
         protocol = self.plan.protocol
@@ -492,7 +492,7 @@ class Experiment(Result):
 
         Args:
             file: File of the protocol.
-            out: The folder. None for the default.
+            out: The folder. If `None`, it is the next free runs/experiment-NAME-N.
         """
         plan = check_experiment(file)
         default_name = f"experiment-{plan.protocol.name}"
@@ -545,8 +545,8 @@ def _describe_mean(rows: list[dict[str, Any]], measure: str) -> str:
 def _describe_median(rows: list[dict[str, Any]]) -> str:
     """Returns the median completion time of trials as text, in s.
 
-    A trial that was not completed counts as longer than any other. If this concerns the median,
-    the text is "not reached".
+    A trial that was not completed counts as longer than any other. If the median is such a
+    time, the text is "not reached".
     """
     times_s = [row[COMPLETION] if is_completed(row) else math.inf for row in rows]
     median_s = find_median(times_s)
@@ -560,12 +560,12 @@ def new_experiment(file: str | Path, *, pair: bool = False, force: bool = False)
     'reaching.toml'
 
     Args:
-        file: the path of the protocol.
-        pair: whether two people hold a master each; otherwise one person does.
-        force: whether an existing file may be replaced.
+        file: Path of the protocol.
+        pair: True if two people each hold a master, False if one person does.
+        force: True to replace an existing file.
 
     Raises:
-        UsageError: the file exists.
+        UsageError: The file exists.
     """
     template_name = "experiment_pair.txt" if pair else "experiment.txt"
     template = resources.files(__package__) / template_name
@@ -608,11 +608,11 @@ def open_experiment(folder: str | Path) -> Experiment:
         stored_plan = json.loads((folder_path / PLAN_FILE).read_text(encoding="utf-8"))
     except (OSError, ValueError):
         raise UsageError(
-            f"{folder_path}: contains no experiment; "
+            f"{folder_path} contains no experiment; "
             "start an experiment with `trilat experiment run FILE`"
         ) from None
 
-    # The trials are planned again, so that a changed protocol is detected by its digest.
+    # The trials are planned again, so that the digest reveals a changed protocol.
     scenarios = {}
     for name, text in stored_plan["scenarios"].items():
         scenarios[name] = parse_scenario(text, str(folder_path))
@@ -641,9 +641,8 @@ def run_experiment(
 
     Args:
         source: File of a protocol, or the folder of an experiment to continue.
-        out: Folder of the experiment. By default the first of runs/experiment-NAME-N that does
-            not exist.
-        jobs: Number of processes. None for one per core.
+        out: Folder of the experiment. Default: the next free runs/experiment-NAME-N.
+        jobs: Number of processes. If `None`, there is one per core.
         on: Address of a Dask scheduler, or an executor that runs the trials.
         progress: Function that is called with the numbers of finished and of all trials.
 

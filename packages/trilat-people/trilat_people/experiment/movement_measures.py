@@ -13,8 +13,8 @@ and returns a number. All quantities are in SI units.
 
 Invariant:
     - A measure depends only on its samples.
-    - A measure that the samples do not determine is None, for example the smoothness of an arm
-      at rest, or the effective width of end points that all coincide.
+    - A measure that the samples do not determine is `None`, for example the smoothness of an
+      arm at rest, or the effective width of end points that all coincide.
     - Arrays of different shapes, and answers outside their scale, are errors.
 """
 
@@ -32,7 +32,7 @@ ONSET_SHARE = 0.05
 
 
 def _read(name: str, values: ArrayLike, dimensions: int) -> Array:
-    """Returns a recorded movement as an array of finite numbers, shape (K,) or (K, D).
+    """Converts a recorded movement to an array of finite numbers, shape (K,) or (K, D).
 
     K is the number of recorded times, and D the number of coordinates.
 
@@ -62,7 +62,7 @@ def _read_same_shape(**values: ArrayLike) -> list[Array]:
     """Converts several recorded series to arrays of floats, and checks their equal length.
 
     Args:
-        **values: Arrays of K samples with D axes, shape (K, D), by the name for messages.
+        **values: Arrays of K samples with D axes, shape (K, D), by their names in messages.
 
     Raises:
         UsageError: The shapes differ, or a sample is not finite.
@@ -91,7 +91,7 @@ def _integrate(values: Array, rate_hz: float) -> float:
 
 
 def _compute_rms(values: Array) -> float:
-    """Returns the root of the mean square of all numbers in an array."""
+    """Returns the root mean square of all numbers in an array."""
     return float(np.sqrt(np.mean(values**2)))
 
 
@@ -108,18 +108,18 @@ def sparc(
 ) -> float | None:
     """Computes the spectral arc length of a movement (SPARC), a measure of its smoothness.
 
-    The value is negative. A value closer to 0 means a smoother movement. A movement that is not
-    smooth has a spectrum of speed with many bumps, whose curve is long.
+    The value is negative. A value closer to 0 means a smoother movement. The speed spectrum of
+    a movement that is not smooth has many bumps, which make its curve long.
 
     Args:
         speed: Speed of a movement from its start to its end, in m/s or rad/s, shape (K,).
         rate_hz: Samples per second.
         padding: The samples are padded with zeros to 2^padding times the next power of two.
-        cutoff_hz: Frequencies above this one count as noise.
+        cutoff_hz: Frequencies above this value count as noise.
         threshold: Share of the largest magnitude below which the spectrum ends.
 
     Returns:
-        The spectral arc length. None at rest.
+        The spectral arc length. `None` if there was no movement.
 
     Source: Balasubramanian, Melendez-Calderon, Roby-Brami and Burdet, "On the analysis of
     movement smoothness", J. NeuroEngineering and Rehabilitation 12:112 (2015).
@@ -183,7 +183,7 @@ def movement_time_s(
         share: Fraction of the peak speed at which the movement starts and ends.
 
     Returns:
-        The duration. None at rest.
+        The duration. `None` if there was no movement.
     """
     samples = np.abs(_read("speed", speed, 1))
     if not samples.any():
@@ -241,7 +241,7 @@ class Throughput(NamedTuple):
     def bits_s(self) -> float:
         """Throughput of pointing movements in bit/s, as Fitts's law defines it.
 
-        It is the index of difficulty over the mean movement time.
+        The throughput is the index of difficulty divided by the mean movement time.
         """
         return self.difficulty_bits / self.time_s
 
@@ -268,11 +268,11 @@ def measure_throughput(
             ring. The overshoot of the previous movement then adds to the distance.
 
     Returns:
-        The throughput. None if the end points do not spread.
+        The throughput. `None` if all end points coincide.
 
     Source: ISO/TS 9241-411 (2012); Soukoreff and MacKenzie, "Towards a standard for pointing
-    device evaluation", Int. J. Human-Computer Studies 61 (2004). As MacKenzie's class
-    `Throughput` computes it.
+    device evaluation", Int. J. Human-Computer Studies 61 (2004). The result equals that of
+    MacKenzie's class `Throughput`.
     """
     start_points, target_points, end_points = _read_same_shape(
         starts=starts, targets=targets, ends=ends
@@ -290,7 +290,7 @@ def measure_throughput(
             "give the centre of the previous target"
         )
 
-    # How far each end point is beyond its target, along the axis of the task.
+    # Distance of each end point beyond its target, along the axis of the task.
     end_errors = end_points - target_points
     projections = (end_errors * axes).sum(axis=1)
     overshoots = projections / lengths
@@ -303,7 +303,7 @@ def measure_throughput(
         deviation = float(np.std(overshoots, ddof=1))
         width = EFFECTIVE_WIDTH * deviation
     distance = float(distances.mean())
-    # End points that coincide have a spread of rounding errors.
+    # The spread of coinciding end points consists of rounding errors.
     smallest_width = 1e-12 * float(lengths.max())
     if width <= smallest_width or distance <= 0.0:
         return None
@@ -321,7 +321,7 @@ def measure_throughput(
 
 
 def find_internal_force(first: ArrayLike, second: ArrayLike) -> Array:
-    """Returns the part of two users' forces on an object that cancels.
+    """Returns the part of two users' forces on an object that cancels out.
 
     If the two users' forces along an axis have opposite signs, the smaller force cancels an
     equal part of the larger force. Otherwise no force cancels. The second user's part is the
@@ -353,12 +353,12 @@ class PairMeasures(NamedTuple):
     """Forces and work of two people who move a shared object together in a trial.
 
     Args:
-        internal_rms_n: RMS of the force that cancels, over all axes and samples, in N.
+        internal_rms_n: RMS of the force that cancels out, over all axes and samples, in N.
         useful_rms_n: RMS of the sum of both forces, which moves the object, in N.
-        internal_share: Part of the forces that cancels, from 0 to 1. None if both forces are
-            zero.
-        first_effort_share: The first user's part of the integral of the squared forces. None if
-            both forces are zero.
+        internal_share: Fraction of the forces that cancels out, from 0 to 1. `None` if both
+            forces are zero.
+        first_effort_share: The first user's share of the integral of the squared forces. `None`
+            if both forces are zero.
         first_work_j: Work of the first user on the object, in J.
         second_work_j: Work of the second user on the object, in J.
         first_taken_j: Energy that the first user absorbs, in J: the integral of the negative
@@ -381,8 +381,8 @@ def measure_pair(
 ) -> PairMeasures:
     """Computes the forces and the work of two users who move a shared object together.
 
-    The sum of their forces moves the object. The internal force is the part by which they work
-    against each other, and which only squeezes the object.
+    The sum of their forces moves the object. The internal force is the part with which they
+    work against each other, and which only squeezes the object.
 
     Args:
         first: Force of the first user on the object, in N, shape (K, D).
@@ -460,9 +460,9 @@ def _list_ratings(ratings: Mapping[str, float]) -> list[float]:
 
 
 def raw_tlx(ratings: Mapping[str, float]) -> float:
-    """Returns how demanding a task was by the raw NASA Task Load Index.
+    """Returns the raw NASA Task Load Index, which measures how demanding a task was.
 
-    It is the mean of six ratings of a participant.
+    The index is the mean of six ratings of a participant.
 
     Args:
         ratings: A rating from 0 to 100 for each of `TLX_SCALES`.
@@ -474,9 +474,9 @@ def raw_tlx(ratings: Mapping[str, float]) -> float:
 
 
 def weighted_tlx(ratings: Mapping[str, float], weights: Mapping[str, int]) -> float:
-    """Returns how demanding a task was by the weighted NASA Task Load Index.
+    """Returns the weighted NASA Task Load Index, which measures how demanding a task was.
 
-    It is the weighted mean of six ratings of a participant.
+    The index is the weighted mean of six ratings of a participant.
 
     Args:
         ratings: A rating from 0 to 100 for each of `TLX_SCALES`.
@@ -488,7 +488,7 @@ def weighted_tlx(ratings: Mapping[str, float], weights: Mapping[str, int]) -> fl
     ratings_in_order = _list_ratings(ratings)
     weights_in_order = [weights.get(scale, -1) for scale in TLX_SCALES]
     cumulative_sums = np.cumsum(sorted(weights_in_order))
-    # Any n scales are compared with each other n (n - 1) / 2 times, and each comparison adds 1.
+    # There are n (n - 1) / 2 comparisons between n scales, and each adds 1 to a weight.
     least_sums = [n * (n - 1) // 2 for n in range(1, 7)]
     has_all_scales = len(weights) == 6
     are_whole_numbers = has_all_scales and all(
@@ -505,9 +505,9 @@ def weighted_tlx(ratings: Mapping[str, float], weights: Mapping[str, int]) -> fl
 
 
 def sus_score(answers: Sequence[int]) -> float:
-    """Returns how usable a participant found a system, from 0 to 100.
+    """Returns a participant's rating of the usability of a system, from 0 to 100.
 
-    It is the score of the System Usability Scale (SUS), a questionnaire of ten items.
+    The rating is the score of the System Usability Scale (SUS), a questionnaire of ten items.
 
     Args:
         answers: Ten answers from 1 (strongly disagree) to 5, in the order of the questions.

@@ -2,15 +2,15 @@
 
 A protocol is a TOML file. It names the scenario (the robot arms and their network), the
 conditions (keys of the scenario with different values), the task, and the number of
-participants and trials. The plan lists all trials in their order. Orders of conditions are
-balanced over the participants, so that practice and fatigue affect all conditions alike, and
-targets are drawn.
+participants and trials. The plan lists all trials in their order. The order of the conditions
+is balanced over the participants, so that practice and fatigue affect all conditions alike.
+Targets are drawn at random.
 
 Invariant:
-    - The plan follows from the protocol and from the scenarios of its conditions.
+    - The plan depends only on the protocol and on the scenarios of its conditions.
     - The digest of the plan covers the protocol and the text of the scenario of each condition.
       The log of each trial contains the digest, which proves that the trial follows the plan.
-    - A protocol that cannot be carried out is refused as a whole, with a list of all problems.
+    - A protocol that cannot be carried out is rejected as a whole, with a list of all problems.
 """
 
 import hashlib
@@ -57,8 +57,8 @@ Feedback = Literal[
 class _CatchTrials(Frozen, frozen=True):
     """Trials of an unexpected condition that are mixed into a block of another condition.
 
-    They keep participants from anticipating what the next trial is like. They do not count in
-    the analysis.
+    They keep participants from anticipating the condition of the next trial, and are left out
+    of the analysis.
 
     Attributes:
         condition: Condition of the catch trials. Blocks of this condition have no catch trials.
@@ -76,7 +76,7 @@ class _Training(Frozen, frozen=True):
     The first user is the expert, the second user the learner.
 
     Attributes:
-        lead: For each condition, the expert's part of the users' authority in the first and in
+        lead: For each condition, the expert's share of the users' authority in the first and in
             the last trial of the training, from 0 to 1.
         before: Number of trials of the learner alone before the training.
         after: Number of trials of the learner alone right after the training (transfer).
@@ -91,11 +91,11 @@ class _Training(Frozen, frozen=True):
     rest_s: Annotated[float, Meta(ge=0.0, le=1e6)] = 600.0
 
     def describe(self) -> str:
-        """Describes in a sentence how the training was laid out, for the methods of a paper.
+        """Describes the design of the training in a sentence for the methods of a paper.
 
         In a training, an expert first leads the slave, and the learner gets more and more of
-        the authority. The sentence states the course of the expert's part, as in "0.9 to 0.1
-        (guided)", and the numbers of trials before, after and for retention.
+        the authority. The sentence states the first and the last value of the expert's share,
+        as in "0.9 to 0.1 (guided)", and the numbers of trials before, after and for retention.
         """
         courses: list[str] = []
         for condition, (first_lead, last_lead) in self.lead.items():
@@ -104,9 +104,11 @@ class _Training(Frozen, frozen=True):
         if self.retention:
             retention_text = f", and {self.retention} more after {self.rest_s:g} s"
         return (
-            f"In these the expert's part of the authority went from {', '.join(courses)}; "
+            "In the training trials, the expert's share of the authority changed from "
+            f"{', '.join(courses)}; "
             f"{count_nouns(self.before, 'trial')} before and "
-            f"{self.after} after them{retention_text} were made without it and are compared"
+            f"{self.after} after them{retention_text} were done by the learner alone and are "
+            "compared"
         )
 
 
@@ -121,7 +123,7 @@ class ExperimentProtocol(Frozen, frozen=True):
         scenario: Name or path of the scenario on which all conditions are based.
         users: Names of the sites whose arms participants hold. Two sites are held by a pair.
         participants: Number of participants, or their pseudonyms.
-        design: How the order of conditions is balanced over participants, see
+        design: Method that balances the order of conditions over participants, see
             docs/reference/experiment-protocol.md.
         trials: Number of counted trials of a block. A block has all trials of a condition.
         practice: Number of practice trials before the counted trials of a block.
@@ -137,9 +139,9 @@ class ExperimentProtocol(Frozen, frozen=True):
         questionnaires: The questionnaires, and when people answer them.
         rest_s: Shortest rest between two blocks, in s.
         feedback: Measures that people see after a trial.
-        force_limit_n: For each participant who needs a lower limit, by pseudonym, the largest
-            force with which the participant can push the arm, in N.
-        catch: Trials of another condition within a block. They do not count.
+        force_limit_n: Largest force with which a participant can push the arm, in N, by the
+            pseudonym of each participant who needs a lower limit.
+        catch: Trials of another condition within a block. They are not evaluated.
         training: Trials in which authority moves from an expert to a learner.
         staircase: Pairs of trials that adapt a scenario key to a participant's threshold.
     """
@@ -182,9 +184,9 @@ class ExperimentProtocol(Frozen, frozen=True):
             random: Generator that draws the order within the pairs of a staircase.
 
         Returns:
-            For each trial, the phase and the first user's part of the authority over the slave
-            arm, from 0 to 1. The phase is empty without training and staircase. A part of None
-            keeps the authority that the scenario defines.
+            For each trial, the phase and the first user's share of the authority over the slave
+            arm, from 0 to 1. The phase is empty without training and staircase. If the share is
+            `None`, the authority that the scenario defines is kept.
         """
         phases: list[tuple[str, float | None]] = []
         if self.staircase is not None:
@@ -210,8 +212,8 @@ class ExperimentProtocol(Frozen, frozen=True):
     def forms(self) -> list[Questionnaire]:
         """Forms that participants fill in during the experiment.
 
-        These are the questionnaires. In an experiment that measures a perception threshold, the
-        question that follows each pair of trials is a form too.
+        The forms are the questionnaires. In an experiment that measures a perception threshold,
+        the question that follows each pair of trials is also a form.
         """
         forms = list(self.questionnaires)
         if self.staircase:
@@ -254,14 +256,62 @@ class ExperimentProtocol(Frozen, frozen=True):
             tables = tomllib.loads(path.read_text(encoding="utf-8"))
             return msgspec.convert(tables, ExperimentProtocol)
         except OSError as error:
-            raise UsageError(f"{path}: cannot be read: {error.strerror}") from None
+            raise UsageError(f"{path} cannot be read: {error.strerror}") from None
         except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-            raise UsageError(f"{path}: is not valid TOML: {error}") from None
+            raise UsageError(f"{path} is not valid TOML: {error}") from None
         except msgspec.ValidationError as error:
             valid = ", ".join(
                 key.encode_name for key in msgspec.structs.fields(ExperimentProtocol)
             )
             raise UsageError(f"{path}: {error}; the keys of a protocol are {valid}") from None
+
+    def limit_forces(self, scenario: Scenario, group: Sequence[str]) -> dict[str, Any]:
+        """Lowers the force limits of the arms of participants who must not push hard.
+
+        The protocol states these participants and their limits under `force_limit_n`. The
+        result contains the changed settings of their sites (arm controllers).
+
+        Args:
+            scenario: Scenario of the condition.
+            group: Pseudonyms of the participants.
+
+        Returns:
+            The specifications of the sites whose limits change, by the name of the site. Empty
+            if no participant of the group needs a lower limit.
+
+        Raises:
+            ScenarioError: The scenario has no force limit for this site, or already has a lower
+                limit.
+        """
+        limited_sites: dict[str, Any] = {}
+        # The lengths may differ: `_find_problems` reports a group that is too small.
+        for user, name in zip(self.users, group, strict=False):
+            site_settings = scenario.sites[user]
+            limit_n = self.force_limit_n.get(name)
+            live_hand = site_settings.find_live_hand(is_open=True)
+            if limit_n is None or live_hand is None:
+                continue
+
+            key = f"force_limit_n.{name}"
+            if live_hand.mode == "joint":
+                raise ScenarioError(
+                    f"the live hand at {user} has the mode 'joint' and therefore no limit in N",
+                    path=key,
+                )
+            hand_limit_n = live_hand.force_limit_n
+            if hand_limit_n < limit_n:
+                raise ScenarioError(
+                    f"{limit_n:g} N exceeds the limit of the live hand at {user}, "
+                    f"which is {hand_limit_n:g} N",
+                    path=key,
+                )
+
+            limited_hand = replace(live_hand, force_limit_n=limit_n)
+            hands = tuple(
+                limited_hand if hand is live_hand else hand for hand in site_settings.hands
+            )
+            limited_sites[user] = replace(site_settings, hands=hands)
+        return limited_sites
 
 
 class PlannedTrial(NamedTuple):
@@ -273,18 +323,18 @@ class PlannedTrial(NamedTuple):
         condition: Name of the condition.
         block: Number of the block within the group, from 1.
         trial: Number of the trial within the block, from 1. Practice trials are first.
-        practice: True for a practice trial, which does not count.
+        practice: True for a practice trial, which is not evaluated.
         before: Number of earlier trials of the group.
         target: Number of the target. The first target of each block is drawn, so that effects
             of the target's direction are not mistaken for learning. Both trials of a staircase
             pair have the same target.
         seed: Seed of the random numbers of the trial.
-        catch: True for a catch trial, which has another condition than its block and does not
-            count.
+        catch: True for a catch trial, whose condition differs from that of its block, and which
+            is not evaluated.
         phase: Phase of a training: "before", "training", "after" or "retention". In a
             staircase: "standard" or "comparison". Otherwise empty.
-        lead: The first user's part of the authority that two users have over the slave. None
-            keeps the scenario's dominance factors.
+        lead: The first user's share of the authority that two users have over the slave. If
+            `None`, the scenario's dominance factors are kept.
     """
 
     number: int
@@ -316,15 +366,15 @@ Choices = Mapping[int, float]
 
 
 class Step(NamedTuple):
-    """One thing that participants have to do in an experiment.
+    """A step of an experiment that participants have to complete.
 
-    It is to give consent, to do a trial, or to answer a questionnaire.
+    In a step, participants give consent, do a trial, or answer a questionnaire.
 
     Attributes:
         kind: "consent", "trial" or "questionnaire".
-        planned: The trial of the step. For a consent this is the next trial, for a
-            questionnaire the previous one.
-        form: The questionnaire. None for other kinds.
+        planned: The trial of the step. For a consent it is the next trial, and for a
+            questionnaire the previous trial.
+        form: The questionnaire. `None` for other kinds.
     """
 
     kind: Literal["consent", "trial", "questionnaire"]
@@ -418,7 +468,7 @@ class ExperimentPlan(Result):
                         yield Step("questionnaire", planned, questionnaire.find_form())
 
     def judge_choices(self, planned: PlannedTrial, choices: Choices) -> list[bool]:
-        """Judges which answers of the participants in a perception test were right.
+        """Judges whether the answers of the participants in a perception test were right.
 
         In each pair of trials, a quantity such as the delay has its standard value in one
         trial, and a larger value in the comparison trial. After the pair, the participants
@@ -433,7 +483,7 @@ class ExperimentPlan(Result):
         Returns:
             For each choice in the block, in the order of the trials, True if it is right.
         """
-        # Both numbers count from 1, so that the difference is the index of the first trial.
+        # Both numbers start at 1, so the difference is the index of the first trial.
         block_start = planned.number - planned.trial
         trials_per_block = self.trials[-1].trial  # all blocks are equally long
         block_end = block_start + trials_per_block
@@ -458,7 +508,8 @@ class ExperimentPlan(Result):
 
         Returns:
             The difference between both trials, in the unit of the staircase's key; and True if
-            the participant's choice was right, False if it was wrong, None before the choice.
+            the participant's choice was right, False if it was wrong, and `None` before the
+            choice.
         """
         staircase = self.protocol.staircase
         assert staircase is not None
@@ -474,8 +525,8 @@ class ExperimentPlan(Result):
     def find_scenario(self, planned: PlannedTrial, choices: Choices) -> Scenario:
         """Returns the scenario that is run in a trial.
 
-        It is the scenario of the trial's condition. In a perception test (staircase), a key of
-        the scenario is adapted to the earlier choices of the participant.
+        This is the scenario of the trial's condition. In a perception test (staircase), a key
+        of the scenario is adapted to the earlier choices of the participant.
 
         Args:
             planned: The trial in the plan.
@@ -493,7 +544,7 @@ class ExperimentPlan(Result):
         return load_scenario(scenario, {staircase.key: value})
 
     def rest_before_s(self, planned: PlannedTrial) -> float:
-        """Returns how long participants must at least rest before a trial, in s.
+        """Returns the shortest rest of the participants before a trial, in s.
 
         The rest precedes the first trial of each later block, and the retention test of a
         training. It is 0 before all other trials.
@@ -502,7 +553,7 @@ class ExperimentPlan(Result):
             planned: The trial in the plan.
         """
         training = self.protocol.training
-        # Numbers count from 1, so that the previous trial has the index `number` - 2.
+        # Numbers start at 1, so the previous trial has the index `number` - 2.
         previous = self.trials[max(planned.number - 2, 0)]
         starts_retention = planned.phase == "retention" and previous.phase != "retention"
 
@@ -517,8 +568,8 @@ class ExperimentPlan(Result):
     def list_orders(self) -> dict[str, list[str]]:
         """Returns the order in which each group of participants gets the conditions.
 
-        Participants get better with practice. Therefore the groups meet the conditions in
-        different orders.
+        Participants improve with practice. Therefore, the order of the conditions differs
+        between the groups.
 
         Returns:
             Names of the conditions in order, by the name of the group, for example {"P01-P02":
@@ -537,8 +588,8 @@ class ExperimentPlan(Result):
     def blocks(self) -> Iterator[Block]:
         """Yields the parts of the text that `trilat experiment check` prints.
 
-        Before any person is invited, the experimenter reads there how many trials there are,
-        how long each takes at most, and in which order each group gets the conditions.
+        The text tells the experimenter, before any person is invited, the number of trials, the
+        longest duration of each, and the order in which each group gets the conditions.
         """
         protocol = self.protocol
         facts = self.to_dict()
@@ -569,15 +620,16 @@ class ExperimentPlan(Result):
         folder: Path | None = None,
         scenarios: Mapping[str, Scenario] | None = None,
     ) -> "ExperimentPlan":
-        """Plans all trials of an experiment from its protocol, or refuses the protocol.
+        """Plans all trials of an experiment from its protocol, or rejects the protocol.
 
-        The protocol is the design of the experiment. With the same protocol, the plan is always
-        the same, so that it can be published before the experiment.
+        The protocol is the design of the experiment. The same protocol always gives the same
+        plan, so the plan can be published before the experiment.
 
         Args:
             protocol: Design of the experiment: conditions, task and participants.
             folder: Folder to which the path of the protocol's scenario is relative.
-            scenarios: Scenario of each condition. None loads them from the protocol's scenario.
+            scenarios: Scenario of each condition. If `None`, they are loaded from the
+                protocol's scenario.
 
         Raises:
             UsageError: The protocol cannot be carried out. The error lists all problems.
@@ -616,7 +668,7 @@ class ExperimentPlan(Result):
 def _list_keys(table: Mapping[str, Any], path: str = "") -> dict[str, Any]:
     """Returns the dotted keys of a table of scenario settings with their values.
 
-    Tables of sites, links and dominance factors are expanded. Other tables stay values.
+    Tables of sites, links and dominance factors are expanded. Other tables are kept as values.
 
     Args:
         table: The table.
@@ -637,7 +689,7 @@ def _list_keys(table: Mapping[str, Any], path: str = "") -> dict[str, Any]:
 def _find_problems(protocol: ExperimentProtocol) -> Iterator[str]:
     """Yields the problems of a protocol that are visible without its scenario.
 
-    Each problem is a sentence that names the key. The author sees all of them at once.
+    Each problem is a sentence that names the key. The author sees all problems at once.
     `_check_scenario` finds the problems with the scenario.
     """
     shortest_s, longest_s = protocol.foreperiod_s
@@ -658,7 +710,8 @@ def _list_pseudonyms(protocol: ExperimentProtocol) -> list[str]:
 def _find_pseudonym_problems(protocol: ExperimentProtocol) -> Iterator[str]:
     """Yields a sentence for each mistake in the pseudonyms of an experiment's participants.
 
-    Two participants have the same pseudonym, or a force limit names one that nobody has.
+    A mistake is a pseudonym that two participants share, or a force limit for a pseudonym that
+    no participant has.
     """
     names = _list_pseudonyms(protocol)
     if len(set(names)) < len(names):
@@ -793,7 +846,7 @@ def _check_scenario(scenario: Scenario, protocol: ExperimentProtocol) -> Scenari
         raise ScenarioError("both users must have a share above 0", path=f"dominance.{slave}")
 
     for group in protocol.groups:
-        limit_forces(scenario, protocol, group)
+        protocol.limit_forces(scenario, group)
 
     staircase = protocol.staircase
     if staircase is not None:
@@ -803,63 +856,12 @@ def _check_scenario(scenario: Scenario, protocol: ExperimentProtocol) -> Scenari
     return scenario
 
 
-def limit_forces(
-    scenario: Scenario, protocol: ExperimentProtocol, group: Sequence[str]
-) -> dict[str, Any]:
-    """Lowers the force limits of the arms of participants who must not push hard.
-
-    The protocol states these participants and their limits under `force_limit_n`. The result
-    has the changed settings of their sites (arm controllers).
-
-    Args:
-        scenario: Scenario of the condition.
-        protocol: Design of the experiment: conditions, task and participants.
-        group: Pseudonyms of the participants.
-
-    Returns:
-        The specifications of the sites whose limits change, by the name of the site. Empty if
-        no participant of the group needs a lower limit.
-
-    Raises:
-        ScenarioError: The scenario has no force limit for this site, or has a lower limit
-            already.
-    """
-    limited_sites: dict[str, Any] = {}
-    # The lengths may differ: `_find_problems` reports a group that is too small.
-    for user, name in zip(protocol.users, group, strict=False):
-        site_settings = scenario.sites[user]
-        limit_n = protocol.force_limit_n.get(name)
-        live_hand = site_settings.find_live_hand(is_open=True)
-        if limit_n is None or live_hand is None:
-            continue
-
-        key = f"force_limit_n.{name}"
-        if live_hand.mode == "joint":
-            raise ScenarioError(
-                f"the live hand at {user} has the mode 'joint' and therefore no limit in N",
-                path=key,
-            )
-        hand_limit_n = live_hand.force_limit_n
-        if hand_limit_n < limit_n:
-            raise ScenarioError(
-                f"{limit_n:g} N exceeds the limit of the live hand at {user}, "
-                f"which is {hand_limit_n:g} N",
-                path=key,
-            )
-
-        limited_hand = replace(live_hand, force_limit_n=limit_n)
-        hands = tuple(
-            limited_hand if hand is live_hand else hand for hand in site_settings.hands
-        )
-        limited_sites[user] = replace(site_settings, hands=hands)
-    return limited_sites
-
-
 def list_orders(design: str, conditions: Sequence[str], seed: int) -> list[tuple[str, ...]]:
     """Lists orders of the experiment's conditions, which are assigned to participants in turn.
 
-    Participants get better by practice and worse by fatigue. If each of them meets the
-    conditions in another order, these effects are the same for all conditions on average.
+    Participants improve with practice and deteriorate with fatigue. If the orders of the
+    conditions differ between participants, these effects are on average the same for all
+    conditions.
 
     Args:
         design: "williams": each condition is equally often at each position, and equally often
@@ -905,11 +907,11 @@ def _list_trials(protocol: ExperimentProtocol) -> Iterator[PlannedTrial]:
     """Yields all trials of an experiment in their order.
 
     Each group of participants does one block of trials per condition. The order of the
-    conditions is the next one of `list_orders`. A block begins with practice trials. The
-    further trials are those of `ExperimentProtocol.list_phases`: a trial has a phase (of a
-    training or of a staircase, otherwise empty), and a lead, the first user's part of the
-    authority over the slave arm. Catch trials have another condition than their block. Numbers
-    count from 1, and indices from 0.
+    conditions is the next order that `list_orders` returns. A block begins with practice
+    trials. The further trials are those of `ExperimentProtocol.list_phases`: a trial has a
+    phase (of a training or of a staircase, otherwise empty), and a lead, the first user's share
+    of the authority over the slave arm. The condition of a catch trial differs from that of its
+    block. Numbers start at 1, and indices at 0.
 
     Each random quantity has a generator of its own, whose seed contains the seed of the
     protocol, the group and the block. A last number distinguishes the quantities: none for the
@@ -930,7 +932,8 @@ def _list_trials(protocol: ExperimentProtocol) -> Iterator[PlannedTrial]:
         phases += protocol.list_phases(condition, phase_random)
         catch_trials = _draw_catches(protocol, condition, group_index, block)
         target_random = np.random.default_rng([protocol.seed, group_index, block])
-        # A task has fewer targets than this. It takes the number modulo that of its targets.
+        # A task has fewer targets than this number, and takes it modulo the number of its
+        # targets.
         first_target = int(target_random.integers(1000))
         for trial, (phase, lead) in enumerate(phases):
             number += 1
@@ -966,8 +969,8 @@ def _draw_catches(
 ) -> set[int]:
     """Draws which trials of a block are catch trials, which have an unexpected condition.
 
-    Participants cannot rely on the condition of the block then. If they behave differently in a
-    catch trial, they have adapted to the condition.
+    Because of these trials, participants cannot rely on the condition of the block. If they
+    behave differently in a catch trial, they have adapted to the condition.
 
     Args:
         protocol: Design of the experiment: conditions, task and participants.
@@ -976,7 +979,7 @@ def _draw_catches(
         block: Index of the block.
 
     Returns:
-        Indices of the catch trials in the block, from 0 with practice trials included.
+        Indices of the catch trials in the block, counted from 0 and including practice trials.
     """
     catch = protocol.catch
     if catch is None or catch.condition == condition:

@@ -4,8 +4,8 @@ NASA-TLX (workload), SUS (usability) and a questionnaire on the sense of agency 
 trilat-net. A protocol may define others.
 
 Invariant:
-    - An answer is a number of the questionnaire's scale, or None. Anything else is refused.
-    - None stands for an item without an answer, such as a slider that nobody touched. It is
+    - An answer is a number on the questionnaire's scale, or `None`. Anything else is rejected.
+    - `None` represents an item without an answer, such as a slider that nobody touched. It is
       stored and counted as missing.
     - A questionnaire with a missing answer has no score.
 """
@@ -32,7 +32,7 @@ Text = Annotated[str, Meta(max_length=300)]
 CHOICE = "choice"
 """Name of the form after a pair of trials of a staircase, which must be answered."""
 Answers = Mapping[str, float | None]
-"""Answers by item. None for a missing answer."""
+"""Answers by item. A missing answer is `None`."""
 
 
 class Questionnaire(Frozen, frozen=True):
@@ -48,7 +48,8 @@ class Questionnaire(Frozen, frozen=True):
         items: Texts of the rated items, by their names in the table.
         low: Text at the lower end of the scale.
         high: Text at the upper end of the scale.
-        ends: For items that differ, the texts at both ends.
+        ends: Texts at both ends of the scale, for items whose texts differ from `low` and
+            `high`.
         least: Smallest number of the scale.
         most: Largest number of the scale.
         step: Distance between two numbers of the scale.
@@ -77,10 +78,10 @@ class Questionnaire(Frozen, frozen=True):
         """Checks a participant's answers from a web page, and assigns them to the questions.
 
         Args:
-            values: Answers in the order of the items. None for a missing answer.
+            values: Answers in the order of the items. A missing answer is `None`.
 
         Returns:
-            The answers by the names of the items. None for a missing answer.
+            The answers by the names of the items. A missing answer is `None`.
 
         Raises:
             UsageError: There are more or fewer values than items, a value is not on the scale,
@@ -96,10 +97,10 @@ class Questionnaire(Frozen, frozen=True):
         return dict(zip(self.items, values, strict=True))
 
     def _is_valid(self, value: float | None) -> bool:
-        """Returns True if an answer is on the scale, or is missing and may be missing.
+        """Returns True if an answer is on the scale, or if it is missing but not required.
 
-        A scale of 0 to 100 in steps of 5 has the values 0, 5, 10 and so on. None is a missing
-        answer.
+        A scale of 0 to 100 in steps of 5 has the values 0, 5, 10 and so on. A missing answer is
+        `None`.
         """
         if value is None:
             return not self.is_forced
@@ -113,8 +114,8 @@ class Questionnaire(Frozen, frozen=True):
 
         Returns:
             The raw NASA Task Load Index for `tlx`, the score of the System Usability Scale for
-            `sus`, and the mean of the answers for any other questionnaire. None if an answer is
-            missing.
+            `sus`, and the mean of the answers for any other questionnaire. `None` if an answer
+            is missing.
         """
         given_answers = {item: value for item, value in answers.items() if value is not None}
         if len(given_answers) < len(answers):
@@ -132,8 +133,8 @@ class Questionnaire(Frozen, frozen=True):
         (items).
 
         Raises:
-            UsageError: The questionnaire has no items and no shipped one has its name, or its
-                scale does not have 2 to 101 numbers.
+            UsageError: The questionnaire has no items and is not a shipped questionnaire, or
+                its scale does not have 2 to 101 numbers.
         """
         name = self.name
         built_in = _read_shipped()

@@ -1,14 +1,15 @@
 """Finds the smallest difference that a participant perceives, with an adaptive staircase.
 
 A staircase consists of pairs of trials. In one trial of a pair, a key of the scenario has its
-standard value, in the other a larger value. The order of the two is drawn. After each pair, the
-participant says in which trial the value was larger. After `down` right answers in a row the
-difference is divided by `factor`, and after a wrong answer it is multiplied by `factor`
-(Levitt, 1971). The difference settles where steps down and up are equally likely. There the
-probability of a right answer is 0.5^(1 / down), for example 0.707 for `down` = 2.
+standard value, in the other a larger value. The order of the two is drawn at random. After each
+pair, the participant says in which trial the value was larger. After `down` right answers in a
+row the difference is divided by `factor`, and after a wrong answer it is multiplied by `factor`
+(Levitt, 1971). The difference settles where steps down and up are equally likely. At this
+difference, the probability of a right answer is 0.5^(1 / down), for example 0.707 for `down` =
+2.
 
 Invariant:
-    - The differences in a block follow from the protocol and from the earlier answers of the
+    - The differences in a block depend only on the protocol and on the earlier answers in the
       block.
 """
 
@@ -36,8 +37,8 @@ class Staircase(Frozen, frozen=True):
 
     Trials come in pairs. A scenario key, such as the delay, has its standard value in one trial
     of a pair, and a larger value in the other. The participant says in which trial the value
-    was larger. The difference of the two values decreases after right answers, and increases
-    after wrong answers.
+    was larger. The difference between the two values decreases after right answers, and
+    increases after wrong answers.
 
     Attributes:
         key: The scenario key that is varied.
@@ -47,7 +48,7 @@ class Staircase(Frozen, frozen=True):
         down: Number of right answers in a row after which the difference decreases.
         asks: Question that participants answer after each pair.
         deviation: Standard deviation of the perception of a simulated participant, in the key's
-            unit. None stands for a quarter of `start`.
+            unit. If `None`, it is a quarter of `start`.
     """
 
     key: str
@@ -62,8 +63,8 @@ class Staircase(Frozen, frozen=True):
     def measure(self) -> str:
         """Name of the perception threshold that the experiment measures, with its unit.
 
-        It is "threshold_" and the last part of the varied setting. For example, the key
-        `link.delay_ms` gives threshold_delay_ms.
+        The name is "threshold_", followed by the last part of the varied setting. For example,
+        the key `link.delay_ms` gives threshold_delay_ms.
         """
         parts = [part for part in self.key.split(".") if not part.isdigit()]
         return f"threshold_{parts[-1]}"
@@ -87,13 +88,14 @@ class Staircase(Frozen, frozen=True):
     def _list_directions(self, right: Sequence[bool]) -> list[int]:
         """Returns the direction in which the tested difference changes after each answer.
 
-        It decreases after `down` right answers in a row, and increases after a wrong answer.
+        The difference decreases after `down` right answers in a row, and increases after a
+        wrong answer.
 
         Args:
             right: For each answer, True if it was right.
 
         Returns:
-            For each answer -1 for down, 1 for up, or 0 for no change.
+            For each answer, -1 for down, 1 for up, or 0 for no change.
         """
         directions: list[int] = []
         right_in_row = 0
@@ -130,18 +132,18 @@ class Staircase(Frozen, frozen=True):
     def find_threshold(self, right: Sequence[bool]) -> float | None:
         """Returns the perception threshold: the difference at which the staircase has settled.
 
-        It is the geometric mean of the differences at the reversals, which are steps in another
-        direction than the previous step. The first two reversals do not count, because the
-        difference is still far from its final value. If the number of reversals is odd, the
-        third does not count either, so that as many reversals lead up as down.
+        The threshold is the geometric mean of the differences at the reversals, which are the
+        steps whose direction differs from that of the previous step. The first two reversals
+        are left out, because the difference is still far from its final value. If the number of
+        reversals is odd, the third is also left out, so that as many reversals lead up as down.
 
         Args:
             right: For each answer, True if it was right.
 
         Returns:
-            The threshold in the key's unit. None if no reversals are left.
+            The threshold in the key's unit. `None` if no reversals are left.
         """
-        # There is one difference more than directions: that of the next pair.
+        # There is one more difference than directions: that of the next pair.
         pairs = zip(self.list_differences(right), self._list_directions(right), strict=False)
         steps = [(difference, direction) for difference, direction in pairs if direction]
 
@@ -159,7 +161,7 @@ class Staircase(Frozen, frozen=True):
     def draw_choice(self, difference: float, comparison: int, seed: int) -> int:
         """Draws which trial of a pair a synthetic participant chooses.
 
-        The participant perceives each trial with a normal error. Therefore the choice is right
+        The participant perceives each trial with a normal error. Therefore, the choice is right
         with probability Phi(difference / (sqrt(2) deviation)) (Green and Swets, 1966).
 
         Args:
@@ -172,17 +174,17 @@ class Staircase(Frozen, frozen=True):
         """
         deviation = self.deviation or self.start / 4.0
         random = np.random.default_rng([seed, 2])
-        # The difference of two normal errors has sqrt(2) times their deviation.
+        # The difference between two normal errors has sqrt(2) times their standard deviation.
         error = 2.0**0.5 * deviation * random.standard_normal()
-        standard_trial = 3 - comparison  # the other number of 1 and 2
+        standard_trial = 3 - comparison  # the other of the numbers 1 and 2
         perceived_difference = difference + error
         return comparison if perceived_difference > 0.0 else standard_trial
 
     def describe(self) -> str:
-        """Describes in a sentence how the perception threshold was measured, for a paper.
+        """Describes in a sentence for a paper how the perception threshold was measured.
 
         The sentence states the key, its standard value, the rule for the differences, and the
-        share of right answers to which the threshold belongs.
+        share of right answers at the threshold.
         """
         right_percent = 100.0 * 0.5 ** (1.0 / self.down)
         return (

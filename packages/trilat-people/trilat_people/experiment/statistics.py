@@ -1,15 +1,15 @@
 """Computes statistics of experiments with people: means, tests and power.
 
 All functions read tidy rows: each trial is a mapping with `participant`, `pair`, `condition`
-and the measures by name, as in `trials.csv`. A trial whose value of a measure is None or ""
-does not count for that measure. A unit is what is sampled independently: a participant, or a
-pair whose members take part together.
+and the measures by name, as in `trials.csv`. A trial whose value of a measure is `None` or ""
+is left out for this measure. A unit is sampled independently: it is a participant, or a pair
+whose members take part together.
 
 Invariant:
     - Trials are averaged per unit and condition before any test, so that more trials do not
       count as more participants.
     - A measure that both users of a pair share is tested with `unit="pair"`.
-    - A statistic that the data do not determine is None.
+    - A statistic that the data do not determine is `None`.
     - Equal rows and seeds give equal numbers.
 """
 
@@ -36,14 +36,14 @@ CONFIDENCE = 0.95
 RESAMPLES = 5000
 """Number of resamples of the bootstrap."""
 _ROUNDING = 1e-12
-"""Spread relative to the largest value, below which values count as equal."""
+"""Spread, relative to the largest value, below which values count as equal."""
 
 
 def import_scipy_stats() -> Any:
-    """Imports and returns the module `scipy.stats`, when statistics are needed.
+    """Imports the module `scipy.stats` when statistics are needed, and returns it.
 
     The import takes longer than all other imports of an experiment together, and trials do not
-    need it.
+    need this module.
     """
     # The import takes half a second, and most commands do not need it.
     from scipy import stats
@@ -107,7 +107,7 @@ def average_trials(
 
 
 def read_number(value: Any, measure: str, row: Row) -> float:
-    """Converts an entry of a result table to a number, and refuses any other text.
+    """Converts an entry of a result table to a number, and rejects any other text.
 
     Args:
         value: A number, or its text from a CSV file.
@@ -134,8 +134,8 @@ def read_number(value: Any, measure: str, row: Row) -> float:
 class ConditionMean(NamedTuple):
     """Mean and spread of a measure under one condition, over participants or pairs.
 
-    A unit is what was sampled independently: a participant, or a pair whose members take part
-    together. The standard deviation and the intervals are None for fewer than two units.
+    A unit is sampled independently: it is a participant, or a pair whose members take part
+    together. The standard deviation and the intervals are `None` for fewer than two units.
 
     Args:
         condition: Name of the condition.
@@ -145,7 +145,7 @@ class ConditionMean(NamedTuple):
         interval: 95 % confidence interval of the mean by Student's t.
         bootstrap: 95 % confidence interval of the mean by the bias-corrected and accelerated
             bootstrap (BCa).
-        missing: Number of trials, or questionnaires, without a number. They are not averaged.
+        missing: Number of trials, or questionnaires, without a value. They are not averaged.
     """
 
     condition: str
@@ -163,7 +163,7 @@ def summarise_conditions(
     """Returns the mean of a measure under each condition, with its spread and intervals.
 
     The trials of each participant (or pair) are averaged first. Conditions in which no trial
-    has a number are left out.
+    has a value are left out.
 
     Args:
         rows: Trials as mappings from column names to values, as for `average_trials`.
@@ -189,16 +189,16 @@ def summarise_conditions(
 def _summarise(condition: str, values: list[float], seed: int) -> ConditionMean:
     """Returns mean, deviation and confidence intervals of one condition.
 
-    A condition is a variant of the experiment, such as a network delay. Its numbers are one
-    mean per participant.
+    A condition is a variant of the experiment, such as a network delay. Its values are one mean
+    per participant.
 
     Args:
         condition: Name of the condition.
         values: Mean over trials of each participant or pair, at least one.
-        seed: Seed of the bootstrap, which draws the participants anew.
+        seed: Seed of the bootstrap, which resamples the participants.
 
     Returns:
-        The summary. With a single participant it has no deviation and no interval.
+        The summary. With a single participant, it has no deviation and no interval.
     """
     mean = MeanInterval.of_values(values)
     if mean is None:  # a single value
@@ -224,8 +224,8 @@ def _summarise(condition: str, values: list[float], seed: int) -> ConditionMean:
 def bootstrap_interval(values: Sequence[float], seed: int = 0) -> tuple[float, float] | None:
     """Computes the 95 % confidence interval of a mean by the BCa bootstrap.
 
-    The bootstrap resamples the values with replacement, and needs no normal distribution. BCa
-    stands for its bias-corrected and accelerated form.
+    The bootstrap resamples the values with replacement, and does not assume a normal
+    distribution. BCa means bias-corrected and accelerated.
 
     Source: Efron, "Better bootstrap confidence intervals", J. American Statistical Association
     82 (1987).
@@ -235,7 +235,7 @@ def bootstrap_interval(values: Sequence[float], seed: int = 0) -> tuple[float, f
         seed: Seed of the resampling.
 
     Returns:
-        Lower and upper end. None for fewer than two values.
+        Lower and upper end. `None` for fewer than two values.
     """
     sample = np.asarray(values, dtype=np.float64)
     if sample.size < 2:
@@ -265,7 +265,7 @@ def bootstrap_interval(values: Sequence[float], seed: int = 0) -> tuple[float, f
 class Comparison(NamedTuple):
     """Comparison of a measure between two conditions, within units.
 
-    Interval, tests and effect sizes need two units. With fewer they are None.
+    Interval, tests and effect sizes need at least two units, and are otherwise `None`.
 
     Args:
         measure: Name of the measure.
@@ -274,7 +274,7 @@ class Comparison(NamedTuple):
         number: Number of units that have both conditions.
         difference: Mean of second minus first.
         interval: 95 % interval of the difference by Student's t.
-        t: Statistic of the paired test, with number - 1 degrees of freedom. None if all
+        t: Statistic of the paired test, with number - 1 degrees of freedom. `None` if all
             differences are equal.
         p: Two-sided p value of the paired test.
         p_holm: p corrected for all comparisons of the measure.
@@ -334,8 +334,8 @@ def _compare(
 ) -> Comparison:
     """Compares two conditions by paired tests over the units that have values for both.
 
-    A unit is a participant or a pair. A test needs at least two units, and means that differ by
-    more than rounding between them.
+    A unit is a participant or a pair. A test needs at least two units whose differences are not
+    all equal up to rounding.
 
     Args:
         measure: Name of the measure.
@@ -344,7 +344,7 @@ def _compare(
         means: Means over trials by condition and unit.
 
     Returns:
-        The difference second minus first, with its interval and tests if there are any.
+        The difference second minus first, with its interval and the tests that are possible.
     """
     common_units = [unit for unit in means[first] if unit in means[second]]
     first_means = np.array([means[first][unit] for unit in common_units])
@@ -383,14 +383,15 @@ def _compare(
 def correct_holm(p: Sequence[float | None]) -> list[float | None]:
     """Corrects the p values of several tests by Holm's method.
 
-    Without a correction, the more tests are made, the more of them are significant by chance.
-    The smallest of n p values is multiplied by n, the next one by n - 1, and so on.
+    Without a correction, the number of tests that are significant by chance grows with the
+    number of tests. The smallest of n p values is multiplied by n, the next by n - 1, and so
+    on.
 
     Args:
-        p: p values. None does not count as a test.
+        p: p values. `None` does not count as a test.
 
     Returns:
-        The corrected values in the same order. None stays None.
+        The corrected values in the same order. `None` stays `None`.
     """
     ascending = sorted((value, index) for index, value in enumerate(p) if value is not None)
     corrected: list[float | None] = [None] * len(p)
@@ -410,7 +411,7 @@ def correct_holm(p: Sequence[float | None]) -> list[float | None]:
 class MixedEffect(NamedTuple):
     """Effect of one condition on a measure in a mixed model, a regression for repeated trials.
 
-    It is relative to the first condition.
+    The effect is relative to the first condition.
 
     Args:
         condition: Name of the condition.
@@ -440,8 +441,9 @@ class MixedModel(NamedTuple):
         measure: Name of the measure.
         reference: The first condition, with which the other conditions are compared.
         effects: Effect of each other condition.
-        freedom: Degrees of freedom of t: observations less participants less effects. They
-            equal those of the analysis of variance if all participants have all conditions.
+        freedom: Degrees of freedom of t: number of observations minus number of participants
+            minus number of effects. They equal those of the analysis of variance if all
+            participants have all conditions.
         variances: Variance of "pair", of "participant" within a pair, and of the "residual".
         notes: Warnings of the fit, for example of a variance at 0.
     """
@@ -457,11 +459,10 @@ class MixedModel(NamedTuple):
 def fit_mixed_model(rows: Sequence[Row], measure: str) -> MixedModel:
     """Fits a mixed model of a measure, with participants nested within pairs.
 
-    Such a model compares the conditions of an experiment although the values are not
-    independent: those of one participant are similar, and so are those of the two participants
-    of a pair. It is for measures of single users. A measure that both users of a pair share is
-    tested by `compare_conditions` with `unit="pair"`. The fit needs `pip install
-    'trilat-net[stats]'`.
+    Such a model can compare conditions although the values are not independent: the values of
+    one participant are similar, and so are those of the two participants of a pair. It is meant
+    for measures of single users. A measure that both users of a pair share is tested by
+    `compare_conditions` with `unit="pair"`. The fit needs `pip install 'trilat-net[stats]'`.
 
     Args:
         rows: Trials, as for `average_trials`, with the keys "pair" and "participant".
@@ -532,7 +533,7 @@ def _fit(formulas: Any, frame: Any, measure: str) -> Any:
         measure: Name of the measure, for the error message.
 
     Raises:
-        UsageError: Neither optimizer gives finite numbers.
+        UsageError: Neither optimizer gives finite values.
     """
     variance_components = {"participant": "0 + C(participant)"}
     model = formulas.mixedlm(
@@ -564,7 +565,7 @@ def _fit(formulas: Any, frame: Any, measure: str) -> Any:
 def _find_pairs(rows: Sequence[Row]) -> dict[str, str]:
     """Returns the pair to which each participant belongs, by the participant's pseudonym.
 
-    A mixed model needs participants who are nested in pairs: each belongs to exactly one.
+    A mixed model needs participants who are nested in pairs: each belongs to exactly one pair.
 
     Raises:
         UsageError: A participant is in two pairs, or no pair has two participants.
@@ -658,7 +659,7 @@ def power(d_z: float, number: int, *, alpha: float = 0.05) -> float:
 def find_least_number(
     d_z: float, *, wanted: float = 0.8, alpha: float = 0.05, most: int = 10_000
 ) -> int:
-    """Returns the smallest number of participants (or pairs) that gives a test enough power.
+    """Returns the smallest number of participants (or pairs) for a test of the desired power.
 
     The power is the probability that the test finds the effect if it exists.
 
@@ -677,7 +678,7 @@ def find_least_number(
             "give a larger effect or a lower power"
         )
 
-    # The power grows with the number of units, so that the number can be found by bisection.
+    # The power grows with the number of units, so the number can be found by bisection.
     return bisect_left(
         range(most), wanted, lo=2, key=lambda number: power(d_z, number, alpha=alpha)
     )
@@ -686,7 +687,8 @@ def find_least_number(
 class SimulatedPower(NamedTuple):
     """Fraction of simulated experiments in which two conditions differ significantly.
 
-    It estimates the power: the probability that an experiment finds the simulated effect.
+    The fraction estimates the power: the probability that an experiment finds the simulated
+    effect.
 
     Args:
         first: Name of the first condition.
@@ -737,7 +739,7 @@ def simulate_power(
         noise = generator.normal(0.0, trial_deviation, (number, len(means), trials))
         rows = _list_rows(effects + noise, means)
         experiments.append(compare_conditions(rows, "measure"))
-    # Variance of the difference of two means, each of which varies by effect and by trial.
+    # Variance of the difference between two means, each of which varies with effect and trial.
     effect_variance = float(effect_deviation) ** 2
     trial_variance = float(trial_deviation) ** 2
     difference_variance = 2.0 * (effect_variance + trial_variance / trials)
@@ -755,7 +757,7 @@ def simulate_power(
 def _list_rows(values: Array, means: Mapping[str, float]) -> list[Row]:
     """Returns simulated measurements as table rows, as a real experiment would have them.
 
-    The power of a statistical test is found by analysing them.
+    The rows are analysed to find the power of a statistical test.
 
     Args:
         values: Deviations from the means, by participant, condition and trial.
@@ -773,12 +775,13 @@ def _list_rows(values: Array, means: Mapping[str, float]) -> list[Row]:
 def _count_significant(runs: Sequence[Comparison], d_z: float, alpha: float) -> SimulatedPower:
     """Returns the power: the share of simulated experiments that find a difference.
 
-    A study is planned with so many participants that the power is, for example, 80 %.
+    The number of participants of a study is planned so that the power is, for example, 80 %.
 
     Args:
         runs: Comparison of the same two conditions in each simulated experiment.
         d_z: Size of the simulated effect, the mean difference over its deviation.
-        alpha: Significance level. A p below it counts as found, also after Holm's correction.
+        alpha: Significance level. A difference with a smaller p, or corrected p, counts as
+            found.
     """
     significant_count = sum(run.p is not None and run.p < alpha for run in runs)
     significant_count_holm = sum(run.p_holm is not None and run.p_holm < alpha for run in runs)

@@ -2,16 +2,17 @@
 
 The synthetic participant sees the slave arm over the network, and moves the hand at its master
 so that the slave reaches the target:
-    - It makes movements of minimum jerk (Flash and Hogan, 1985), whose ends scatter with their
-      length (Harris and Wolpert, 1998) and whose durations follow Fitts' law.
+    - It makes movements of minimum jerk (Flash and Hogan, 1985), whose end points scatter in
+      proportion to their length (Harris and Wolpert, 1998) and whose durations follow Fitts'
+      law.
     - Before a correction it waits until the slave is at rest, as people do with a delay
       (Ferrell, 1965).
-    - It follows a moving target at a rate of correction that it lowers with the known delay
+    - It follows a moving target with a correction rate that decreases with the known delay
       (McRuer and Jex, 1967).
-    - With practice it becomes faster by an exponential law.
+    - With practice it becomes faster according to an exponential law.
 
 Invariant:
-    - The motion follows from what the participant sees, its parameters and its seed.
+    - The motion depends only on the participant's view, its parameters and its seed.
 """
 
 import math
@@ -45,13 +46,14 @@ class ParticipantModel(Frozen, frozen=True):
     log2(distance / width + 1).
 
     Attributes:
-        reaction_s: Time from what the participant sees to the reaction, in s.
+        reaction_s: Time from a visible event to the participant's reaction, in s.
         fitts_a_s: Duration of a movement of no difficulty, in s.
         fitts_b_s: Additional duration for each bit of the index of difficulty, in s.
-        noise: Standard deviation of a movement's end, as a fraction of the movement's length.
+        noise: Standard deviation of a movement's end point, as a fraction of the movement's
+            length.
         crossover_rad_s: Rate at which a moving target is followed without a delay, in rad/s.
         learning: Fraction by which a first trial is slower than a practised trial.
-        practised: Number of trials after which half of the fraction `learning` is gone.
+        practised: Number of trials after which the fraction `learning` has halved.
         spread: Standard deviation of the logarithm of a participant's parameters.
     """
 
@@ -67,8 +69,8 @@ class ParticipantModel(Frozen, frozen=True):
     def draw(self, seed: int) -> "ParticipantModel":
         """Returns the model of one participant, who differs from this mean model by chance.
 
-        Five parameters are multiplied by log-normal factors of the deviation `spread`: reaction
-        time, both constants of Fitts' law, noise and crossover frequency.
+        Five parameters are multiplied by log-normal factors with the deviation `spread`:
+        reaction time, both constants of Fitts' law, noise and crossover frequency.
 
         Args:
             seed: Seed of the random numbers. Equal seeds give the same participant.
@@ -91,8 +93,8 @@ class ParticipantModel(Frozen, frozen=True):
 class SyntheticParticipant:
     """A model of a person at one master arm in one trial, for experiments without people.
 
-    It has the interface of an operator program, as users may write one: the site of the arm
-    calls `act` at a fixed rate, and moves the arm towards the returned position.
+    It has the interface of a user-written operator program: the site of the arm calls `act` at
+    a fixed rate, and moves the arm towards the returned position.
 
     Args:
         facts: Description of the participant's site.
@@ -100,7 +102,7 @@ class SyntheticParticipant:
         goal: Goal of the trial.
         slave: Name of the slave's site, the slave's arm, and a function that returns the force
             on the end effector, in N, from joint angles and torques.
-        before: Number of trials that the participant has done before.
+        before: Number of earlier trials of the participant.
         seed: Seed of the trial.
         user: Index of the participant among the users, from 0.
     """
@@ -137,10 +139,10 @@ class SyntheticParticipant:
         """Decides where the simulated person moves the arm now.
 
         The person sees the slave arm and the target with a delay, and starts a new movement
-        when the slave is at rest off the target.
+        when the slave is at rest outside the target.
 
         Args:
-            now: What the participant sees and feels at its site.
+            now: The participant's view and felt force at its site.
 
         Returns:
             The target position of the hand, shape (2,) or (3,), in m.
@@ -173,15 +175,15 @@ class SyntheticParticipant:
         return self._interpolate_movement(now.t_s)
 
     def _see_slave(self, now: HandView, slave: PeerView) -> Array:
-        """Looks at the slave arm, and remembers where it is and when it last moved.
+        """Observes the slave arm, and stores its position and the time of its last motion.
 
-        A step of the slave counts as a motion if it is longer than the share `MOVED_SHARE`
-        of the diameter of the target. Before the first look, the participant's own hand rests
-        where it is.
+        A step of the slave counts as a motion if it is longer than the share `MOVED_SHARE` of
+        the diameter of the target. Before the first observation, the participant's own hand
+        rests at its present position.
 
         Args:
-            now: What the participant sees and feels at its site, with the pose of the hand.
-            slave: What the participant sees of the slave arm, delayed by the network.
+            now: The participant's view and felt force at its site, with the pose of the hand.
+            slave: The participant's view of the slave arm, delayed by the network.
 
         Returns:
             The position of the slave's end effector in m, shape (axes,), with two or three
@@ -189,7 +191,7 @@ class SyntheticParticipant:
         """
         position_m = place_slave(self._arm, slave.q)
         slave_m = position_m[: self._axes]
-        if self._slave_m is None:  # the first look
+        if self._slave_m is None:  # the first observation
             self._start_m = now.pose
             self._end_m = now.pose
             self._slave_m = slave_m
@@ -206,11 +208,11 @@ class SyntheticParticipant:
         """Returns the earliest time at which the participant starts the next movement, in s.
 
         The hand and the slave must have come to rest. Then the participant reacts. If the
-        movement corrects an earlier one, the participant also waits until the delayed view
+        movement corrects an earlier movement, the participant also waits until the delayed view
         shows the end of the slave's motion.
 
         Args:
-            slave: What the participant sees of the slave arm, with the age of this view.
+            slave: The participant's view of the slave arm, with the age of this view.
 
         Returns:
             The time since the start of the trial.
@@ -224,23 +226,23 @@ class SyntheticParticipant:
         if is_correction:
             view_delay_s = slave.age_s
         wait_s = self._model.reaction_s + view_delay_s
-        return max(rest_s, 0.0) + wait_s  # a rest counts from the start of the trial
+        return max(rest_s, 0.0) + wait_s  # a rest starts at the beginning of the trial
 
     def _find_press_step(self, slave: PeerView, t_s: float) -> Array:
         """Decides how far the hand moves to press the slave arm against a wall.
 
-        The direction is that from the start of the trial to the target in the wall. The length
-        is proportional to the share of the required force that is still missing: with no force
-        it would be the width of the target, and with the required force it is 0. With too large
-        a force the hand moves back.
+        The step points from the slave's start position to the target in the wall. Its length is
+        proportional to the share of the required force that is still missing: it would be the
+        width of the target without any force, and is 0 with the required force. If the force is
+        too large, the hand moves back.
 
         Args:
-            slave: What the participant sees of the slave arm.
+            slave: The participant's view of the slave arm.
             t_s: Present time in the trial, in s.
 
         Returns:
-            The step of the hand in m, shape (axes,). It is 0 if there is no force at all,
-            because the slave has not reached the wall yet.
+            The step of the hand in m, shape (axes,). It is 0 if there is no force, because the
+            slave has not reached the wall yet.
         """
         goal = self._goal
         force_n = self._find_force_n(slave.q, slave.tau_x)
@@ -256,10 +258,10 @@ class SyntheticParticipant:
         return full_step_m * missing_share
 
     def _start_movement(self, t_s: float, step_m: Array) -> None:
-        """Starts a movement of minimum jerk to the target, as a person would make it.
+        """Starts a movement of minimum jerk to the target, as a person would.
 
-        The end of the movement scatters in proportion to the length of the step. The duration
-        follows Fitts' law and the practice so far.
+        The end point of the movement scatters in proportion to the length of the step. The
+        duration depends on Fitts' law and on the practice so far.
 
         Args:
             t_s: Present time, in s.
@@ -275,7 +277,7 @@ class SyntheticParticipant:
         difficulty_bits = math.log2(relative_length + 1.0)
         practised_duration_s = model.fitts_a_s + model.fitts_b_s * difficulty_bits
 
-        # After `practised` trials, half of the initial slowness is gone.
+        # After `practised` trials, the initial slowness has halved.
         halvings = self._before / model.practised
         remaining_slowness = 0.5**halvings
         slowness = 1.0 + model.learning * remaining_slowness
@@ -311,13 +313,13 @@ class SyntheticParticipant:
 
         The rate is `crossover_rad_s`, but at most `DELAY_MARGIN` / (reaction time + 2 age of
         the slave's sample), since a person corrects more slowly over a delay. In one call, the
-        hand corrects the share rate * (time since the last call) of the error, at most all of
-        it. The error is seen with noise in proportion to its size.
+        hand corrects the share rate * (time since the last call) of the error, but at most the
+        whole error. The perceived error has noise in proportion to its size.
 
         The time of the call and the position of the hand are stored for the next call.
 
         Args:
-            now: What the participant sees and feels at its site, with the present time.
+            now: The participant's view and felt force at its site, with the present time.
             error_m: Vector from the slave to the target, in m, shape (axes,).
             age_s: Age of the slave's sample, in s.
 

@@ -1,12 +1,13 @@
 """Defines the tasks of an experiment: reach a target, hand over, press a wall, track a path.
 
-A protocol defines a `TrialTask` with its numbers, such as the distance of the targets. For each
-trial the task makes a `TrialGoal`. The goal knows where the target is at every time, and judges
-how the trial ends. The participants move the slave arm over the network with their master arms.
+A protocol defines a `TrialTask` with its parameters, such as the distance of the targets. For
+each trial, the task creates a `TrialGoal`. The goal computes the position of the target at any
+time, and judges the result of the trial. The participants move the slave arm over the network
+with their master arms.
 
 Invariant:
-    - The goal of a trial follows from the task's numbers, the trial's seed, and the start of
-      the slave's arm.
+    - The goal of a trial depends only on the task's parameters, the trial's seed, and the start
+      position of the slave's arm.
     - A trial is judged by the position of the slave's end effector and by the force on it. The
       delayed pictures that the users see play no role.
     - A trial ends when the end effector has stayed at the goal, when its time is over, or when
@@ -30,7 +31,7 @@ Seconds = Annotated[float, Meta(gt=0.0, le=600.0)]
 class TrialTask(Frozen, frozen=True, tag_field="kind"):
     """A task for the participants, as a protocol defines it: reach, press or follow.
 
-    It is the same for all trials. `make_goal` derives the goal of a single trial.
+    The task is the same for all trials. `make_goal` creates the goal of a single trial.
 
     Attributes:
         description: The task in a phrase, for texts and plans.
@@ -55,10 +56,10 @@ class TrialTask(Frozen, frozen=True, tag_field="kind"):
 
     @property
     def longest_s(self) -> float:
-        """Longest duration of a trial, from the appearance of its target on, in s.
+        """Longest duration of a trial after the appearance of its target, in s.
 
         With a time limit (`has_limit`), a trial that has not succeeded by then has failed.
-        Without one, every trial lasts exactly that long.
+        Without a limit, every trial lasts exactly this long.
         """
         raise NotImplementedError
 
@@ -66,7 +67,8 @@ class TrialTask(Frozen, frozen=True, tag_field="kind"):
     def has_limit(self) -> bool:
         """True if a trial fails when the participant has not finished in `longest_s` seconds.
 
-        False if every trial lasts exactly that long, as for following a moving target.
+        False if every trial lasts exactly `longest_s` seconds, as for following a moving
+        target.
         """
         return True
 
@@ -74,7 +76,7 @@ class TrialTask(Frozen, frozen=True, tag_field="kind"):
     def needs_pair(self) -> bool:
         """True if two participants perform the task together.
 
-        The protocol of the experiment must then name two master arms.
+        If so, the protocol of the experiment must name two master arms.
         """
         return False
 
@@ -98,15 +100,16 @@ class TrialGoal:
         width_m: Diameter of the target, in m.
 
     Attributes:
-        start_m: Position of the target before it appears, in m: the start of the slave.
+        start_m: Position of the target before it appears, in m, which is the slave's start
+            position.
         width_m: Diameter of the target, in m.
         appears_s: Time at which the target appears, in s. Users must wait until then.
-        is_moving: True if the target moves from then on.
-        force_n: Force to press with, in N. 0 if the task has no force.
-        lead: The first user's part of the authority that two users share over the slave, until
-            a handover. None for the scenario's dominance factors.
+        is_moving: True if the target moves after it has appeared.
+        force_n: Force with which to press, in N. 0 if the task does not require a force.
+        lead: The first user's share of the authority that two users have over the slave, until
+            a handover. If `None`, the scenario's dominance factors apply.
         handover: Time from the target's appearance until the second user receives the
-            authority, and duration of the change, both in s. None without a handover.
+            authority, and duration of the change, both in s. `None` if there is no handover.
     """
 
     is_moving = False
@@ -120,12 +123,12 @@ class TrialGoal:
         self.appears_s = 0.0
 
     def find_target_m(self, t_s: float, user: int | None = None) -> Array:
-        """Returns where the end effector shall be at a time, shape (2,) or (3,), in m.
+        """Returns the target position of the end effector at a time, shape (2,) or (3,), in m.
 
         Args:
             t_s: Time since the start of the session, in s.
-            user: Index of the user whose target is returned, from 0. None for the middle of all
-                users' targets.
+            user: Index of the user whose target is returned, from 0. If `None`, the middle of
+                all users' targets is returned.
         """
         if t_s < self.appears_s:
             return self.start_m
@@ -142,14 +145,14 @@ class TrialGoal:
             force_n: Magnitude of the force on the end effector, in N.
 
         Returns:
-            The outcome of the trial. None while the trial goes on.
+            The outcome of the trial. `None` while the trial continues.
         """
         if t_s < self.appears_s:
             return None
         return self._judge(t_s, position_m, force_n)
 
     def has_authority(self, t_s: float, user: int) -> bool:
-        """Tells whether the slave follows a user at all at some time of the trial.
+        """Returns True if the slave follows a user at a given time of the trial.
 
         With a handover, the authority over the slave moves from the first user to the second.
 
@@ -175,7 +178,7 @@ class TrialGoal:
             t_s: Time since the start of the session, in s.
 
         Returns:
-            The start of the corridor and its width, both in m. None without a corridor.
+            The start of the corridor and its width, both in m. `None` if there is no corridor.
         """
         return None
 
@@ -185,7 +188,7 @@ class TrialGoal:
         position_m: Array,  # noqa: ARG002
         force_n: Array,  # noqa: ARG002
     ) -> dict[str, float]:
-        """Computes measures that only this task has, such as the mean force against a wall.
+        """Computes measures of this task alone, such as the mean force against a wall.
 
         Args:
             after_s: Times since the target's appearance, shape (K,), in s.
@@ -193,7 +196,7 @@ class TrialGoal:
             force_n: Magnitudes of the force on the end effector, shape (K,), in N.
 
         Returns:
-            The measures by name. Empty if the task has none.
+            The measures by name. Empty if the task has no measures of its own.
         """
         return {}
 
@@ -202,7 +205,7 @@ class TrialGoal:
 
         Args:
             after_s: Time since the target's appearance, in s.
-            user: Index of the user, or None, see `find_target_m`.
+            user: Index of the user, or `None`, see `find_target_m`.
 
         Returns:
             The position, shape (2,) or (3,), in m.
@@ -219,7 +222,7 @@ class TrialGoal:
 
 
 class Outcome(NamedTuple):
-    """How a trial ended: whether the task was done, and when.
+    """Result of a trial: whether the task was done, and the time of the end.
 
     A trial without an outcome is still running.
 
@@ -235,20 +238,20 @@ class Outcome(NamedTuple):
 class ReachTrial(TrialTask, frozen=True, tag="reach"):
     """Task of an experiment: move the arm to targets on a ring, as in ISO 9241-411.
 
-    Each target is opposite the previous one.
+    Each target is opposite the previous target.
 
     Attributes:
         targets: Number of targets.
         distance_m: Radius of the ring around the start, in m.
         width_m: Diameter of a target, in m.
-        dwell_s: How long the end effector must stay in the target, in s.
+        dwell_s: Time for which the end effector must stay in the target, in s.
         timeout_s: Time after which the trial has failed, in s.
-        corridor_m: Width of the straight corridor to the target, in m, which nobody may leave.
-            None if the users may choose the path.
+        corridor_m: Width of the straight corridor to the target, in m, which the users may not
+            leave. `None` if the users may choose the path.
         handover_s: Time after which the second user receives the first user's authority, in s.
-            None without a handover.
-        ramp_s: Duration of the handover, in s. The end effector must stay in the target
-            meanwhile. Then the next target appears.
+            `None` if there is no handover.
+        ramp_s: Duration of the handover, in s. The end effector must stay in the target during
+            the handover. Then the next target appears.
     """
 
     description: ClassVar[str] = "reaching to a ring of targets"
@@ -270,8 +273,8 @@ class ReachTrial(TrialTask, frozen=True, tag="reach"):
     def needs_pair(self) -> bool:
         """True if two participants reach the target together.
 
-        The first one then hands over the control of the slave arm to the second one during the
-        trial.
+        The first participant then hands over the control of the slave arm to the second
+        participant during the trial.
         """
         return self.handover_s is not None
 
@@ -328,7 +331,8 @@ class ReachTrial(TrialTask, frozen=True, tag="reach"):
 
         Args:
             start_m: Centre of the ring, in m.
-            number: Number of the target, from 0. Numbers beyond the last target begin anew.
+            number: Number of the target, from 0. Numbers beyond the last target start again
+                with the first target.
         """
         # Targets with even numbers advance around the ring. Those with odd numbers are half a
         # ring further.
@@ -346,7 +350,7 @@ class ReachTrial(TrialTask, frozen=True, tag="reach"):
 
 
 class _DwellGoal(TrialGoal):
-    """A goal that is reached once a condition has held for some time without a break.
+    """A goal that is reached once a condition has held for some time without interruption.
 
     A user who only passes through the target has not reached it. Subclasses define the
     condition by `_is_inside`, for example that the end effector is in the target.
@@ -356,7 +360,7 @@ class _DwellGoal(TrialGoal):
         super().__init__(start_m, task.width_m)
         self._dwell_s = task.dwell_s
         self._longest_s = task.longest_s
-        # Time since which the condition is met; infinite while it is not met.
+        # Time since which the condition has been met; infinite while it is not met.
         self._inside_since_s = math.inf
 
     def _is_inside(self, after_s: float, position_m: Array, force_n: float) -> bool:
@@ -373,7 +377,7 @@ class _DwellGoal(TrialGoal):
         """Ends the trial with success after the dwell time, or as failed after the time limit.
 
         The dwell time is the time for which the end effector must stay in the target. It starts
-        anew whenever the end effector leaves the target.
+        again whenever the end effector leaves the target.
         """
         after_s = t_s - self.appears_s
         if self._is_inside(after_s, position_m, force_n):
@@ -394,8 +398,8 @@ class _DwellGoal(TrialGoal):
 class _ReachGoal(_DwellGoal):
     """Goal of a trial of `ReachTrial`: to bring the end effector to a target and stay there.
 
-    With a handover, there is a second target for the user who receives the slave. Without one,
-    `_handover_s` and `_second_appears_s` are -1.
+    With a handover, there is a second target for the user who receives the slave. Without a
+    handover, `_handover_s` and `_second_appears_s` are -1.
     """
 
     def __init__(self, task: ReachTrial, start_m: Array, targets_m: Sequence[Array]) -> None:
@@ -443,8 +447,8 @@ class _ReachGoal(_DwellGoal):
         page draws it.
 
         Returns:
-            The start of the corridor and its width, both in m. None before the target appears,
-            and for a task without a corridor.
+            The start of the corridor and its width, both in m. `None` before the target
+            appears, and for a task without a corridor.
         """
         if self._corridor_m is None or t_s < self.appears_s:
             return None
@@ -456,7 +460,7 @@ class _ReachGoal(_DwellGoal):
         """Returns the start and the end of the present movement, in m.
 
         Usually this is the movement from the start to the target. After a handover between two
-        users, a second target follows, and the movement is that from the first to the second
+        users, a second target follows, and the movement goes from the first to the second
         target.
 
         Args:
@@ -468,7 +472,7 @@ class _ReachGoal(_DwellGoal):
         return self._waypoints_m[:2]
 
     def _find_target_m(self, after_s: float, user: int | None) -> Array:  # noqa: ARG002 - all users see the same
-        """Returns the end of the present movement, which all users see alike, in m."""
+        """Returns the end of the present movement, which is the same for all users, in m."""
         _, end_m = self._find_segment(after_s)
         return end_m
 
@@ -512,9 +516,9 @@ class ContactTrial(TrialTask, frozen=True, tag="contact"):
         axis: Axis of the arm's base frame along which the target is drawn, from 0.
         distance_m: Distance from the start to the target, in m. Negative for the other side.
         width_m: Diameter of the target, in m.
-        force_n: Force to press with, in N.
+        force_n: Force with which to press, in N.
         tolerance_n: Largest error of the force, in N.
-        dwell_s: How long the force must be held, in s.
+        dwell_s: Time for which the force must be held, in s.
         timeout_s: Time after which the trial has failed, in s.
     """
 
@@ -553,7 +557,7 @@ class ContactTrial(TrialTask, frozen=True, tag="contact"):
 
 
 class _ContactGoal(_DwellGoal):
-    """Decides when a trial has succeeded in which a wall is pressed with a force for some time.
+    """Decides when a trial has succeeded whose task is to press a wall with a given force.
 
     Only the force is judged, not the position. See `ContactTrial`.
     """
@@ -575,7 +579,7 @@ class _ContactGoal(_DwellGoal):
         position_m: Array,  # noqa: ARG002
         force_n: Array,
     ) -> dict[str, float]:
-        """Computes how well the force was held at the end of the trial.
+        """Computes the accuracy with which the force was held at the end of the trial.
 
         The measures are the mean of the force and the RMS of its error, both in N, over the
         time for which the force had to be held.
@@ -600,7 +604,7 @@ class _ContactGoal(_DwellGoal):
 
 
 class TrackTrial(TrialTask, frozen=True, tag="track"):
-    """The task to follow a target that moves along one axis in a way that nobody can foresee.
+    """The task to follow a target that moves unpredictably along one axis.
 
     The path is a sum of sines whose frequencies have no common multiple.
 
@@ -629,7 +633,7 @@ class TrackTrial(TrialTask, frozen=True, tag="track"):
 
     @property
     def has_limit(self) -> bool:
-        """False: following a moving target takes exactly `duration_s`, and cannot fail."""
+        """Always False: following a target takes exactly `duration_s`, and cannot fail."""
         return False
 
     @property
@@ -644,7 +648,7 @@ class TrackTrial(TrialTask, frozen=True, tag="track"):
     def longest_s(self) -> float:
         """Duration of every trial of following a moving target, in s.
 
-        It counts from the moment at which the target appears.
+        The duration starts when the target appears.
         """
         return self.duration_s
 
@@ -711,7 +715,7 @@ class _TrackGoal(TrialGoal):
         Args:
             after_s: Time since the target's appearance, in s.
             user: Index of a user, whose target is half of `apart_m` away from the path: the
-                first user's on the positive side. None for the path itself.
+                first user's on the positive side. If `None`, the path itself is returned.
         """
         task = self._task
         rates_rad_s = 2.0 * math.pi * np.array(task.frequencies_hz)

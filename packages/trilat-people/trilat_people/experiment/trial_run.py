@@ -5,7 +5,7 @@ target. `ExperimentTrial` is a trial with people, recorded by a live session. `S
 is a trial of synthetic participants, which are models of people, and runs in virtual time.
 
 Invariant:
-    - The result of a trial follows from its log. The log is executed again, and the task is
+    - The result of a trial is computed from its log. The log is executed again, and the task is
       judged by the state of the slave in every period of its control loop.
     - A trial of synthetic participants is simulated twice. The first simulation is fast, writes
       no log, and finds out when the trial ends. The second simulation repeats the same motion,
@@ -32,19 +32,19 @@ from trilat_net.analysis import (
 )
 from trilat_net.core import Array
 from trilat_net.errors import LogError
-from trilat_net.execution import FusedRun, record_virtual, verify
+from trilat_net.execution import FusedRun, record_virtual, verify_log
 from trilat_net.files import digest_file
 from trilat_net.log import Ints, Log, SiteLog, open_log
 from trilat_net.records import NS_PER_S
 from trilat_net.scenario import Change, HandPlayer, HandSite, Scenario, parse_scenario
 
 from .movement_measures import energy_j, measure_pair, movement_time_s, path_length_m, sparc
-from .protocol import ExperimentProtocol, PlannedTrial, limit_forces
+from .protocol import ExperimentProtocol, PlannedTrial
 from .synthetic_participant import ParticipantModel, SyntheticParticipant
 from .tasks import Outcome, TrialGoal
 
 RECORD_STEP = 5
-"""Every fifth record of the slave is measured."""
+"""Number of the slave's records per record that is measured."""
 HAND_HZ = 50
 """Rate at which a synthetic participant acts, in 1/s."""
 HAND_DELAY_S = 0.02
@@ -83,7 +83,7 @@ class TrialJudge:
 
     Attributes:
         goal: Goal of the trial.
-        outcome: Outcome of the trial. None while the trial goes on.
+        outcome: Outcome of the trial. `None` while the trial continues.
     """
 
     def __init__(self, trial: "ExperimentTrial") -> None:
@@ -94,16 +94,16 @@ class TrialJudge:
     def accept(self, t_s: float, q: Sequence[float], tau_x: Sequence[float]) -> Outcome | None:
         """Takes the next record of the slave into account.
 
-        A record contains what the site of the slave arm measured in one control period. The
+        A record contains the measurements of the slave arm's site in one control period. The
         trial may end with any record.
 
         Args:
             t_s: Time since the start of the session, in s.
             q: Joint positions, in rad or m.
-            tau_x: Minus the torques of hands and environments ON the arms, in N m or N.
+            tau_x: Minus the torques of hands and environments ON the arm, in N m or N.
 
         Returns:
-            The outcome once the trial has ended. None before.
+            The outcome once the trial has ended, `None` before.
         """
         if self.outcome is None:
             # The force is computed only for tasks that need it, because it takes long.
@@ -152,8 +152,8 @@ class ExperimentTrial:
 
     Attributes:
         people: False for synthetic participants, which are models of people.
-        protocol: Same as the argument.
-        planned: Same as the argument.
+        protocol: The argument of the same name.
+        planned: The argument of the same name.
         slave: Name of the slave in the scenario.
         arm: Model of the slave arm.
         scenario: Scenario of this trial, with the longest duration that the trial may have.
@@ -178,7 +178,8 @@ class ExperimentTrial:
         start = self.arm.end_effector(start_q)
         self._start_m = np.array(start, dtype=np.float64)
 
-        # The target appears after a random time (foreperiod), so that nobody anticipates it.
+        # The target appears after a random time (foreperiod), so that users cannot anticipate
+        # it.
         shortest_s, longest_s = protocol.foreperiod_s
         random = np.random.default_rng(planned.seed)
         foreperiod_s = random.uniform(shortest_s, longest_s)
@@ -186,11 +187,11 @@ class ExperimentTrial:
 
         scenario = self._set_authority(scenario)
         # Synthetic participants act, and their trial is judged, once per 1 / HAND_HZ. The end
-        # of a trial may be noticed that late.
+        # of a trial may be detected that late.
         latest_end_s = self.appears_s + protocol.task.longest_s
         self.longest_s = latest_end_s + 1.0 / HAND_HZ
 
-        # The log of the trial says what it is about.
+        # The log of the trial states which trial it contains.
         kind = "" if self.people else "synthetic "
         participants = ", ".join(planned.group)
         about = (
@@ -199,7 +200,7 @@ class ExperimentTrial:
             f"protocol sha256 {digest}"
         )
 
-        limited_sites = limit_forces(scenario, protocol, planned.group)
+        limited_sites = protocol.limit_forces(scenario, planned.group)
         self.scenario = replace(
             scenario,
             duration_s=self.longest_s + REST_S,
@@ -214,7 +215,7 @@ class ExperimentTrial:
 
         The slave follows the users' arms with weights, the dominance factors. The protocol
         determines how two users share the sum of their factors. A handover exchanges their
-        parts during the trial.
+        shares during the trial.
         """
         goal = self.make_goal()
         if goal.lead is None:
@@ -231,8 +232,8 @@ class ExperimentTrial:
             lead = 0.7 gives 0.7 and 0.3.
 
             Args:
-                lead: First user's part of the authority over the slave, from 0 to 1. The second
-                    user has the rest.
+                lead: First user's share of the authority over the slave, from 0 to 1. The
+                    second user has the rest.
             """
             first_share = sum_of_shares * lead
             second_share = sum_of_shares - first_share
@@ -263,7 +264,7 @@ class ExperimentTrial:
 
         Args:
             q: Joint positions, in rad or m.
-            tau_x: Minus the torques of hands and environments ON the arms, in N m or N.
+            tau_x: Minus the torques of hands and environments ON the arm, in N m or N.
         """
         forces_n = self._find_forces_n(np.array([q]), np.array([tau_x]))
         return float(forces_n[0])
@@ -294,10 +295,10 @@ class ExperimentTrial:
         return self._rows.place_end_effector(q, speed)
 
     def make_goal(self) -> TrialGoal:
-        """Creates the goal of the trial, which knows the target and decides on the end.
+        """Creates the goal of the trial, which computes the target and decides on the end.
 
-        Each judge of the trial needs a goal of its own, because a goal remembers since when the
-        end effector has been in the target.
+        Each judge of the trial needs a goal of its own, because a goal stores the time since
+        which the end effector has been in the target.
         """
         planned = self.planned
         task = self.protocol.task
@@ -311,17 +312,17 @@ class ExperimentTrial:
     def settle(self, path: Path) -> TrialEntry:
         """Verifies the log of the trial, and returns the trial's result computed from it.
 
-        The run is executed again from the log. The result counts only if the records are the
+        The run is executed again from the log. The result is valid only if the records are the
         same.
 
         Args:
             path: Path of the log.
 
         Raises:
-            LogError: The records are not those of a run, or they end before the trial does.
+            LogError: The records cannot be reproduced, or they end before the trial does.
         """
         log = open_log(path)
-        if not verify(log).passed:
+        if not verify_log(log).passed:
             raise LogError(f"{path}: the records differ from those of a repeated run")
 
         outcome = self._judge_log(log)
@@ -338,13 +339,13 @@ class ExperimentTrial:
         )
 
     def _judge_log(self, log: Log) -> Outcome | None:
-        """Decides from the recorded log of a trial when it succeeded or failed.
+        """Decides from the recorded log when a trial succeeded or failed.
 
-        It is judged record by record, as a trial in progress is judged. A trial in which an arm
-        left its limits has failed at that time.
+        The trial is judged record by record, as a trial in progress is judged. A trial in which
+        an arm left its limits has failed at that time.
 
         Returns:
-            The outcome. None if the log ends before the trial does.
+            The outcome. `None` if the log ends before the trial does.
         """
         judge = TrialJudge(self)
         records = log[self.slave]
@@ -363,8 +364,8 @@ class ExperimentTrial:
     def _measure(self, log: Log, outcome: Outcome) -> dict[str, float]:
         """Computes the measures of a trial, with units in the names.
 
-        They are the measures of the slave's motion, the forces and the work of each user, and
-        the mean age of the first user's samples (sent states) at the slave.
+        The measures cover the slave's motion, the forces and the work of each user, and the
+        mean age of the first user's samples (sent states) at the slave.
         """
         measures = self._measure_motion(log, outcome.ended_s)
         aligned = align_records(log)
@@ -406,7 +407,8 @@ class ExperimentTrial:
     ) -> _MotionSamples:
         """Returns the motion of the slave's end effector between two times, for its measures.
 
-        Only every `RECORD_STEP`-th record is used. Velocities are differences of positions.
+        Only every `RECORD_STEP`-th record is used. Velocities are computed from differences
+        between positions.
 
         Args:
             records: Records of the slave.
@@ -432,9 +434,9 @@ class ExperimentTrial:
     def _measure_pair(
         self, aligned: Mapping[str, AlignedRecords], forces: Sequence[Array], ended_s: float
     ) -> dict[str, float]:
-        """Computes the cooperation measures of two users, such as the force that cancels.
+        """Computes the cooperation measures of two users, such as the force that cancels out.
 
-        The forces are treated as if each user pushed at the slave's end effector.
+        The forces are treated as if each user pushed the slave's end effector.
 
         Args:
             aligned: Records of each site.
@@ -479,7 +481,7 @@ class ExperimentTrial:
         onset_speed = 0.05 * speed.max()
         is_moving = speed > onset_speed
 
-        # The target may move, so that the error is computed at each time.
+        # The target may move, so the error is computed at each time.
         targets = [goal.find_target_m(t_s) for t_s in motion.t_s]
         targets_m = np.array(targets)
         error_vectors_m = motion.positions_m - targets_m
@@ -523,7 +525,7 @@ class ExperimentTrial:
 class SyntheticTrial(ExperimentTrial):
     """A trial in which models of people (synthetic participants) move the master arms.
 
-    It runs in virtual time, without a network, in less time than the trial lasts. It serves to
+    It runs in virtual time, without a network, in less time than the trial lasts. It is used to
     test a protocol and its analysis before people take part.
     """
 
@@ -532,7 +534,7 @@ class SyntheticTrial(ExperimentTrial):
     def _make_players(self, scenario: Scenario) -> dict[str, HandPlayer]:
         """Creates models of the participants of a trial, by the sites whose arms they move.
 
-        Each call creates them anew, because a model keeps a state during a trial.
+        Each call creates new models, because a model keeps a state during a trial.
 
         Args:
             scenario: Scenario of the trial.
@@ -567,8 +569,8 @@ class SyntheticTrial(ExperimentTrial):
     def _draw_model(self, participant: str) -> ParticipantModel:
         """Returns the model of a participant: reaction time, speed, noise, and so on.
 
-        The parameters are drawn by the protocol's seed and the pseudonym, so that a participant
-        stays the same in all trials.
+        The parameters are drawn with the protocol's seed and the pseudonym, so that a
+        participant has the same parameters in all trials.
 
         Args:
             participant: Pseudonym of the participant.
@@ -579,7 +581,7 @@ class SyntheticTrial(ExperimentTrial):
         return self.protocol.model.draw(participant_seed)
 
     def find_end_s(self) -> float:
-        """Returns how long the trial lasts, from a fast simulation that writes no log.
+        """Returns the duration of the trial, from a fast simulation that writes no log.
 
         A second run then writes the log, and ends soon after that time.
 
@@ -625,8 +627,8 @@ class SyntheticTrial(ExperimentTrial):
     def write(self, path: Path) -> TrialEntry:
         """Simulates a trial with a model of the participant, and writes its log.
 
-        A first run without a log finds out when the trial ends, so that the log stops soon
-        after. Returns the result of the trial.
+        A first run without a log determines when the trial ends, so that the log stops soon
+        after. The result of the trial is returned.
 
         Args:
             path: Path of the log.

@@ -6,8 +6,8 @@ recorded log, and writes the result to the journal of the experiment. Between tr
 consents and questionnaires.
 
 Invariant:
-    - A trial counts only if its log exists and is valid. The log is moved to its final place
-      before the journal mentions the trial. If this process dies at any moment, no completed
+    - A trial counts only if its log exists and is valid. The log is moved to its final path
+      before the trial is added to the journal. If this process dies at any moment, no completed
       trial is lost, and no incomplete trial is counted.
     - Every attempt at a trial has its own folder. If the attempt does not count, its folder is
       kept, together with a note of the reason.
@@ -42,13 +42,13 @@ POLL_NS = 20_000_000
 FAREWELL_NS = NS_PER_S
 """Time between the last step and the end of the server, in ns.
 
-In this time every page receives that the experiment has ended.
+During this time, every page is told that the experiment has ended.
 """
 EARLY_FAILURE_NS = 60 * NS_PER_S
-"""Time within which a session that fails before its beginning would fail again, in ns."""
+"""A session that fails to begin within this time would fail again, in ns."""
 
 SessionRunner = Callable[[TrialWatch, Path, Callable[[], bool]], SessionResult]
-"""A function that runs the session of a trial until the trial is over or people end it.
+"""Function that runs the session of a trial until the trial is over or people end it.
 
 Its arguments are the watch of the trial, the folder of the attempt, and a function that returns
 True once the session may begin.
@@ -63,8 +63,8 @@ class ExperimentSessions:
 
     Attributes:
         experiment: The experiment, with its plan and the journals of completed steps.
-        stage: Controls what the pages show between the sessions, and collects the participants'
-            replies.
+        stage: Controls the content of the pages between the sessions, and collects the
+            participants' replies.
         clock: Clock of this process.
         run_session: Function that runs the session of a trial.
         ends: Function that returns True once the experiment must end for now.
@@ -88,8 +88,8 @@ class ExperimentSessions:
             True if all steps are completed. False if the experiment was ended earlier.
 
         Raises:
-            LogRefused: The disk refused a file. Everything that was done is kept.
-            UsageError: The experiment is one of synthetic participants.
+            LogRefused: A file could not be written to the disk. All results so far are kept.
+            UsageError: The experiment has synthetic participants.
         """
         trials = self.experiment.open_trials(people=True)
         notes = self.experiment.open_notes()
@@ -109,7 +109,7 @@ class ExperimentSessions:
         return True
 
     def _request_step(self, step: Step, rest_s: float = 0.0) -> bool:
-        """Waits until every user has completed a step, and notes consents and answers.
+        """Waits until every user has completed a step, and records consents and answers.
 
         A step is a consent, a questionnaire, or the readiness for a trial. The users complete
         it on their web pages, which the stage controls. A note is an entry of the experiment's
@@ -121,7 +121,8 @@ class ExperimentSessions:
             rest_s: Rest before the step, in s.
 
         Returns:
-            True if every user has completed the step. False if the experiment was ended before.
+            True if every user has completed the step. False if the experiment was ended
+            earlier.
         """
         pseudonyms = dict(zip(self.stage.users, step.planned.group, strict=True))  # by site
         note_keys = {site: f"{step.key} {who}" for site, who in pseudonyms.items()}
@@ -140,7 +141,8 @@ class ExperimentSessions:
             # A user who is ready for a trial leaves no note.
             if step.kind == "trial":
                 continue
-            # Every poll offers all replies. The journal ignores those that it contains already.
+            # Every poll returns all replies. The journal ignores replies that it already
+            # contains.
             for site, (answers, _) in list(request.replies.items()):
                 self._add_note(
                     cell=note_keys[site],
@@ -165,7 +167,7 @@ class ExperimentSessions:
         text: str,
         answers: Mapping[str, float | None] = {},
     ) -> None:
-        """Adds a note to the journal, unless the journal has a note of the same key already.
+        """Adds a note to the journal, unless the journal already has a note with the same key.
 
         Args:
             cell: Key of the note.
@@ -173,7 +175,7 @@ class ExperimentSessions:
             who: Pseudonym of the participant, or of all participants of the trial.
             number: Number of the trial.
             text: Name of the questionnaire, or a reason.
-            answers: Answers to a questionnaire. None for an item without an answer.
+            answers: Answers to a questionnaire. A missing answer is `None`.
         """
         unix_s = round(self.clock.unix_ns() / NS_PER_S, 3)
         note = Note(
@@ -188,24 +190,24 @@ class ExperimentSessions:
         self._notes.add(note)
 
     def _run_trial(self, step: Step) -> bool:
-        """Repeats a trial until one attempt counts.
+        """Runs attempts at a trial until one is valid.
 
-        An attempt is one session of the trial, with a folder of its own. If an earlier start of
+        An attempt is one session of the trial, with a folder of its own. If an earlier run of
         this program was ended during the trial, it may have left a finished log, which is
-        counted now, or an unfinished attempt, which is noted as aborted.
+        counted now, or an unfinished attempt, which is recorded as aborted.
 
         Args:
             step: The step of the trial.
 
         Returns:
-            True if an attempt counts. False if the experiment was ended before.
+            True if an attempt counts. False if the experiment was ended earlier.
         """
         plan = self.experiment.plan
         planned = step.planned
         scenario = plan.find_scenario(planned, self.experiment.list_choices())
         trial = ExperimentTrial(plan.protocol, scenario, planned, plan.digest)
         log_path = make_subfolder(self.experiment.folder / LOGS) / planned.file
-        # The log exists if the program was killed before it had counted the trial.
+        # If the log already exists, the program was killed before it had counted the trial.
         if log_path.exists():
             reason_against = self._count_trial(trial, log_path)
             if not reason_against:
@@ -240,14 +242,14 @@ class ExperimentSessions:
         return sorted(attempts.glob(f"{planned.number:05d}-*"))
 
     def _record_aborted(self, planned: PlannedTrial, reason: str) -> None:
-        """Notes in the journal why the newest attempt at a trial does not count.
+        """Records in the journal why the newest attempt at a trial does not count.
 
-        The trial is then repeated. If the reason of this attempt is noted already, nothing
+        The trial is then repeated. If the reason for this attempt is already recorded, nothing
         changes.
 
         Args:
             planned: The trial.
-            reason: Why the attempt does not count, for the experimenter.
+            reason: Reason why the attempt does not count, for the experimenter.
         """
         last_attempt = self._list_attempts(planned)[-1]
 
@@ -268,14 +270,14 @@ class ExperimentSessions:
         Args:
             step: The step of the trial.
             trial: The trial.
-            path: Final place of the log.
+            path: Final path of the log.
             rest_s: Rest before the trial, in s.
 
         Returns:
             True if the trial counts.
 
         Raises:
-            LogRefused: The disk refused the log.
+            LogRefused: The log could not be written to the disk.
             RunFailed: The session failed before it began, and would fail again.
         """
         number = len(self._list_attempts(step.planned)) + 1
@@ -289,8 +291,8 @@ class ExperimentSessions:
         def begins() -> bool:
             """Returns True once all participants have said that they are ready.
 
-            They do so on their web pages. The session waits for this before its first control
-            period. Then the pages change to the picture of the trial.
+            They confirm this on their web pages. The session waits for the confirmations before
+            its first control period. Then the pages show the trial.
             """
             nonlocal has_begun
             if not has_begun and request.replies.keys() >= set(self.stage.users):
@@ -331,7 +333,7 @@ class ExperimentSessions:
 
         Args:
             trial: The trial.
-            path: The log, in its final place.
+            path: The log, at its final path.
 
         Returns:
             The reason why the trial does not count. Empty if it counts.
@@ -362,7 +364,7 @@ class ExperimentSessions:
 
 
 def _find_repeat_reason(watch: TrialWatch, result: SessionResult) -> str:
-    """Returns the reason why a trial of an experiment must be repeated. Empty if it counts.
+    """Returns the reason why a trial must be repeated, or an empty text if it counts.
 
     A trial in which an arm has left its limits is not repeated: it counts as failed.
     """
@@ -386,15 +388,15 @@ def run_with_people(
 
     Args:
         experiment: The experiment, with its plan and the journals of completed steps.
-        options: How the pages are served.
+        options: Address, encryption and further options of the page server.
         say: Function that prints a line for the user.
 
     Returns:
         The exit code of the command.
 
     Raises:
-        LogRefused: The disk refused a file. Everything that was done is kept.
-        UsageError: The experiment is one of synthetic participants.
+        LogRefused: A file could not be written to the disk. All results so far are kept.
+        UsageError: The experiment has synthetic participants.
     """
     clock = SystemClock()
     plan = experiment.plan
@@ -432,7 +434,8 @@ def run_with_people(
                     attend=show_session_on_pages,
                     begins=begins,
                 )
-                # Both are the number of the signal that arrived, or 0. The first one is kept.
+                # Both are the number of the signal that arrived, or 0. The first signal is
+                # kept.
                 interrupt.number = interrupt.number or result.interrupted
                 return result
 
@@ -464,9 +467,9 @@ def _show_session(
 ) -> Iterator[Callable[[], bool]]:
     """Shows the session of a trial on the pages of the experiment while it runs.
 
-    The function has the form of a `SessionAttendant`, and is a context manager. After the
-    session the pages observe the experiment's own network connection, on which nothing happens,
-    so that the connection to the session can be closed.
+    The function has the signature of a `SessionAttendant`, and is a context manager. After the
+    session, the pages observe the experiment's own network connection, on which no messages are
+    sent, so that the connection to the session can be closed.
 
     Args:
         page: Server of the pages.

@@ -1,4 +1,4 @@
-"""Controls what the pages of an experiment show: consent, readiness, trials, questionnaires.
+"""Controls the content of an experiment's pages: consent, readiness, trials, questionnaires.
 
 A trial is one execution of a task by the participants, in a session of its own. The `Stage`
 requests the steps between the trials from the users and collects their replies. A `TrialWatch`
@@ -11,7 +11,7 @@ Invariant:
       record is the stored result of one period of its control loop. The later evaluation of the
       log uses the same records.
     - Rests of the users and absences of pages are measured on the monotonic clock, which is
-      never set, so that a correction of the time of day changes no duration.
+      never set, so a correction of the time of day does not change any duration.
     - The pages of users never show the condition of the experiment, such as the delay or the
       control law, because this knowledge could influence the users.
 """
@@ -76,7 +76,7 @@ class TrialWatch:
         """True once the session in which a trial takes place can end.
 
         After an abort, the session can end at once. After the outcome, it continues for
-        `END_DELAY_NS`, so that the log contains what follows.
+        `END_DELAY_NS`, so that the log contains the motion after the trial.
         """
         if self.aborted:
             return True
@@ -84,9 +84,9 @@ class TrialWatch:
         return has_outcome and self._clock.monotonic_ns() - self._ended_ns > END_DELAY_NS
 
     def poll(self, view: SessionView, absent: Collection[str]) -> list[str]:
-        """Judges the trial by new records of the slave arm, and finds reasons to repeat it.
+        """Judges the trial from new records of the slave arm, and finds reasons to repeat it.
 
-        A record contains what the process of an arm measured and computed in one control
+        A record contains the measurements and results of an arm's process in one control
         period. The trial must be repeated if an arm was stopped, or if the web page of a
         participant has disappeared. The records are then not judged.
 
@@ -117,14 +117,14 @@ class TrialWatch:
     def _judge_records(self, view: SessionView) -> list[str]:
         """Judges the slave's new records in order, up to the outcome of the trial.
 
-        A record is judged only when no earlier one can still arrive. The evaluation of the log
-        then comes to the same outcome. Records that are lost for good are skipped.
+        A record is judged only when no earlier record can still arrive. The evaluation of the
+        log then gives the same outcome. Records that are permanently lost are skipped.
 
         Args:
             view: State of the session.
 
         Returns:
-            Texts that the log should keep as marks of this moment, such as "trial 3 begins".
+            Texts that mark this moment in the log, such as "trial 3 begins".
         """
         slave = view.sites[self.trial.slave]
         number = self.trial.planned.number
@@ -160,10 +160,11 @@ class TrialWatch:
     def describe(self, t_s: float, site: str) -> Json:
         """Describes the target that the participants must reach now, for a page.
 
-        The page also learns whether the target has appeared already.
+        The description also states whether the target has appeared.
 
         Args:
-            t_s: Time of the pose that the page shows, counted in the trial, in s.
+            t_s: Time of the pose that the page shows, since the start of the trial's session,
+                in s.
             site: Name of the site of the page's user. If it is empty, the target lies in the
                 middle of the targets of all users.
 
@@ -186,7 +187,7 @@ class TrialWatch:
             fields["way"] = {"from": start_m.tolist(), "width_m": width_m}
 
         fields["appeared"] = t_s >= goal.appears_s
-        # The time of a trial runs from the appearance of the target.
+        # The time of a trial starts when the target appears.
         running_s = max(t_s, goal.appears_s)
         fields["left_s"] = max(0.0, trial.longest_s - running_s)
         return fields
@@ -198,8 +199,8 @@ class _StepRequest:
 
     Attributes:
         step: The step.
-        from_ns: Time from which replies are accepted, in ns on the monotonic clock. The users
-            rest until then.
+        from_ns: Earliest time at which replies are accepted, in ns on the monotonic clock. The
+            users rest until then.
         replies: For each user who has completed the step, by name of the site, the answers and
             the number of the page that sent them.
     """
@@ -210,7 +211,7 @@ class _StepRequest:
 
 
 class Stage:
-    """Decides what the web pages of an experiment show before, during and after each trial.
+    """Decides the content of an experiment's web pages before, during and after each trial.
 
     In an experiment, people move robot arms over a network. Each trial is a session of its own.
     Between trials, the participants complete steps on their pages, such as a questionnaire. The
@@ -224,9 +225,9 @@ class Stage:
 
     Attributes:
         users: Names of the sites (processes, one per arm) whose arms the participants hold.
-        shows_ages: True if the pages first show how old the displayed poses of the other arms
-            are. It is False in a staircase, a procedure that asks participants for differences,
-            because the ages could reveal the answer.
+        shows_ages: True if the pages initially show the ages of the displayed poses of the
+            other arms. It is False in a staircase, a procedure that asks participants for
+            differences, because the ages could reveal the answer.
     """
 
     def __init__(self, plan: ExperimentPlan, clock: Clock) -> None:
@@ -289,7 +290,7 @@ class Stage:
         selects.
 
         Args:
-            entry: Result of the trial. None if it must be repeated.
+            entry: Result of the trial. `None` if the trial must be repeated.
             why: Reason for the repetition.
         """
         self._feedback = {"why": why, "measures": {}}
@@ -308,7 +309,7 @@ class Stage:
         self._phase = "over"
 
     def poll(self, view: SessionView, pages: Sequence[tuple[str, int]]) -> list[str]:
-        """Evaluates the new records of a trial, and notes which users have an open page.
+        """Evaluates the new records of a trial, and records which users have an open page.
 
         The server of the pages calls this method many times a second.
 
@@ -318,20 +319,19 @@ class Stage:
                 the page.
 
         Returns:
-            Texts that the log should keep as marks of this moment. Empty if no trial is
-            running.
+            Texts that mark this moment in the log. Empty if no trial is running.
         """
         now_ns = self._clock.monotonic_ns()
         request = self._request
 
-        # The first page of a site has the smallest number. Only this page counts.
+        # The first page of a site has the smallest number. Only the replies of this page count.
         self._holders = {}
         for site, number in pages:
             self._holders[site] = min(number, self._holders.get(site, number))
         self._page_seen_ns |= dict.fromkeys(self._holders, now_ns)
 
         if request is not None and request.step.kind == "trial":
-            # A user who leaves is not ready any more.
+            # A user who leaves is no longer ready.
             for site, (_, replying_page) in list(request.replies.items()):
                 if self._holders.get(site) != replying_page:
                     del request.replies[site]
@@ -358,7 +358,8 @@ class Stage:
             message: The message.
 
         Returns:
-            False if the message was not requested from that page. It has no effect then.
+            True if the message was accepted. False if it was not requested from that page and
+            has no effect.
         """
         is_holder = self._holders.get(site) == page
         if isinstance(message, AbortTrial):
@@ -384,7 +385,7 @@ class Stage:
     def _abort_trial(self, site: str, why: str) -> bool:
         """Aborts the running trial, which is repeated later. Returns False if no trial runs.
 
-        For example, the experimenter sees that a participant has misunderstood the task.
+        An example is an experimenter who sees that a participant has misunderstood the task.
 
         Args:
             site: Site of the user who aborts it. Empty for the experimenter.
@@ -398,15 +399,15 @@ class Stage:
         return True
 
     def describe(self, role: str, site: str, page: int, t_s: float | None) -> Json:
-        """Describes for a page what it must show of the experiment now.
+        """Describes the present content of a page of the experiment.
 
         The server of the page calls this for each message that it sends to the page.
 
         Args:
-            role: Role of the page: that of an experimenter, a user or a watcher.
+            role: Role of the page's user: experimenter, user of one arm, or watcher.
             site: Name of the site of the page's user. Empty if the page belongs to no user.
             page: Number of the page.
-            t_s: Time of the pose that the page shows, in s. None if it shows no arms.
+            t_s: Time of the pose that the page shows, in s. `None` if it shows no arms.
 
         Returns:
             The present phase, the requested step, the task, the users and further facts that
@@ -455,11 +456,11 @@ class Stage:
     def _describe_users(self, step: Step, done_sites: Collection[str]) -> list[Json]:
         """Describes the users for all pages: pseudonym, and whether they are present or done.
 
-        The experimenter sees there for whom the experiment waits.
+        The description tells the experimenter for whom the experiment waits.
 
         Args:
-            step: The step that they have to complete.
-            done_sites: Sites of the users who have completed it.
+            step: The step that the users have to complete.
+            done_sites: Sites of the users who have completed the step.
 
         Returns:
             An entry per user, whose "state" is "done", "here" or empty.
@@ -473,7 +474,7 @@ class Stage:
         return users
 
     def _describe_for_experimenter(self, step: Step) -> Json:
-        """Returns what only experimenters may see of the present step, such as the condition.
+        """Returns facts of the present step that only experimenters see, such as the condition.
 
         Participants who knew the condition might expect an effect.
 
@@ -493,13 +494,13 @@ class Stage:
         }
 
     def _describe_for_user(self, step: Step, site: str, page: int) -> Json:
-        """Returns what only the page of a participant shows, such as a questionnaire.
+        """Returns the content that only a participant's page shows, such as a questionnaire.
 
         Args:
             step: The present step.
             site: Site of the participant's arm.
-            page: Number of the page. Of several pages of one site only the first counts. The
-                field "second" tells the others so.
+            page: Number of the page. If a site has several pages, only the first counts, and
+                the field "second" is true for the others.
         """
         pseudonyms = dict(zip(self.users, step.planned.group, strict=True))
         fields: Json = {

@@ -2,14 +2,14 @@
 
 People watch and control the robot arms of a session on web pages. A new connection is called a
 stranger until the server knows the role of its user: experimenter, user of one arm, or watcher.
-Then the connection is called a page. The server limits the number of strangers and the number
-of pages, so that nobody can keep others out by opening many connections.
+After that, it is called a page. The server limits the numbers of strangers and pages, so that
+nobody can block others by opening many connections.
 
 Invariant:
     - Silent or slow connections and downloads count as strangers. If there are too many
-      strangers, the oldest one is closed for a new connection.
-    - The number of pages is limited for each role separately, so that many watchers do not take
-      the places of other roles.
+      strangers, the oldest is closed to admit a new connection.
+    - The number of pages is limited separately for each role, so that many watchers cannot
+      displace other roles.
     - A new page of an experimenter or a user is always accepted. If there are too many, the
       oldest page with the same role is closed. A page on which an experimenter controls the
       session is closed only if all experimenters' pages control it.
@@ -30,13 +30,13 @@ MAX_PAGES = {"experimenter": 4, "user": 2, "watcher": 12}
 
 
 class Strangers:
-    """The open connections for which it is not known yet what they want.
+    """The open connections of strangers, whose role is not known yet.
 
     Their number is limited. If there are too many, the oldest is closed, so that nobody can
-    keep others out with many silent connections.
+    block others with many silent connections.
 
     Args:
-        refused: Numbers of refusals by reason. Connections that are closed here are added.
+        refused: Number of refusals by reason. Connections that are closed here are added.
     """
 
     def __init__(self, refused: Counter[str]) -> None:
@@ -45,10 +45,10 @@ class Strangers:
         self._refused = refused
 
     def add(self, connection: ServerConnection) -> None:
-        """Adds a new connection. If there are too many, the oldest one is closed and counted.
+        """Adds a new connection. If there are too many, the oldest is closed and counted.
 
-        The oldest one has had the most time to say what it wants, so a flood of connections
-        cannot keep newcomers out.
+        The oldest connection has had the most time to prove its role, so a flood of connections
+        cannot block new ones.
 
         Args:
             connection: The new connection, whose role is not known yet.
@@ -63,13 +63,13 @@ class Strangers:
     def remove(self, connection: ServerConnection) -> None:
         """Removes a connection that was closed, or whose web page has proved its role.
 
-        A connection that is not in the list changes nothing.
+        If the connection is not in the list, nothing happens.
         """
         self._connections.pop(connection, None)
 
 
 class _SeatedPage(Protocol):
-    """Describes the fields of an open web page by which the server limits the number of pages.
+    """Describes the fields of an open web page that are needed to limit the number of pages.
 
     The class `page_server.Page` has these fields.
 
@@ -88,7 +88,7 @@ Page = TypeVar("Page", bound=_SeatedPage)
 
 
 def is_full(pages: Iterable[_SeatedPage], role: Role) -> bool:
-    """Returns True if as many web pages of a role are open as are allowed.
+    """Returns True if no further web page of a role may be opened.
 
     Args:
         pages: The open pages of all roles.
@@ -99,7 +99,7 @@ def is_full(pages: Iterable[_SeatedPage], role: Role) -> bool:
 
 
 def choose_page_to_close(pages: Iterable[Page], role: Role) -> Page | None:
-    """Returns the open page that must be closed so that another page can be opened.
+    """Returns the open page that must be closed before another page can be opened.
 
     The number of pages is limited for each role: experimenter, user of an arm, or watcher. The
     oldest page of the role is closed.
@@ -109,7 +109,7 @@ def choose_page_to_close(pages: Iterable[Page], role: Role) -> Page | None:
         role: Role of the new page.
 
     Returns:
-        The page to close. None if there is room for the new page.
+        The page to close. `None` if there is room for the new page.
     """
     role_pages = _list_pages_of_role(pages, role)
     if len(role_pages) < MAX_PAGES[role.kind]:

@@ -1,10 +1,10 @@
-"""Selects the files that the server of the web page sends: the page and the results.
+"""Selects the files that the web server sends: the page and the results.
 
 The results are the log of the session and the report that is computed from it. They are offered
 for download on the page when the session has ended.
 
 Invariant:
-    - A page runs scripts of its own server only. A report runs its own scripts, isolated from
+    - A page runs only scripts from its own server. A report runs its own scripts, isolated from
       the page, because it may come from somebody else's log.
     - Nobody can guess the address of a report or a log.
 """
@@ -75,7 +75,7 @@ class PageFiles:
             path: Path of the requested address.
 
         Returns:
-            The response of the server, with the content of the file. None if there is no such
+            The response of the server, with the content of the file. `None` if there is no such
             file.
         """
         result = self.results.get(path)
@@ -106,7 +106,7 @@ def _list_assets() -> dict[str, tuple[str, bytes]]:
     assets = {}
     for file in [*page_assets, *plot_assets]:
         address = "/" + file.name
-        # The end of the name follows the last "." or "-", as in "uPlot-LICENSE".
+        # The suffix follows the last "." or "-" of the name, as in "uPlot-LICENSE".
         _, _, behind_dot = file.name.rpartition(".")
         _, _, ending = behind_dot.rpartition("-")
         media_type = _KINDS.get(ending)

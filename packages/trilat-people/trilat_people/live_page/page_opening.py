@@ -1,10 +1,12 @@
 """Opens a browser at a link that contains a secret token.
 
-The link leads to the page on which people watch and control a session of robot arms. Whoever
-knows the token can take part in the session. Other users of the same machine must not see it.
+The link leads to the page on which people watch and control a session of robot arms. Anybody
+who knows the token can take part in the session, so other users of the same machine must not
+see it.
 
 Invariant:
-    - The token is in no command line, because every user of the machine can list these.
+    - The token never appears in a command line, because every user of the machine can list
+      command lines.
     - The browser opens a file that only its user can read, and that redirects to the link. The
       file is removed once the page is open.
 """
@@ -33,10 +35,10 @@ class BrowserOpening:
         self._folder: Path | None = None
 
     def open(self) -> None:
-        """Opens a browser at the secret link of a page, by a file that redirects to the link.
+        """Opens a browser at the secret link of a page, through a file that redirects to it.
 
-        If there is no browser, or the file cannot be written, nothing happens, as the link is
-        printed for the user anyway.
+        If there is no browser, or the file cannot be written, nothing happens, because the link
+        is also printed for the user.
         """
         # A RuntimeError means that the user has no home directory.
         with suppress(OSError, webbrowser.Error, RuntimeError):
@@ -67,7 +69,7 @@ class BrowserOpening:
     def remove_file(self) -> None:
         """Removes the temporary file with the secret link of a page.
 
-        It is called once the browser has opened the page, or when the server ends.
+        The method is called once the browser has opened the page, or when the server ends.
         """
         if self._folder is not None:
             shutil.rmtree(self._folder, ignore_errors=True)

@@ -8,12 +8,12 @@ that each control one arm, and receives their replies.
 
 Invariant:
     - A valid message has one of the types below, finite numbers in range, and names that the
-      session contains. Any other message, and any that exceeds the rate of its type, is counted
-      and dropped.
-    - Of several requests that wait and change the same network link, only the newest is sent.
-      The same holds for the weights with which a site follows the other arms.
+      session contains. Any other message, and any message that exceeds the rate of its type, is
+      counted and dropped.
+    - If several waiting requests change the same network link, only the newest is sent. The
+      same applies to the weights with which a site follows the other arms.
     - Only one request at a time waits for the reply of a site. A request to stop the arm does
-      not wait for this, but is sent at once. Every role may send it.
+      not wait, but is sent at once, and every role may send it.
     - The address of a page contains a secret token, which grants a role and, to a user, a site.
       The rest of the address may lower the role, but never raise it.
 """
@@ -53,9 +53,9 @@ MAX_PENDING = 256
 TOKEN_BYTES = 16
 """Size of a link's token."""
 RELEASE = "release"
-"""Subject of waiting orders that let an arm follow again or end its fault."""
+"""Subject of waiting orders that let an arm follow again or clear its fault."""
 MIN_RAMP_S = 0.25
-"""Duration of a change of dominance factors that somebody drags with the mouse, in s."""
+"""Duration of a change of dominance factors that a user drags with the mouse, in s."""
 
 Name = Annotated[str, Meta(max_length=64)]
 Numbers = Annotated[list[float], Meta(max_length=12)]
@@ -69,7 +69,7 @@ class PageMessage(
     """Base class of the messages that a page sends to its server.
 
     The field `do` of the JSON text names the kind of message, for example {"do": "mark",
-    "text": "contact"}. Unknown fields are refused.
+    "text": "contact"}. Unknown fields are rejected.
     """
 
     @staticmethod
@@ -97,7 +97,7 @@ class PageMessage(
 
 
 class Seen(PageMessage, frozen=True, kw_only=True, tag="seen"):
-    """Message of a web page that it has drawn a state, so that the next one can be sent.
+    """Message of a web page that it has drawn a frame, so that the next frame can be sent.
 
     The server describes the present state of the session in messages called frames.
 
@@ -119,7 +119,7 @@ class TakePart(PageMessage, frozen=True, kw_only=True, tag="control"):
 
 
 class AnswerPage(PageMessage, frozen=True, kw_only=True, tag="answer"):
-    """Reply of a page to another page that asks for control of the session.
+    """Reply of a page to another page that has asked for control of the session.
 
     A page with control may move arms and change settings. The pages that hold an arm at present
     must allow another page to take part.
@@ -134,9 +134,9 @@ class AnswerPage(PageMessage, frozen=True, kw_only=True, tag="answer"):
 
 
 class StopArms(PageMessage, frozen=True, kw_only=True, tag="stop"):
-    """Request of a web page to stop all arms at once. Everybody may send it, also a watcher.
+    """Request of a web page to stop all arms at once. Everybody may send it, even a watcher.
 
-    The session continues: the arms come to rest until somebody releases them.
+    The session continues: the arms rest until somebody releases them.
     """
 
 
@@ -144,7 +144,8 @@ class ReleaseArms(PageMessage, frozen=True, kw_only=True, tag="release"):
     """Request of a web page to let stopped arms move again, or to reset arms after a fault.
 
     Attributes:
-        order: "enable" to let stopped arms follow the other arms again, "reset" to end faults.
+        order: "enable" to let stopped arms follow the other arms again, "reset" to clear
+            faults.
         sites: Names of the processes ("sites") that control these arms.
     """
 
@@ -194,7 +195,7 @@ class MarkMoment(PageMessage, frozen=True, kw_only=True, tag="mark"):
 class ShowAges(PageMessage, frozen=True, kw_only=True, tag="ages"):
     """Request of a page to show or hide the age of displayed poses on the pages of users.
 
-    The network delays what users see of the other arms. The age is this delay.
+    The network delays the users' view of the other arms. The age is this delay.
 
     Attributes:
         shown: True to show the ages, False to hide them.
@@ -209,8 +210,8 @@ class MoveHand(PageMessage, frozen=True, kw_only=True, tag="hand"):
     Attributes:
         site: Name of the process ("site") that controls the arm.
         grip: True to hold the arm, False to release it.
-        to: Where the arm is pulled: the position of the end effector in m, or the joint
-            positions in rad. For an arm that is pushed instead, the force in N.
+        to: Target to which the arm is pulled: the position of the end effector in m, or the
+            joint positions in rad. For an arm that is pushed instead, it is the force in N.
     """
 
     site: Name
@@ -232,8 +233,8 @@ class DoStep(PageMessage, frozen=True, kw_only=True, tag="step"):
 
     Attributes:
         key: Key of the step, as the server sent it to the page.
-        answers: Answers to a questionnaire, in the order of its items. None for an item without
-            an answer.
+        answers: Answers to a questionnaire, in the order of its items. A missing answer is
+            `None`.
     """
 
     key: Name
@@ -267,7 +268,7 @@ _RATES: dict[type[PageMessage], tuple[float, int]] = {
 }
 """Largest mean rate of a page's messages of each kind, in 1/s, and largest burst.
 
-`PageMessage` stands for all kinds together.
+The entry of `PageMessage` applies to all kinds together.
 """
 
 
@@ -275,8 +276,8 @@ _RATES: dict[type[PageMessage], tuple[float, int]] = {
 class _TokenBucket:
     """State of a limit on a message rate, by the method of the token bucket.
 
-    Tokens are added at the allowed rate, up to the largest burst. Each message removes one. A
-    message that finds no token exceeds the limit.
+    Tokens are added at the allowed rate, up to the largest burst. Each message removes one
+    token. If there is no token, the message exceeds the limit.
 
     Attributes:
         tokens: Number of tokens in the bucket.
@@ -290,8 +291,8 @@ class _TokenBucket:
 class MessageLimits:
     """Limits how many messages a web page may send, per kind of message and in total.
 
-    A page that sends more messages than a person can cause is faulty or hostile. The messages
-    in excess are dropped.
+    A page that sends more messages than a person can cause is faulty or hostile. The excess
+    messages are dropped.
     """
 
     def __init__(self) -> None:
@@ -302,15 +303,15 @@ class MessageLimits:
     def allows(self, kind: type[PageMessage], now_ns: int) -> bool:
         """Returns True if a message of a page is within the allowed rate, and counts it.
 
-        The rate is limited by the method of the token bucket. A message needs a token. Tokens
-        are added at the allowed rate, up to the largest burst.
+        The rate is limited by the method of the token bucket: each message needs a token, and
+        tokens are added at the allowed rate, up to the largest burst.
 
         Args:
             kind: Kind of the message.
             now_ns: Present time on the monotonic clock, in ns.
 
         Returns:
-            False if the page has sent too many messages and this one must be dropped.
+            False if the page has sent too many messages, and this message must be dropped.
         """
         if kind not in _RATES:
             return True
@@ -332,7 +333,7 @@ class MessageLimits:
 
 @dataclass(frozen=True, slots=True)
 class Role:
-    """The rights of a person at a web page, and the arm from whose side the page shows all.
+    """The rights of a person at a web page, and the arm whose user's view the page shows.
 
     Attributes:
         kind: An experimenter may do everything, a user may hold the arm of one site, and a
@@ -347,7 +348,7 @@ class Role:
     def may(self, message: PageMessage) -> bool:
         """Returns True if a person with this role has the right to send a message.
 
-        An experimenter may send every message. A user may move the own arm and reply in an
+        An experimenter may send every message. A user may move their own arm, and reply in an
         experiment. Everybody may stop the arms.
 
         Args:
@@ -365,7 +366,7 @@ class Role:
 
     @property
     def noun(self) -> str:
-        """Who uses a web page, as events of the session call the person: "the user of m1"."""
+        """Name of a web page's user in events of the session, such as "the user of m1"."""
         if self.kind == "experimenter":
             return "the experimenter"
         if self.kind == "user":
@@ -376,8 +377,8 @@ class Role:
     def query(self) -> str:
         """Part of a web page's address that states the role of its user, such as "as=m1".
 
-        "as=m1" is the role of the user of the arm m1, and "watch" that of a watcher. The text
-        is empty for an experimenter.
+        "as=m1" is the role of the user of the arm m1, and "watch" is the role of a watcher. The
+        text is empty for an experimenter.
         """
         fields: list[str] = []
         if self.kind == "watcher":
@@ -388,18 +389,18 @@ class Role:
 
 
 class RoleLinks:
-    """Makes the links that open a page, and finds out which role a link grants.
+    """Creates the links that open a page, and determines the role that a link grants.
 
     A link contains a secret token, so that only those who received it can open the page. A
     token is needed on this machine too, because other users of the machine can connect. The
-    token of a role is computed from a random secret, so that it need not be stored.
+    token of a role is computed from a random secret, so it need not be stored.
     """
 
     def __init__(self) -> None:
         self._secret = secrets.token_bytes(TOKEN_BYTES)
 
     def link(self, address: str, role: Role) -> str:
-        """Makes the link under which the page of a role can be opened.
+        """Creates the link that opens the page of a role.
 
         The secret token is in the fragment of the link, the part after #, which a browser does
         not send to other servers.
@@ -415,14 +416,14 @@ class RoleLinks:
     def find(self, query: str) -> Role | None:
         """Returns the role that a link grants to the page that was opened with it.
 
-        The link contains a secret token of its role. An experimenter may use a lower role, for
-        example to see what the user of an arm sees.
+        The link contains the secret token of its role. An experimenter may choose a lower role,
+        for example to see the view of an arm's user.
 
         Args:
             query: Query part of the page's request, with the token.
 
         Returns:
-            The role. None if the token is not that of any role.
+            The role. `None` if the token does not belong to any role.
         """
         fields = parse_qs(query, keep_blank_values=True)
         token = fields.get("token", [""])[0]
@@ -454,7 +455,7 @@ class RoleLinks:
     def _is_token(self, token: str, role: Role) -> bool:
         """Returns True if a secret text from a link (token) gives the rights of a role.
 
-        The comparison takes the same time for any token, so that nobody can guess one by
+        The comparison takes the same time for any token, so that no token can be guessed by
         timing.
         """
         role_token = self._make_token(role)
@@ -468,8 +469,8 @@ class RoleLinks:
 class PageHands:
     """Moves the arms that the person at one page holds.
 
-    The messages of the page serve as heartbeat: if they stop, for example because the page was
-    closed, the site releases the arm.
+    The messages of the page serve as a heartbeat: if they stop, for example because the page
+    was closed, the site releases the arm.
 
     Args:
         bus: Network connection that reaches the session.
@@ -489,7 +490,7 @@ class PageHands:
     def move(self, order: MoveHand, *, pushes: bool) -> None:
         """Moves the arm of a site as the person at the page requests, or releases the arm.
 
-        A message with a grip holds the arm, and one without it releases the arm.
+        A message with `grip` set holds the arm, and any other message releases it.
 
         Args:
             order: Message of the page, with the name of the site and the target or force.
@@ -517,7 +518,7 @@ class PageHands:
     def release(self) -> None:
         """Releases all arms that the user of a web page moves.
 
-        This happens for example when the page is closed.
+        This happens, for example, when the page is closed.
         """
         for site in list(self._held_sites):
             message = MoveHand(site=site, grip=False)
@@ -528,8 +529,8 @@ class PageHands:
 
         Args:
             site: Name of the site.
-            source: Number of the holder, as the newest record of the site states it. 0 if
-                nobody holds the arm.
+            source: Number of the holder, from the newest record of the site. 0 if nobody holds
+                the arm.
         """
         sender = self._senders.get(site)
         if source == 0 or sender is None:
@@ -543,7 +544,7 @@ class _OpenQuery(NamedTuple):
     Attributes:
         inbox: Inbox that receives the reply.
         sent_ns: Time of sending on the monotonic clock, in ns.
-        request: The request, to repeat it in another form if an older site refuses it.
+        request: The request, which is repeated in another form if an older site rejects it.
     """
 
     inbox: Inbox
@@ -561,8 +562,8 @@ class OrderDesk:
         bus: Network connection that reaches the session.
         clock: Clock of this process.
         session: Name of the session.
-        refused: Numbers of refused orders by reason, to which this object adds. None to begin a
-            new count.
+        refused: Number of refused orders by reason, to which this object adds. If `None`, a new
+            count begins.
 
     Attributes:
         replies: Replies that have not been read yet. Each contains the name of the site, the
@@ -590,15 +591,16 @@ class OrderDesk:
     ) -> None:
         """Queues a request to change the settings of a link, or the weights of a site.
 
-        A slider of a page sends many values. Therefore a request replaces a waiting one about
-        the same link or site. A request about an unknown link or site is refused and counted.
+        A slider of a page sends many values. Therefore, a request replaces a waiting request
+        about the same link or site. A request about an unknown link or site is refused and
+        counted.
 
         Args:
             order: New settings of a link, or new dominance factors, which are the weights with
                 which a site follows the other sites.
             sites: Names of the sites of the session.
             links: Names of the links of the session.
-            source: Who sends the request, for the site's event.
+            source: Sender of the request, for the site's event.
         """
         if isinstance(order, SetLink):
             if order.link not in links:
@@ -626,7 +628,7 @@ class OrderDesk:
 
         Args:
             sites: Names of the sites.
-            source: Who sends the request, for the sites' events.
+            source: Sender of the request, for the sites' events.
         """
         stop = ChangeRequest(order="stop")
         request = _add_source(stop, source)
@@ -657,11 +659,11 @@ class OrderDesk:
         """Queues a request, which replaces a waiting request about the same subject.
 
         A slider of a page sends many values, of which only the latest matters. A request about
-        a new subject is dropped if too many wait.
+        a new subject is dropped if too many requests wait.
 
         Args:
             site: Name of the site.
-            subject: What the request is about, for example the name of a link.
+            subject: Subject of the request, for example the name of a link.
             request: The request.
         """
         is_replacement = (site, subject) in self._pending
@@ -699,8 +701,8 @@ class OrderDesk:
         """Receives the replies of the sites to earlier requests, and sends requests that wait.
 
         The requests are changes of the session, for example a new delay. A site receives one
-        request at a time, and the next one after its reply. If a site does not reply in time,
-        `replies` receives an entry that says so.
+        request at a time, and the next request after its reply. If a site does not reply in
+        time, an entry that states this is added to `replies`.
         """
         now_ns = self._clock.monotonic_ns()
         # A copy of the items, because answered requests are removed.
@@ -729,9 +731,9 @@ class OrderDesk:
     ) -> None:
         """Stores the reply of a site to a request, so that web pages can show it.
 
-        A refused stop is repeated in an older form: a site of an older program does not know
-        the field `source` and refuses the whole request, but its arm must stop too. A reply
-        that cannot be decoded is counted.
+        A refused stop is repeated in an older form: a site that runs an older program does not
+        know the field `source` and rejects the whole request, but its arm must also stop. A
+        reply that cannot be decoded is counted.
         """
         try:
             reply = decode(payload, ChangeReply)
@@ -749,17 +751,17 @@ class OrderDesk:
 
 
 def _add_source(request: ChangeRequest, source: str) -> ChangeRequest:
-    """Returns a request that says who sent it. With an empty source it stays as it is."""
+    """Returns a request that names its sender, or the same request if the source is empty."""
     if not source:
         return request
     return msgspec.structs.replace(request, source=source)
 
 
 def _make_link_request(order: SetLink) -> ChangeRequest:
-    """Returns the request that changes the settings of a link as a page wants it.
+    """Returns the request that changes the settings of a link as requested by a page.
 
-    The page sets a delay and its standard deviation. Unless it names a preset, a delay with a
-    deviation becomes a gamma distribution, and a delay without one is constant.
+    The page sets a delay and its standard deviation. Unless the page names a preset, a delay
+    with a deviation becomes a gamma distribution, and a delay without a deviation is constant.
     """
     settings: dict[str, Any] = dict(order.to)
     sets_delay = "preset" not in settings and "delay_ms" in settings
@@ -776,5 +778,5 @@ def _make_link_request(order: SetLink) -> ChangeRequest:
 
 
 def _is_zero(value: float | str) -> bool:
-    """Returns True if a setting is the number 0. A text is not; the site will refuse it."""
+    """Returns True if a setting is the number 0. A text, which the site will reject, is not."""
     return str(value) in ("0.0", "-0.0")

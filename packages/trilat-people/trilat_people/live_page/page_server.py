@@ -11,13 +11,14 @@ session after the other, and a `Stage` controls the steps around them. If the ma
 browser, the server opens it.
 
 Invariant:
-    - A page receives a frame only when it has drawn an earlier one. A slow page therefore sees
-      fewer frames, and nobody waits for it. Each frame has the newest state.
+    - A page receives a frame only when it has drawn an earlier frame. A slow page therefore
+      sees fewer frames, and no other part of the program waits for it. Each frame has the
+      newest state.
     - Requests from pages of another web site, requests without a token, and messages that are
-      too many, too large or not allowed for the page's role are refused and counted. None of
-      their contents reaches a site.
+      too many, too large or not allowed for the page's role are refused and counted. Their
+      contents never reach a site.
     - The number of pages of each role is limited, see `page_entrance`.
-    - One thread serves all pages and receives the session's messages. Therefore no locks are
+    - One thread serves all pages and receives the session's messages. Therefore, no locks are
       needed.
 """
 
@@ -94,7 +95,7 @@ The priority is above the normal priority, and below that of the sites.
 FRAMES_PER_S = 30
 """Rate of the frames, in 1/s."""
 FRAMES_AHEAD = 2
-"""Largest number of frames that a page has not drawn yet: one travels while one is drawn."""
+"""Largest number of undrawn frames of a page: one is in transit while one is drawn."""
 MAX_EXCESS = 1_000
 """Number of messages beyond the allowed rate after which a page is closed."""
 REQUEST_TIMEOUT_S = 3.0
@@ -104,11 +105,11 @@ ANSWER_TIMEOUT_NS = 10_000_000_000
 RESTART_S = 1.0
 """Time between a failure of the server and its restart, in s."""
 SWITCH_POLL_NS = 10_000_000
-"""Time between two checks whether another session is shown, in ns."""
+"""Time between two checks for a request to show another session, in ns."""
 WAITING_FRAME_STEP = 10
 """Number of frame periods between two frames before a session begins."""
 POINTS_PER_FRAME = 240
-"""Largest number of points of the plots in a frame. A page that was away longer has a gap."""
+"""Largest number of plot points in a frame. After a longer absence, the plots have a gap."""
 _POLICY_VIOLATION = 1008
 """Code with which the server closes a socket (RFC 6455)."""
 _BROKEN = {1002: "broken frames", 1007: "no text", 1009: "too large"}
@@ -119,7 +120,7 @@ _SILENT.propagate = False
 """Logger of the WebSocket library. It prints nothing, because strangers could flood it."""
 
 RESULTS_TIMEOUT_NS = 600_000_000_000
-"""Longest time for which an open page can load the report and the log, in ns."""
+"""Time after the session for which an open page can load the report and the log, in ns."""
 MAX_DURATION_S = 3600.0
 """Longest duration of a session with a page, in s, unless the user sets another duration."""
 
@@ -134,7 +135,7 @@ class _Visitor(ServerConnection):
 
     Attributes:
         refused: Numbers of refused connections and messages, by reason.
-        strangers: Connections that are open but do not belong to a web page yet.
+        strangers: Open connections that do not belong to a web page yet.
     """
 
     refused: Counter[str]
@@ -143,7 +144,7 @@ class _Visitor(ServerConnection):
     _is_counted = False
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
-        """Counts a new connection as that of a stranger, until its page has proved its role.
+        """Counts a new connection as a stranger until its page has proved its role.
 
         Args:
             transport: The connection.
@@ -155,21 +156,21 @@ class _Visitor(ServerConnection):
         """Removes a closed connection from the strangers (connections without a role).
 
         Args:
-            exc: Reason why it was closed. None if it was closed in order.
+            exc: Error that closed the connection. `None` if it was closed normally.
         """
         self.strangers.remove(self)
         super().connection_lost(exc)
 
     def data_received(self, data: bytes) -> None:
-        """Processes data of the browser, and notes that this connection has sent some.
+        """Processes data of the browser, and records that this connection has sent data.
 
-        Browsers open connections in advance and close some of them unused. The note
+        Browsers open connections in advance and close some of them unused. The record
         distinguishes these from connections whose data were not a valid request.
 
         Args:
             data: The received bytes.
         """
-        # Browsers open connections in advance and close some unused; those are not counted.
+        # Connections that browsers open in advance and close unused are not counted.
         self._has_received = True
         super().data_received(data)
 
@@ -191,7 +192,7 @@ class _Visitor(ServerConnection):
 
 
 class Page:
-    """State of one page that is open in a browser: its rights, and what was sent to it.
+    """State of one page that is open in a browser: its rights, and the data sent to it.
 
     The server sends frames, messages from which the page draws the session. A frame describes
     the present state. Therefore a slow page may miss some frames.
@@ -203,11 +204,11 @@ class Page:
         hands: Connections with which the page holds and moves arms.
         takes_part: True if the page may give orders.
         asks: The other pages that must allow this page to take part, and the time of its
-            request in ns. None if the page has not requested it.
+            request in ns. `None` if the page has not asked to take part.
         wake: Event that is set when there is a frame that the page has not received.
         drawn: Number of the last frame that the page has drawn.
         sent: Number of the last frame that was sent to the page.
-        notified: Number of the frame that was sent before the last one.
+        notified: Number of the frame that was sent before the last frame.
         unseen: Numbers of the frames that were sent but not drawn yet.
         points: Number of points of the plots that the page has received.
         energies: Number of points of the energy plot that the page has received.
@@ -240,7 +241,7 @@ class Page:
         self.notified = 0
         self.unseen: deque[int] = deque()
 
-        # What the page has received of growing lists.
+        # Numbers of entries of growing lists that the page has received.
         self.points = 0
         self.energies = 0
         self.events = 0
@@ -256,11 +257,11 @@ class PageOptions:
 
     Attributes:
         host: Address at which the server listens.
-        port: Port at which the server listens. 0 chooses any free port.
+        port: Port at which the server listens. If 0, any free port is chosen.
         insecure: True if the user allows an address outside this machine without encryption.
         opens: True to open a browser, if there is one.
-        tls: Folder with the keys of a member of the session, which are used for encryption.
-            None for no encryption.
+        tls: Folder with the keys of a member of the session, which are used for encryption. If
+            `None`, connections are not encrypted.
     """
 
     host: str = "127.0.0.1"
@@ -270,10 +271,10 @@ class PageOptions:
     tls: Path | None = None
 
     def make_context(self) -> ssl.SSLContext | None:
-        """Returns the TLS settings by which connections to browsers are encrypted.
+        """Returns the TLS settings with which connections to browsers are encrypted.
 
         Returns:
-            The settings, with the certificate and the private key from the folder `tls`. None
+            The settings, with the certificate and the private key from the folder `tls`. `None`
             if the connections are not encrypted.
 
         Raises:
@@ -288,7 +289,7 @@ class PageOptions:
         return context
 
     def check(self) -> None:
-        """Checks that the server can listen at the address, and that the user accepts its risk.
+        """Checks that the server can listen at the address, and that the user accepts the risk.
 
         An address outside this machine must be encrypted, or declared as `insecure`.
 
@@ -323,10 +324,10 @@ class PageServer:
         bus: Network connection that reaches the session.
         clock: Clock of this process.
         session: Name of the session.
-        options: How the page is served.
+        options: Address, encryption and further options of the server.
         ends: True if experimenters may end the session from their page.
         say: Function that prints a line for the user.
-        stage: The steps of an experiment with people. None if there is no experiment.
+        stage: The steps of an experiment with people. `None` if there is no experiment.
 
     Attributes:
         address: Link for an experimenter, with its token.
@@ -436,7 +437,7 @@ class PageServer:
         """Shows the session that the last call of `show` requested.
 
         Only the thread of the server uses the state of a session. `show` runs in another
-        thread, and waits until this method has switched, also if it fails.
+        thread, and waits until this method has switched or failed.
         """
         if self._next_session is not None:
             bus, session = self._next_session
@@ -448,9 +449,9 @@ class PageServer:
     def _switch_session(self, bus: Bus, session: str) -> None:
         """Observes another session, and makes all pages receive its state from the beginning.
 
-        A page remembers how many points of the plots and how many events it has received, so
-        that it is sent only new ones. These numbers restart at 0 for the new session, and each
-        page is sent the constants of the new session again ("greeted").
+        For each page, the numbers of plot points and events that it has received are stored, so
+        that only new ones are sent. These numbers restart at 0 for the new session, and each
+        page is sent the constants of the new session ("greeted").
 
         Args:
             bus: Network connection that reaches the session.
@@ -479,8 +480,8 @@ class PageServer:
     def _run(self) -> None:
         """Runs the server in its thread until the end, and restarts it after a failure.
 
-        A failure before the server was ready is kept for `__enter__`, which raises it, because
-        the user must know that there is no page.
+        A failure before the server was ready is stored for `__enter__`, which raises it,
+        because the user must know that there is no page.
         """
         raise_priority(NICE)
         while not self._ending.is_set() and self._problem is None:
@@ -497,14 +498,14 @@ class PageServer:
             self._ready.set()
 
     def report_refusals(self) -> None:
-        """Prints how many messages and requests of pages were refused, a line per reason."""
+        """Prints the number of refused messages and requests of pages, one line per reason."""
         for reason, count in sorted((+self.refused).items()):
             self._say(f"the page refused {count_nouns(count, 'message')} or requests: {reason}")
 
     def _count_failure(self, part: str, error: Exception) -> None:
         """Counts an error of the web server, and prints the first error of each kind.
 
-        The server takes no part in the control of the arms, and continues after any error.
+        The server is not involved in the control of the arms, and continues after any error.
 
         Args:
             part: Part of the page that failed, for example "frame".
@@ -518,10 +519,10 @@ class PageServer:
                 self._say(f"the page continues, though its {reason}: {error}")
 
     async def _serve(self) -> None:
-        """Accepts connections of browsers and serves web pages, until the server shall end.
+        """Accepts connections of browsers and serves web pages until the server has to end.
 
-        It sets `address`, the link with the port that was chosen, and then reports that it is
-        ready.
+        The method sets `address`, the link with the port that was chosen, and then reports that
+        it is ready.
         """
         self._loop = asyncio.get_running_loop()
         self._stop = asyncio.Event()
@@ -540,7 +541,7 @@ class PageServer:
             max_queue=32,
             compression=None,
             ping_interval=5,
-            # Long, because the page of a busy machine is slow and not dead.
+            # This time is long, because on a busy machine the page is slow but still alive.
             ping_timeout=30,
             open_timeout=REQUEST_TIMEOUT_S,
             close_timeout=1,
@@ -565,7 +566,7 @@ class PageServer:
     def _print_links(self) -> None:
         """Prints the links with which users and watchers can open their pages.
 
-        Users are those who hold a master arm, or the participants of an experiment. The links
+        Users are people who hold a master arm, or the participants of an experiment. The links
         are printed once, when the scenario that names the arms is known.
         """
         scenario = self.view.scenario
@@ -588,7 +589,7 @@ class PageServer:
             self._say(f"{name}: {self._links.link(self._base_address, role)}")
 
     async def _tick(self) -> None:
-        """Receives the session's messages and offers pages its state, 30 times a second.
+        """Receives the session's messages and gives pages its state, 30 times a second.
 
         If one step fails, the failure is counted, and the other steps continue.
         """
@@ -655,7 +656,7 @@ class PageServer:
         The WebSocket library calls this function for each request, before it opens a WebSocket.
 
         Returns:
-            The response with a file or an error. None to open a WebSocket.
+            The response with a file or an error. `None` to open a WebSocket.
         """
         try:
             target = urlsplit(request.path)
@@ -679,10 +680,10 @@ class PageServer:
         return response or connection.respond(HTTPStatus.NOT_FOUND, "there is no such file\n")
 
     def _find_refusal(self, request: Request, query: str) -> str | None:
-        """Returns the reason why a request must be refused. Returns None if it is accepted.
+        """Returns the reason why a request must be refused, or `None` if it is accepted.
 
-        Requests that come from pages of other web sites, for example, could move an arm without
-        its user's knowledge.
+        For example, requests from pages of other web sites could move an arm without its user's
+        knowledge.
 
         Args:
             request: The request.
@@ -704,8 +705,8 @@ class PageServer:
     async def _serve_page(self, connection: ServerConnection) -> None:
         """Exchanges messages with one web page until its connection ends.
 
-        The page of a user may move its arm at once. The page of an experimenter controls the
-        session if no other page of an experimenter does.
+        The page of a user may move the user's arm at once. The page of an experimenter controls
+        the session if no other experimenter's page does.
         """
         assert connection.request is not None
         role = self._links.find(urlsplit(connection.request.path).query)
@@ -742,7 +743,7 @@ class PageServer:
             self._pages.discard(page)
 
     def _close_page_for(self, role: Role) -> None:
-        """Closes an older web page of a role if no more pages of this role may be open.
+        """Closes an older web page of a role if the number of these pages is at its limit.
 
         The arms that the person at the closed page holds are released.
 
@@ -764,10 +765,10 @@ class PageServer:
         task.add_done_callback(self._closing.discard)
 
     def _receive(self, page: Page, text: str | bytes) -> None:
-        """Decodes and handles a message of a web page, unless the page sends too many.
+        """Decodes and handles a message of a web page, unless the page sends too many messages.
 
-        A message that releases an arm is always handled, because holding the arm could be
-        dangerous.
+        A message that releases an arm is always handled, because continuing to hold the arm
+        could be dangerous.
         """
         now_ns = self._clock.monotonic_ns()
         if not page.limits.allows(PageMessage, now_ns):
@@ -788,11 +789,11 @@ class PageServer:
             self._count_failure("message", error)
 
     def _handle_message(self, page: Page, message: PageMessage) -> None:
-        """Carries out the request of a page's message, if the page has the right to it.
+        """Carries out the request in a page's message if the page has the right to it.
 
         A request without the right is counted as refused, with the reason. The right depends on
-        the role of the person, for example a watcher. Most requests also need a page that takes
-        part, which means that it may move arms and change settings.
+        the role of the person, for example a watcher. Most requests also require that the page
+        takes part, which means that it may move arms and change settings.
 
         Args:
             page: The page.
@@ -800,7 +801,7 @@ class PageServer:
         """
         if not page.role.may(message):
             self.refused["not of its role"] += 1
-        # Requests of every page, whether it takes part or not.
+        # Requests that are allowed for every page, whether it takes part or not.
         elif isinstance(message, Seen):
             self._note_drawn_frame(page, message.n)
         elif isinstance(message, StopArms):
@@ -815,9 +816,9 @@ class PageServer:
             self._control_session(page, message)
 
     def _note_drawn_frame(self, page: Page, frame_number: int) -> None:
-        """Notes that a web page has drawn a state of the arms, and can receive newer ones.
+        """Records that a web page has drawn a frame, and can receive newer frames.
 
-        A slow browser is thereby not flooded.
+        A slow browser is thus not flooded.
 
         Args:
             page: The page.
@@ -888,14 +889,14 @@ class PageServer:
     def experimenters(self) -> set[Page]:
         """The open web pages of experimenters.
 
-        Those of them that take part control the session.
+        The pages that take part control the session.
         """
         return {page for page in set(self._pages) if page.role.kind == "experimenter"}
 
     def _answer_request(self, page: Page, answer: AnswerPage) -> None:
         """Applies the answer of a page to another page's request to control the session.
 
-        An answer to a request that does not exist, or that was put to other pages, is counted
+        An answer to a request that does not exist, or that was sent to other pages, is counted
         as refused.
 
         Args:
@@ -913,10 +914,10 @@ class PageServer:
         self.refused["was not asked"] += 1
 
     def _settle_requests(self) -> None:
-        """Decides on requests for the control of a session that nobody has answered in time.
+        """Decides on requests for control of a session that were not answered in time.
 
-        A page receives the control if the asked pages have gone, or if the time is over and
-        they no longer hold an arm.
+        A page receives control if the asked pages were closed, or if the time is over and they
+        no longer hold an arm.
         """
         now_ns = self._clock.monotonic_ns()
         for page in self._pages:
@@ -933,8 +934,8 @@ class PageServer:
     def _list_held_sites(self, page: Page) -> list[str]:
         """Lists the arms that the person at a web page holds, by the names of their sites.
 
-        Only the records of sites (arm controllers) say who holds an arm. Before the first
-        record the list is empty.
+        The holder of an arm is only known from the records of its site (arm controller). Before
+        the first record, the list is empty.
         """
         sites = (self._frame or {}).get("sites", {})
         held_sites: list[str] = []
@@ -944,10 +945,10 @@ class PageServer:
         return held_sites
 
     async def _send(self, page: Page) -> None:
-        """Sends a web page the newest state, each time the page has drawn an earlier one.
+        """Sends a web page the newest frame each time the page has drawn an earlier frame.
 
         The first message is a greeting with the constants of the session. A page for a site
-        that the session does not have is closed. The coroutine ends with the connection.
+        that is not in the session is closed. The coroutine ends with the connection.
         """
         encode: Callable[[Any], bytes] = msgspec.json.encode
         with suppress(ConnectionClosed):
@@ -982,13 +983,13 @@ class PageServer:
     def _is_frame_due(self, page: Page, *, has_begun: bool) -> bool:
         """Returns True if the page should receive the newest frame now.
 
-        A page that has not drawn the previous frame yet gets none, so that messages do not pile
-        up.
+        A page that has not drawn the previous frame yet gets no new frame, so that messages do
+        not pile up.
 
         Args:
             page: The page.
-            has_begun: False before the session has a frame. Then pages receive a message only
-                now and then.
+            has_begun: False before the session has a frame. Pages then receive messages at a
+                low rate.
         """
         is_page_behind = len(page.unseen) >= FRAMES_AHEAD
         has_newest_frame = page.sent == self._frame_number
@@ -1027,13 +1028,13 @@ class PageServer:
         return {"hello": fields}
 
     def _describe_stage(self, page: Page, t_s: float | None = None) -> dict[str, Any]:
-        """Returns what a web page shows of the present step of an experiment.
+        """Returns the facts of the present step of an experiment that a web page shows.
 
-        The result is empty without an experiment.
+        The result is empty if there is no experiment.
 
         Args:
             page: The page.
-            t_s: Time of the arms on the page, in s. None without arms.
+            t_s: Time of the arms on the page, in s. `None` if the page shows no arms.
         """
         if self._stage is None:
             return {}
@@ -1043,16 +1044,16 @@ class PageServer:
     def _describe_frame(self, page: Page) -> dict[str, Any]:
         """Returns the newest frame for a page: the state of the session and of the page itself.
 
-        A frame is a message from which the page draws the session, about 30 times a second.
-        What a page receives depends on the role of its user.
+        A frame is a message from which the page draws the session, about 30 times a second. The
+        content depends on the role of the page's user.
 
         Args:
             page: The page.
 
         Returns:
             The frame as plain values for JSON. It consists of the time, the arms and the links
-            as the page's user sees them, of the fields that are explained below, and of the
-            step of the experiment if there is one.
+            as the page's user sees them, the fields that are explained below, and the step of
+            the experiment if there is one.
         """
         site = page.role.site
         # The user of a site sees the other arms delayed. Other roles see all arms at present.
@@ -1066,7 +1067,7 @@ class PageServer:
             # Files of the ended session that can be loaded, and new replies of sites to orders.
             "results": list(self.files.results) if is_full_experimenter else [],
             "notices": self._list_notices(page),
-            # Whether the page shows how old the poses of the other arms are.
+            # Whether the page shows the ages of the other arms' poses.
             "ages": self._shows_ages,
             # Number of open pages.
             "pages": len(self._pages),
@@ -1097,7 +1098,7 @@ class PageServer:
         """Lists the replies of sites (arm controllers) that a web page has not received yet.
 
         The replies name keys and commands, which only an experimenter can use. Pages of other
-        roles receive only which sites refused to stop.
+        roles are only told which sites refused to stop.
         """
         notices = [notice for notice in self._notices if notice["n"] > page.notified]
         if page.role.kind == "experimenter":
@@ -1112,10 +1113,10 @@ class PageServer:
         return refused_stops
 
     def _describe_as_site(self, site: str) -> dict[str, Any]:
-        """Returns what the user of one arm may see, in which the other arms appear delayed.
+        """Returns the frame for the user of one arm, in which the other arms appear delayed.
 
-        It has no plots and no events, which would reveal the present state. All pages of the
-        arm get the same message (frame).
+        The frame has no plots and no events, which would reveal the present state. All pages of
+        the arm get the same message (frame).
 
         Args:
             site: Name of the site that controls the arm.
@@ -1129,10 +1130,10 @@ class PageServer:
         return {**self._frames_as_site[site], **hidden_fields}
 
     def _describe_all(self, page: Page) -> dict[str, Any]:
-        """Returns the state for a web page that sees everything, with new points and events.
+        """Returns the frame for a web page that sees everything, with new points and events.
 
-        The page remembers how many points and events were sent to it. The first message has all
-        that are kept.
+        The numbers of points and events that were sent to the page are stored. The first
+        message contains all stored points and events.
 
         Args:
             page: The page of an experimenter or watcher.
@@ -1140,7 +1141,7 @@ class PageServer:
         frames = self._frames
         view = self.view
         is_first = page.points == 0 and page.energies == 0
-        # More than all points that are kept.
+        # Greater than the number of stored points.
         limit = 100_000 if is_first else POINTS_PER_FRAME
         points = frames.points.since(page.points, limit)
         energies = frames.energies.since(page.energies, limit)
@@ -1153,7 +1154,7 @@ class PageServer:
 
 
 def _has_screen() -> bool:
-    """Returns True if this machine can show a browser, so that opening one makes sense.
+    """Returns True if this machine can show a browser.
 
     On Linux, this is read from the variables DISPLAY and WAYLAND_DISPLAY.
     """
@@ -1163,13 +1164,13 @@ def _has_screen() -> bool:
 
 
 class PageAttendant(ExitStack):
-    """Serves the page of a session that runs in this process, such as one of `trilat live`.
+    """Serves the page of a session that this process runs, as for `trilat live`.
 
     The page is served while a `with` statement runs. It stays open after the session, so that
     it can show the report.
 
     Args:
-        options: How the page is served.
+        options: Address, encryption and further options of the server.
         clock: Clock of this process.
     """
 
@@ -1203,7 +1204,7 @@ class PageAttendant(ExitStack):
         self._page.report_refusals()
 
     def offer_results(self, paths: Iterable[Path]) -> None:
-        """Offers files of the ended session to experimenters, as long as their page is open.
+        """Offers files of the ended session to experimenters as long as their pages are open.
 
         Ctrl-C ends the offer. The address of a file cannot be guessed, and only these pages
         receive it.
@@ -1233,7 +1234,7 @@ def show_on_page(
     The command `trilat watch --page` uses it as the argument `show` of `watch_session`.
 
     Args:
-        options: How the page is served.
+        options: Address, encryption and further options of the server.
         clock: Clock of this process.
         session: Name of the session.
         say: Function that prints a line for the user.

@@ -1,19 +1,19 @@
 """Composes the JSON messages from which the web pages of a running session are drawn.
 
 A session is a run in which several processes ("sites") each control one robot arm. A record
-contains what a site measured and computed in one tick, a period of its control loop. A page
-first receives the constants of the session, such as the shapes of the arms. Then it receives
-about 30 frames a second. A frame is a message with the present state of each arm and network
-link, and with new points of the plots.
+contains the measurements and results of a site in one tick, a period of its control loop. A
+page first receives the constants of the session, such as the shapes of the arms. Then it
+receives about 30 frames a second. A frame is a message with the present state of each arm and
+network link, and with new points of the plots.
 
 Invariant:
-    - A frame is computed from the records since the previous frame. It describes the whole
-      state. Therefore a page may miss frames.
+    - A frame is computed from the records since the previous frame, but describes the whole
+      state. Therefore, a page may miss frames.
     - The plots show the extremes of the records between two frames, so that short peaks are
       visible.
-    - Forces act on the arm and are in N. The forces of people and of the control law follow
-      from their torques: torque = J^T force, where J is the Jacobian of the end effector. Near
-      a singular pose, the force is the smallest one that explains the torque.
+    - Forces act on the arm and are in N. The forces of people and of the control law are
+      computed from their torques: torque = J^T force, where J is the Jacobian of the end
+      effector. Near a singular pose, the force is the smallest one that explains the torque.
     - The frame for the user of one site shows every other arm as that user sees it: with the
       delay of the network, and with the further delay of the picture if the scenario has one
       (`SessionView.find_peer_ticks`). It contains no newer pose of these arms.
@@ -44,15 +44,15 @@ from trilat_net.scenario import Scenario, describe_event
 from .session_view import SessionView, SiteView, Tail
 
 POINTS_KEPT = 1200
-"""Points of a plot that a new page receives: 40 s."""
+"""Number of points of a plot that a new page receives. They cover 40 s."""
 ENERGY_PERIOD_S = 0.025
 """Smallest time between two points of the energies, in s."""
 COLOURS = 6
 """Number of colours for sites in `theme.css`."""
 MAX_FRAME_S = 0.5
-"""Longest time whose records a frame evaluates, in s."""
+"""Longest time interval whose records are evaluated for a frame, in s."""
 _MIN_SINGULAR_SHARE = 0.05
-"""Smallest singular value of the Jacobian that is inverted, as a share of the largest.
+"""Smallest singular value of the Jacobian that is inverted, as a fraction of the largest.
 
 Along directions in which the end effector moves less, the force counts as zero.
 """
@@ -62,7 +62,7 @@ Json = dict[str, Any]
 
 
 def _round(values: Array, digits: int = 5) -> list[Any]:
-    """Returns an array as nested lists of rounded numbers, which make a short JSON text."""
+    """Returns an array as nested lists of rounded numbers, which keep the JSON text short."""
     rounded: list[Any] = np.round(values, digits).tolist()
     return rounded
 
@@ -139,7 +139,8 @@ class _ArmFrames:
     def _describe_hand(self) -> Json | None:
         """Describes how people can hold the arm: by force or position, and within which limits.
 
-        None if the scenario (the settings of the session) does not let people hold this arm.
+        The result is `None` if the scenario (the settings of the session) does not let people
+        hold this arm.
         """
         hand = self._hand
         if hand is None:
@@ -165,7 +166,7 @@ class _ArmFrames:
         }
 
     def describe_pose(self, q: Array) -> Json:
-        """Computes where the joints of the arm are, for a web page that draws the arm.
+        """Computes the points between the arm's links, for a web page that draws the arm.
 
         Args:
             q: Positions of the joints, shape (n,), in rad or m.
@@ -182,7 +183,7 @@ class _ArmFrames:
         }
 
     def describe_start(self) -> Json:
-        """Computes where the joints of the arm are before the first control period.
+        """Computes the points between the arm's links before the first control period.
 
         Returns:
             The pose as `describe_pose` returns it, with the tick -1 and no bodies.
@@ -202,7 +203,7 @@ class _ArmFrames:
         largest values are plotted, so that peaks between two frames are visible.
 
         Args:
-            records: Records since the previous frame. The last one is the present.
+            records: Records since the previous frame. The last record describes the present.
 
         Returns:
             The present state as plain values for JSON, and four largest values: norm of the
@@ -246,18 +247,19 @@ class _ArmFrames:
         return state, extremes
 
     def _place_reference(self, records: AlignedRecords) -> Array:
-        """Returns where the reference is that the arm follows, so that a page can draw it.
+        """Returns the position of the arm's reference, so that a page can draw it.
 
-        The reference `q_des` is what the control law makes the arm follow. It consists of joint
+        The control law makes the arm follow the reference `q_des`. It consists of joint
         positions, or of a pose of the end effector if the sites exchange such poses. A pose
         begins with the position x, y, z, multiplied by the scale of the site's task.
 
         Args:
-            records: Records since the previous frame. The reference of the last one is placed.
+            records: Records since the previous frame. The reference in the last record is used.
 
         Returns:
-            Points in m. For joint positions, the points between the links of an arm in the
-            reference pose. For a pose of the end effector, one point, shape (1, 3).
+            Points in m. If the reference consists of joint positions, they are the points
+            between the links of an arm in the reference pose. If it is a pose of the end
+            effector, there is one point, shape (1, 3).
         """
         points_m: Array
         if self._model.shares_pose:
@@ -270,9 +272,9 @@ class _ArmFrames:
         return points_m
 
     def _describe_grip(self, records: AlignedRecords, force: Array) -> Json:
-        """Describes who holds the arm at present, how firmly, and where the arm shall go.
+        """Describes who holds the arm at present, how firmly, and the target of the arm.
 
-        Empty if nobody can hold the arm.
+        The result is empty if nobody can hold the arm.
 
         Args:
             records: Records since the previous frame.
@@ -322,9 +324,9 @@ class _ArmFrames:
         return split.end_effector.find_force(torque, _MIN_SINGULAR_SHARE)
 
     def _compute_pull(self, records: AlignedRecords, split: TorqueSplit) -> list[float]:
-        """Returns the force of the remote arms that a user feels at the present, in N.
+        """Returns the force of the remote arms that a user feels at present, in N.
 
-        It follows from the torque of the control law without gravity compensation.
+        It is computed from the torque of the control law without gravity compensation.
 
         Returns:
             The components of the force. Empty if the masses of the arm are not known.
@@ -389,7 +391,8 @@ class SessionFrames:
         self.energies: Tail[list[float]] = Tail(POINTS_KEPT)
         self._energy_s = -1.0
         # Poses in which users see other arms, and signs of the quaternions of touched bodies.
-        # The keys are the user's site and the arm's site. A page for all arms has the user "".
+        # The keys are the user's site and the arm's site. For a page that shows all arms, the
+        # user is "".
         self._peer_poses: dict[tuple[str, str], Json] = {}
         self._turns: defaultdict[tuple[str, str], BodyTurns] = defaultdict(BodyTurns)
 
@@ -398,7 +401,8 @@ class SessionFrames:
 
         Returns:
             The sites, the links and the names of the plotted values, as plain values for JSON.
-            Before the session runs, the members that are present and those that are missing.
+            Before the session runs, the result contains the members that are present and those
+            that are missing.
         """
         view = self._view
         scenario = view.scenario
@@ -440,10 +444,10 @@ class SessionFrames:
         }
 
     def _describe_waiting(self, scenario: Scenario | None) -> Json:
-        """Describes for a web page which processes a session that has not begun waits for.
+        """Describes for a web page the processes for which a session that has not begun waits.
 
         Args:
-            scenario: Scenario of the session. None until a member has sent it.
+            scenario: Scenario of the session. `None` until a member has sent it.
         """
         members = self._view.members
         names = [] if scenario is None else scenario.names
@@ -459,12 +463,12 @@ class SessionFrames:
     def make_frame(self) -> Json | None:
         """Composes the present state of all arms for web pages, as one message (frame).
 
-        It covers all records since the previous frame. New points are also added to the plots
-        `points` and `energies`.
+        The frame covers all records since the previous frame. New points are also added to the
+        plots `points` and `energies`.
 
         Returns:
-            The present state of all arms and links, as plain values for JSON. None until every
-            site has published a record.
+            The present state of all arms and links, as plain values for JSON. `None` until
+            every site has published a record.
         """
         view = self._view
         has_all_records = all(site.record is not None for site in view.sites.values())
@@ -512,8 +516,8 @@ class SessionFrames:
 
         Args:
             t_s: Time of the point, in s.
-            values: The number of each curve: extremes of each site, then the age of each link's
-                samples in ms. None leaves a gap.
+            values: The value of each curve: extremes of each site, then the age of each link's
+                samples in ms. `None` leaves a gap.
         """
         point: list[float | None] = [round(t_s, 4)]
         for value in values:
@@ -524,8 +528,8 @@ class SessionFrames:
     def _add_energies(self) -> None:
         """Adds new values of the stored and the supplied energy to the plot on the web page.
 
-        There is a value for each complete control period. At most one per `ENERGY_PERIOD_S`
-        becomes a point.
+        There is a value for each complete control period. At most one value per
+        `ENERGY_PERIOD_S` becomes a point.
         """
         new_energies = self._view.advance_energy()
         if new_energies is None:
@@ -540,7 +544,7 @@ class SessionFrames:
                 self.energies.add([t_s, V, supplied])
 
     def describe_session_as_user(self) -> Json:
-        """Describes what does not change during the session, for the page of a participant.
+        """Describes the constants of the session for the page of a participant.
 
         The settings of links and the dominance factors, the weights with which the arms follow
         each other, are left out. They could reveal the condition of an experiment.
@@ -561,7 +565,7 @@ class SessionFrames:
         return {**constants, **hidden}
 
     def describe_as(self, frame: Json, site: str, *, ages: bool) -> Json:
-        """Makes the frame for the user of one arm from the frame that shows all arms.
+        """Derives the frame for the user of one arm from the frame that shows all arms.
 
         A frame is a message from which a web page draws the session. The user sees the other
         arms with their delay, in the poses that the site (process) of the user's arm last knew.
@@ -569,7 +573,7 @@ class SessionFrames:
         Args:
             frame: Newest frame of `make_frame`. It is not changed.
             site: Name of the user's site.
-            ages: True to add how old the pose of each other arm is, in ms.
+            ages: True to add the age of the pose of each other arm, in ms.
 
         Returns:
             The frame for this user.
@@ -601,10 +605,9 @@ class SessionFrames:
         }
 
     def _compute_age_ms(self, site: str, tick: int, t_s: float) -> float | None:
-        """Returns how old the shown pose of an arm is at a given time, in ms.
+        """Returns the age of the displayed pose of an arm at a given time, in ms.
 
-        The users of an experiment or a demonstration see there how late a remote arm appears to
-        them.
+        The age shows the users of an experiment or a demonstration the delay of a remote arm.
 
         Args:
             site: Name of the site.
@@ -612,7 +615,7 @@ class SessionFrames:
             t_s: The time, in s.
 
         Returns:
-            The age. None before the first record.
+            The age. `None` before the first record.
         """
         if tick < 0:
             return None
@@ -635,7 +638,7 @@ class SessionFrames:
 
         Returns:
             The pose as `_ArmFrames.describe_pose` returns it, its tick, and the poses of the
-            bodies that the arm can touch. Before the first record, the pose at the start.
+            bodies that the arm can touch. Before the first record, it is the start pose.
         """
         arm = self._arms[peer]
         pose = self._peer_poses.get((site, peer)) or arm.describe_start()
@@ -659,12 +662,12 @@ class SessionFrames:
 
         Args:
             name: Name of the site.
-            site: What is known about the site. It must have published a record.
+            site: View of the site, which must have published a record.
 
         Returns:
-            The state as plain values for JSON: that of `_ArmFrames.describe_now`, and the
-            fields that are explained below. In addition, the four largest values since the
-            previous frame, as `_ArmFrames.describe_now` returns them.
+            The state as plain values for JSON, with the fields of `_ArmFrames.describe_now` and
+            those that are explained below; and the four largest values since the previous
+            frame, as `_ArmFrames.describe_now` returns them.
         """
         record = site.record
         stats = site.stats
@@ -688,7 +691,7 @@ class SessionFrames:
         if has_seen_all:
             state_account = site.reception.accounts["state"]
             missing_count = state_account.missing
-        # The source is the number of the program that holds the arm at present, 0 if none does.
+        # The source is the number of the program that holds the arm at present, or 0.
         is_held = bool(state.get("source"))
         fields = {
             **state,
@@ -699,7 +702,7 @@ class SessionFrames:
             "tick": record.tick,
             # For each peer, the tick of the sample that the control law used.
             "used": record.used,
-            # What the site does, for example "fault".
+            # The mode of the site, for example "fault".
             "mode": record.mode,
             # Poses of the bodies that the arm can touch: seven numbers per body.
             "bodies": _round(bodies),
@@ -722,7 +725,7 @@ class SessionFrames:
     ) -> tuple[Json, list[float], bool]:
         """Describes the newest state of an arm, with the extremes since the last description.
 
-        Without new records, the newest record is evaluated again.
+        If there are no new records, the newest record is evaluated again.
 
         Returns:
             The state of the arm, the extremes, and True if there are new records.
@@ -731,7 +734,8 @@ class SessionFrames:
         newest_tick = max(window.newest, 0)
         previous_tick = self._last_ticks.get(name, -1)
         self._last_ticks[name] = newest_tick
-        # After a pause, only the last `MAX_FRAME_S` are evaluated: a frame must be fast.
+        # After a pause, only the last `MAX_FRAME_S` are evaluated, because a frame must be
+        # computed fast.
         most_ticks = round(MAX_FRAME_S * window.rate_hz)
         earliest_tick = newest_tick - most_ticks
         next_tick = min(previous_tick + 1, newest_tick)
@@ -752,7 +756,7 @@ class SessionFrames:
             name: Name of the link, for example "m1->s".
 
         Returns:
-            Plain values. The age is None before the first sample came into use.
+            Plain values. The age is `None` before the first sample comes into use.
         """
         view = self._view
         peer, _, receiver = name.partition("->")
@@ -792,7 +796,7 @@ class SessionFrames:
 
 
 def _count_samples(receiving: SiteView, peer: str) -> Json:
-    """Returns how many messages of a peer have arrived at a site, and with which delay.
+    """Returns the number of a peer's messages that have arrived at a site, and their delay.
 
     A message (sample) is the state that a peer, another site, publishes in a control period.
     The receiving site counts them in its statistics.
@@ -817,7 +821,7 @@ def _count_samples(receiving: SiteView, peer: str) -> Json:
 
 
 def _describe_alarm(alarm: LifeAlarm) -> Json:
-    """Returns an alarm, for example about a stopped arm, in the form that a web page shows.
+    """Returns an alarm, for example about a stopped arm, in the format of a web page.
 
     The page has a button for the command that ends the alarm. Therefore the advice does not
     name a shell command.

@@ -1,4 +1,4 @@
-"""Keeps the state of a running session, as an observer learns it from its messages.
+"""Keeps the state of a running session, which an observer reconstructs from its messages.
 
 A session is a run in which several processes ("sites") each control one robot arm. Every site
 publishes a record per tick (period of its control loop), statistics of its network links, and
@@ -10,11 +10,13 @@ Invariant:
       sites, as the recorder does. Therefore the energy of the arms that it computes equals the
       energy computed from the log. Pages show only the newest record of each site.
     - An observer that joins late does not request earlier records. It requests all events,
-      because they contain the changes that were made.
-    - A site has ended if its `end` event says so, never because it is silent. On a busy machine
-      a running site may be silent for long, and its records are used when they arrive.
-    - A session has ended if every site has, or if the network reports that all of them have
-      left, and `AWAY_NS` have passed: a site that was killed sends no `end` event.
+      because they contain earlier changes of the session.
+    - A site has ended only if it has published an `end` event, never because it is silent. On a
+      busy machine a running site may be silent for long, and its records are used when they
+      arrive.
+    - A session has ended if every site has ended. Because a site that was killed sends no `end`
+      event, the session has also ended if the network reports that all sites have left, and
+      `AWAY_NS` have passed.
 """
 
 from collections import Counter, deque
@@ -49,7 +51,7 @@ from trilat_net.scenario import (
 )
 
 LATE_S = 3.0
-"""An observer has joined late if the first record that it receives is of a later time, in s."""
+"""An observer has joined late if the first record that it receives has a later time, in s."""
 MIN_SILENCE_NS = 2 * NS_PER_S
 """Silence after which a running site is reported as silent, in ns."""
 EVENTS_KEPT = 400
@@ -90,14 +92,14 @@ class Tail(Generic[T]):
     def since(self, count: int, most: int) -> list[T]:
         """Lists the entries that a reader does not know yet.
 
-        A page receives in this way only the new events, and not all of them again.
+        A page thus receives only the new events, and not all of them again.
 
         Args:
             count: Number of entries that had been added when the reader last asked.
-            most: Largest number of entries to return. Older ones are left out.
+            most: Largest number of entries to return. Older entries are left out.
 
         Returns:
-            The entries, the oldest first. Empty if there are no new ones.
+            The entries, the oldest first. Empty if there are no new entries.
         """
         kept_count = len(self._entries)
         unread_count = self.count - count
@@ -107,7 +109,7 @@ class Tail(Generic[T]):
 
 
 class SiteView:
-    """What an observer knows about one arm: its newest state, and which messages are missing.
+    """An observer's knowledge about one arm: its newest state, and which messages are missing.
 
     The messages come from the process of the arm, its site.
 
@@ -120,21 +122,23 @@ class SiteView:
         window: Latest records of the site.
 
     Attributes:
-        glides: True if the site stops smoothly when it loses its peers (the rule `glide`), so
-            that it has alarms.
+        glides: True if the site stops smoothly when it loses its peers (the rule `glide`). Only
+            such a site has alarms.
         peers: Names of the sites whose states the site receives.
         layout: Numbers of joints and peers in its records, if the site continues without a lost
-            peer. Otherwise None.
-        hand: Settings for people who hold its arm. None if nobody can hold it.
-        reception: Which of its messages have arrived.
+            peer. Otherwise `None`.
+        hand: Settings for people who hold its arm. `None` if nobody can hold it.
+        reception: State of the reception of its messages, which shows the messages that have
+            arrived.
         window: Its latest records.
         holder: Person or program that took hold of its arm last.
-        stopped_by: Person or program that ordered its last stop, according to its events.
+        stopped_by: Person or program that ordered its last stop, according to the site's
+            events.
         bodies: Poses of the bodies that its arm can touch, by tick, as far back as `window`.
         dropped: Numbers of dropped messages by reason.
         repair: Requests for its missing messages.
-        record: Its newest record. None before the first one.
-        stats: Its newest statistics. None before the first one.
+        record: Its newest record. `None` before the first record.
+        stats: Its newest statistics. `None` before the first statistics.
         first_tick: Tick of the first record if the observer has joined late, otherwise 0.
     """
 
@@ -170,16 +174,16 @@ class SiteView:
         """Finds out whether the arm of the site needs attention, because of a stop or a fault.
 
         Only a site under the rule `glide` has alarms: by this rule an arm comes to rest while a
-        peer is silent. The alarm follows from the newest record of the site, and in it from the
-        mode of the site and from `mem`, the numbers that it keeps from tick to tick.
+        peer is silent. The alarm is derived from the newest record of the site: from its mode
+        and from `mem`, the values that it keeps from tick to tick.
 
         Args:
             session: Name of the session.
             name: Name of the site.
 
         Returns:
-            The alarm, with its reason. None if there is none, if the site has ended, or if its
-            scenario has no alarms (`glides`).
+            The alarm, with its reason. `None` if there is no alarm, if the site has ended, or
+            if its scenario has no alarms (`glides`).
         """
         record = self.record
         if record is None or not self.glides or self.ended:
@@ -202,7 +206,7 @@ class SiteView:
         if alarm is None:
             return None
 
-        # The order "enable" ends a stop that was ordered. Only an event says by whom.
+        # The order "enable" ends a stop that was ordered. Only an event states who ordered it.
         was_stopped_by_order = alarm.order == "enable"
         if was_stopped_by_order and self.stopped_by:
             reason = f"ordered by {self.stopped_by}"
@@ -219,7 +223,7 @@ class SiteView:
 
     @property
     def complete(self) -> int:
-        """Control period (tick) up to which all records of the site are there or lost for good.
+        """Control period (tick) up to which all records of the site have arrived or are lost.
 
         A record is the result of one tick. No earlier record can still arrive. The value is -1
         before the first record.
@@ -233,7 +237,7 @@ class SiteView:
 
 
 class SessionView:
-    """What an observer knows about a running session from the messages of its sites.
+    """An observer's knowledge about a running session, from the messages of its sites.
 
     A session is a run of several sites, processes that control one arm each. The owner calls
     `poll` regularly, which receives the messages that have arrived.
@@ -244,13 +248,13 @@ class SessionView:
         session: Name of the session.
 
     Attributes:
-        scenario: Scenario of the session. None until a member has sent it.
-        sites: What is known about each running site, by name. Empty until all of them run.
+        scenario: Scenario of the session. `None` until a member has sent it.
+        sites: View of each running site, by name. Empty until all sites run.
         members: Identities of the members (sites and recorders) that have replied.
         links: Present settings of every link between two sites, such as its delay, as tables.
-        dominance: For each site, the weights with which it was last told to follow its peers.
+        dominance: For each site, the latest requested weights with which it follows its peers.
         energy: The energy function V of the stability proof, computed while the session runs.
-            None until all sites run.
+            `None` until all sites run.
         events: The latest events of all members, oldest first.
         dropped: Numbers of invalid or unknown messages, by the reason why they were dropped.
     """
@@ -271,7 +275,8 @@ class SessionView:
         self._presence = bus.presence(topics.presence_key(session, "*"))
         # Keys of the liveliness tokens of sites that are present.
         self._tokens: set[str] = set()
-        # Time at which the last of them disappeared. None if a site is present, or never was.
+        # Time at which the last of them disappeared. `None` if a site is present, or if no site
+        # has ever been present.
         self._left_ns: int | None = None
         self._pictures: dict[str, PictureDelay] = {}
         self._applied_changes: set[tuple[str, str]] = set()
@@ -306,9 +311,9 @@ class SessionView:
     def has_left(self) -> bool:
         """True if every site has disappeared from the network for longer than `AWAY_NS`.
 
-        The time counts from the last sign of a site (arm controller): its last message, or the
-        notice that it is gone. A short loss of the connection therefore does not end the
-        observation.
+        The time is measured from the last sign of life of any site (arm controller): its last
+        message, or the notice that it has disappeared. A short loss of the connection therefore
+        does not end the observation.
         """
         if self._left_ns is None:
             return False
@@ -324,7 +329,7 @@ class SessionView:
         self._finished = True
 
     def silence_s(self, site: SiteView) -> float:
-        """Returns for how long no message of a running site has arrived, in s.
+        """Returns the time since the last message of a running site arrived, in s.
 
         A site is the controller of one arm. A silence shorter than `MIN_SILENCE_NS` counts as
         0, because it is normal. A site that has ended is not silent.
@@ -345,10 +350,10 @@ class SessionView:
 
     @property
     def session_silence_s(self) -> float:
-        """Time for which no running site (arm controller) has been heard, in s.
+        """Time since the last message of any running site (arm controller), in s.
 
-        Displays then say that they wait, because either the session or their own connection is
-        gone. It is 0 while any site is heard.
+        Displays show this time, because either the session or their own connection may be lost.
+        It is 0 while messages of any site arrive.
         """
         silences_s: list[float] = []
         for site in self.sites.values():
@@ -358,7 +363,7 @@ class SessionView:
         return min(silences_s, default=0.0)
 
     def poll(self) -> None:
-        """Receives the messages that have arrived, and requests those that are missing.
+        """Receives the messages that have arrived, and requests missing messages.
 
         The owner of this object calls it regularly, for example 30 times a second. It never
         waits. Before the session runs, it only looks for the sites.
@@ -389,7 +394,7 @@ class SessionView:
         self.links.advance_to(newest_ns)
 
     def _note_presence(self, now_ns: int) -> None:
-        """Notes which sites have appeared on the network or disappeared, for `has_left`.
+        """Records which sites have appeared on the network or disappeared, for `has_left`.
 
         Each member of a session has a liveliness token, which the network removes when the
         member disappears. Recorders do not count.
@@ -410,14 +415,14 @@ class SessionView:
                 self._left_ns = None if self._tokens else now_ns
 
     def advance_energy(self) -> EnergyCourse | None:
-        """Computes the energy of the session at the new ticks, with which stability is checked.
+        """Computes the energy of the session at the new ticks, to check stability.
 
         The energy function V of the stability proof must not rise by more than people and walls
         supply. A tick is a period of the control loop. It is new if, since the last call, the
         records of all sites have arrived for it.
 
         Returns:
-            V and the supplied energy over time, in J. None if there is no new tick.
+            V and the supplied energy over time, in J. `None` if there is no new tick.
         """
         if self.energy is None:
             return None
@@ -431,8 +436,8 @@ class SessionView:
 
         A tick is a period of a control loop, and a sample is the state that a peer publishes in
         a tick. The user sees a peer at the tick of the sample that the site uses for its
-        control law. The scenario may delay the picture that the user sees further. Then it is
-        the tick of an earlier sample.
+        control law. If the scenario delays the user's picture further, it is the tick of an
+        earlier sample.
 
         Args:
             site: Name of the user's site.
@@ -479,7 +484,7 @@ class SessionView:
     def _create_sites(self, scenario: Scenario) -> None:
         """Creates the view of each site, the tables of the links and the energy of the session.
 
-        This is possible only when all sites run, because the energy is that of all arms
+        This is possible only when all sites run, because the energy is computed for all arms
         together.
 
         Args:
@@ -502,8 +507,8 @@ class SessionView:
     def _receive(self, key: str, block: bytes, mono_ns: int) -> None:
         """Decodes a message of a site, and stores each record, statistic or event in it.
 
-        Messages of other members are ignored. The first record or statistics of a site shows
-        whether this observer has joined late, so that earlier ones are not requested.
+        Messages of other members are ignored. The first record or statistics of a site show
+        whether this observer has joined late. If so, earlier ones are not requested.
 
         Args:
             key: Key of the message in the network.
@@ -545,7 +550,7 @@ class SessionView:
         """Follows a site that was started again, if an event announces the new start.
 
         Each start of a site has a random number, its boot. Messages of an unknown boot are
-        dropped, until an event says that the new process has joined the session.
+        dropped until an event states that the new process has joined the session.
 
         Args:
             name: Name of the site.
@@ -594,7 +599,7 @@ class SessionView:
     def _store(
         self, name: str, site: SiteView, channel: str, content: State | LinkStats | Event
     ) -> None:
-        """Stores the content of a new message where pages look for it.
+        """Stores the content of a new message, from where pages read it.
 
         A record is the result of one control period of an arm, and an event reports something
         rare, such as the end of the run.
@@ -613,9 +618,9 @@ class SessionView:
             self._store_event(name, site, content)
 
     def _store_record(self, name: str, site: SiteView, record: State) -> None:
-        """Stores a received record of an arm, and notes the changes of settings that it states.
+        """Stores a received record of an arm, and applies the changes of settings in it.
 
-        Records that were sent again may come late. Only a newer one becomes the site's
+        Records that were sent again may come late. Only a newer record becomes the site's
         `record`.
 
         Args:
@@ -640,8 +645,9 @@ class SessionView:
     def _store_event(self, name: str, site: SiteView, event: Event) -> None:
         """Stores an event for the pages, and the news about an arm that it contains.
 
-        An event of the kind "hand" names who took hold of the arm. An event of the kind
-        "change" names who requested a stop, and may contain a change of links or weights.
+        An event of the kind "hand" names the person or program that took hold of the arm. An
+        event of the kind "change" names the sender of a request to stop, and may contain a
+        change of links or weights.
 
         Args:
             name: Name of the site.
@@ -665,7 +671,7 @@ class SessionView:
         A change is in a record and in an event of its site. It is applied only once.
 
         Args:
-            site: Name of the site that made the change.
+            site: Name of the site that carried out the change.
             text: The change as JSON.
         """
         if self.scenario is None or self.energy is None:

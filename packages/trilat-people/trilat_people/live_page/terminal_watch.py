@@ -35,8 +35,9 @@ SessionOnlooker = Callable[
 ]
 """Function that shows a session, given a network connection that reaches the session.
 
-It returns a context manager. The session is shown in its `with` statement. It yields the
-state of the session, and a function that must be called often to update the display.
+The function returns a context manager. The session is shown within the `with` statement. The
+context manager yields the state of the session, and a function that must be called often to
+update the display.
 """
 
 
@@ -98,7 +99,7 @@ def watch_session(
 
 
 class SessionWatch:
-    """Composes the text by which `trilat watch` shows a running session in a terminal.
+    """Composes the text with which `trilat watch` shows a running session in a terminal.
 
     Args:
         bus: Network connection that reaches the session.
@@ -118,7 +119,7 @@ class SessionWatch:
 
         The check uses V, the energy function of the stability proof. V must not rise by more
         than people and walls supply. A text with the newest V, or with the reason why there is
-        none, is stored for the line `title` above the table.
+        no V, is stored for the line `title` above the table.
 
         Raises:
             ScenarioError: The session has no site whose user's view could be shown.
@@ -126,7 +127,7 @@ class SessionWatch:
         view = self.view
         view.poll()
         if self._as_site and view.scenario is not None:
-            # Called only for the error that it raises if there is no such site.
+            # This call only serves to raise an error if there is no such site.
             view.scenario.find_site(self._as_site)
 
         course = view.advance_energy()  # energies at the new ticks, None without new ticks
@@ -145,7 +146,7 @@ class SessionWatch:
     def title(self) -> str:
         """Line above the table, with the name of the session and its present state.
 
-        The state says whether the session waits for members, has ended, or is silent, and for
+        The text states whether the session waits for members, has ended, or is silent, and for
         how long. For a running session, the line also contains V, the energy with which
         stability is checked. If only the view of one user is shown, the line names the user's
         site instead of V.
@@ -167,7 +168,8 @@ class SessionWatch:
     def alarms(self) -> list[tuple[str, LifeAlarm]]:
         """Arm controllers (sites) that need attention: they hold, are stopped or have a fault.
 
-        Each entry contains the name of the site and its alarm. Empty if there are none.
+        Each entry contains the name of the site and its alarm. The list is empty if there are
+        no alarms.
         """
         view = self.view
         alarms = []
@@ -184,12 +186,12 @@ class SessionWatch:
 
         If only the view of one user is shown, the user's own site has a complete row. The row
         of another site contains the time and the joint angles of the pose that this user sees.
-        This pose is older than the newest one, because the network delays it, and because the
+        This pose is older than the newest pose, because the network delays it, and because the
         scenario may delay the picture further.
 
         Returns:
-            The rows. Each row is a dictionary of texts, by the heads of the columns. Empty
-            until the sites run.
+            The rows. Each row is a dictionary of texts, by the headings of the columns. There
+            are no rows until the sites run.
         """
         view = self.view
         scenario = view.scenario
@@ -251,7 +253,7 @@ def show_in_terminal(
 
             `watch` composes the texts about the session, `desk` sends orders to the sites and
             collects their replies, and `display` prints on the terminal. `read_keys` returns
-            the pressed keys, and is None if this process must not read the keyboard.
+            the pressed keys, and is `None` if this process must not read the keyboard.
             """
             watch.update()
             wants_stop = read_keys is not None and STOP_KEYS.intersection(read_keys())
@@ -262,7 +264,7 @@ def show_in_terminal(
                 desk.stop(watch.view.sites, "a watcher at a terminal")
             desk.poll()
             while desk.replies:
-                # A reply also has the site, the channel of the order and the acceptance.
+                # A reply also contains the site, the channel of the order and the acceptance.
                 *_, text = desk.replies.pop(0)
                 display.say(text)
             if display.due:
@@ -275,8 +277,9 @@ def show_in_terminal(
 def _read_keys() -> Iterator[Callable[[], str] | None]:
     """Yields a function that returns the keys pressed since its last call, without waiting.
 
-    Meanwhile the terminal passes on each key at once and shows none. Its settings are restored
-    at the end. Yields None if this process does not own a terminal: then no key stops the arms.
+    In the `with` block, the terminal passes on each key at once and does not show it. Its
+    settings are restored at the end. If this process does not own a terminal, `None` is
+    yielded, and keys cannot stop the arms.
     """
     try:
         import termios
@@ -295,7 +298,7 @@ def _read_keys() -> Iterator[Callable[[], str] | None]:
     def read() -> str:
         """Returns the keys that were pressed since the last call.
 
-        Empty if there were none, or if the terminal has gone.
+        The text is empty if no keys were pressed, or if the terminal was closed.
         """
         with suppress(OSError):
             readable, _, _ = select.select([keyboard], [], [], 0.0)

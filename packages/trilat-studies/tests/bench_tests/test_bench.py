@@ -52,7 +52,6 @@ from trilat_studies.bench.bench_results import (
     BenchCellResult,
     BenchRun,
     build_bench_page,
-    encode_runs,
 )
 from trilat_studies.bench.bench_run import (
     MAX_RUN_TICKS,
@@ -106,7 +105,7 @@ def encode_files(results: BenchResults) -> list[str]:
     return [
         build_bench_page(results, "trilat bench"),
         encode_csv(results.to_rows()),
-        encode_runs(results),
+        results.encode_runs(),
     ]
 
 

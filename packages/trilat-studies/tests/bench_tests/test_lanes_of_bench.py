@@ -12,7 +12,6 @@ from study_builders import (
     use_single_runs,
 )
 from trilat_studies.bench import prepare_bench_folder, run_bench
-from trilat_studies.bench.bench_results import encode_runs
 
 
 def test_interrupted_lanes_give_the_same_files(
@@ -32,5 +31,5 @@ def test_interrupted_lanes_give_the_same_files(
     assert lane_times_s
     resumed = run_bench(prepare_bench_folder(plan, tmp_path / "lanes"), jobs=1)
     assert resumed.runs == alone.runs
-    assert encode_runs(resumed) == encode_runs(alone)
+    assert resumed.encode_runs() == alone.encode_runs()
     assert resumed.alone == {}

@@ -103,7 +103,7 @@ def test_map_shows_progress_and_fixed_settings(folder: Path) -> None:
     assert (
         "- gains that were not swept: adaptive: Lambda 1, Kp 1, Gamma 1, theta_hat0 0\n" in page
     )
-    assert "- laws at their best gains compare fairly by: `trilat compare --tune`\n" in page
+    assert "- to compare laws at their best gains, use: `trilat compare --tune`\n" in page
 
 
 @pytest.mark.long

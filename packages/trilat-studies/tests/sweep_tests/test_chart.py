@@ -14,7 +14,7 @@ from trilat_studies.sweep.stability_map import (
     MapLine,
     PlaneAxis,
     StabilityCriterion,
-    build_stability_map,
+    StabilityMap,
     find_criterion_edge,
     load_grid_scenario,
     make_panel_loader,
@@ -44,7 +44,7 @@ def results(**axes: tuple[object, ...]) -> SweepResults:
 
 def test_every_panel_has_its_own_lines() -> None:
     """Play-out of 400 ms requires d = 2 whatever the delay."""
-    stability_map = build_stability_map(
+    stability_map = StabilityMap.of_sweep(
         results(link__playout_ms=(0.0, 400.0)), ("trilat sweep",), linearly=False
     )
     (direct,), (played,) = stability_map.lines
@@ -62,7 +62,7 @@ def test_lines_depend_on_neither_runs_nor_processes() -> None:
     all_runs = results()
     one_run_less = replace(all_runs, rows=[row for row in all_runs.rows if row["cell"] != 7])
     (closed, rooted), (same_closed, same_rooted) = (
-        build_stability_map(results_of_runs, (), jobs).lines[0]
+        StabilityMap.of_sweep(results_of_runs, (), jobs).lines[0]
         for results_of_runs, jobs in ((all_runs, 1), (one_run_less, 2))
     )
     assert (closed.rank, rooted.rank) == (0, 1)
@@ -104,7 +104,7 @@ def test_coarse_map_has_the_exact_linear_line() -> None:
 def test_a_strip_has_no_lines() -> None:
     plan = plan_sweep("p_d_margin", over=OVER[:1])
     rows_of_strip = [row for row in make_map_rows() if row["control.d"] == 0.7]
-    assert build_stability_map(SweepResults(plan, rows_of_strip), ()).lines == ((),)
+    assert StabilityMap.of_sweep(SweepResults(plan, rows_of_strip), ()).lines == ((),)
 
 
 def test_place_of_panel_is_cell_of_plan() -> None:
@@ -114,7 +114,7 @@ def test_place_of_panel_is_cell_of_plan() -> None:
     for law, row in product(("p_d", "pd_d"), make_map_rows(link__playout_ms=(0.0, 400.0))):
         rows_by_panel.append({**row, "law": law})
 
-    plane = build_stability_map(SweepResults(plan, rows_by_panel), (), linearly=False).plane
+    plane = StabilityMap.of_sweep(SweepResults(plan, rows_by_panel), (), linearly=False).plane
     assert [panel.title for panel in plane.panels] == [
         f"{law}, playout {ms} ms" for law in ("p_d", "pd_d") for ms in (0, 400)
     ]
@@ -381,7 +381,7 @@ def test_line_between_few_columns_is_that_of_theory() -> None:
         )
     ]
 
-    drawn = build_stability_map(SweepResults(plan, cells), (), linearly=False)
+    drawn = StabilityMap.of_sweep(SweepResults(plan, cells), (), linearly=False)
     ((line,),) = drawn.lines
     step_ms = np.diff(line.fine_positions).max()
     assert step_ms <= 800.0 / 24 + 1e-9

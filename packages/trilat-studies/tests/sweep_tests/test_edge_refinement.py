@@ -19,7 +19,7 @@ from trilat_studies.sweep.edge_refinement import (
     EdgeRefinement,
     choose_side,
 )
-from trilat_studies.sweep.stability_map import build_stability_map
+from trilat_studies.sweep.stability_map import StabilityMap
 from trilat_studies.sweep.sweep_cell import CellClass, CellResult
 from trilat_studies.sweep.sweep_plan import SweepPlan, parse_axis, plan_sweep
 from trilat_studies.sweep.sweep_results import RESULTS_FILE
@@ -148,7 +148,7 @@ def test_an_interrupted_refinement_ends_as_any_other(
     assert (folder.path / RESULTS_FILE).read_bytes() == table
 
     planes = [
-        build_stability_map(swept.results, (), linearly=False).plane
+        StabilityMap.of_sweep(swept.results, (), linearly=False).plane
         for swept in (whole, refined)
     ]
     edges = [plane.find_edges(plane.panels[0]) for plane in planes]

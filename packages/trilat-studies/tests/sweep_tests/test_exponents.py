@@ -17,7 +17,7 @@ from study_builders import (
 )
 from trilat_studies.sweep import prepare_sweep_folder
 from trilat_studies.sweep.map_page import draw_stability_map, tabulate_edges
-from trilat_studies.sweep.stability_map import MapPlane, StabilityMap, build_stability_map
+from trilat_studies.sweep.stability_map import MapPlane, StabilityMap
 from trilat_studies.sweep.sweep_plan import SweepPlan, plan_sweep
 from trilat_studies.sweep.sweep_results import SweepResults, read_results
 
@@ -46,7 +46,7 @@ def results(tmp_path_factory: pytest.TempPathFactory) -> SweepResults:
 
 @pytest.fixture(scope="module")
 def chart(results: SweepResults) -> StabilityMap:
-    return build_stability_map(results, (), 1)
+    return StabilityMap.of_sweep(results, (), 1)
 
 
 def test_exponents_are_real_parts_of_rightmost_roots(results: SweepResults) -> None:

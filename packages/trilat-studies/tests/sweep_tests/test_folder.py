@@ -110,7 +110,7 @@ def test_a_folder_with_other_contents_is_left_alone(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("content", "phrase"),
     [
-        (None, "this folder contains no sweep"),
+        (None, "contains no sweep"),
         ("{", "is not JSON"),
         ("[]", "is not the plan"),
         ("{}", "is not the plan"),

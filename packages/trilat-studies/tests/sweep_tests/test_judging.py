@@ -6,7 +6,7 @@ from typing import Any
 
 import msgspec
 import pytest
-from trilat_studies.measure_run import measure_virtual_run
+from trilat_studies.measure_run import RunMetrics
 from trilat_studies.sweep.sweep_cell import CellClass, CellResult, classify_cell
 
 import trilat_net
@@ -177,7 +177,7 @@ def test_trials_see_no_roots_but_certificates_do() -> None:
     assert cell.verdict is CellClass.BOUNDED
     assert "this rest: unstable" in cell.reasons
 
-    assert measure_virtual_run(scenario).end.stability is Stability.SETTLED
+    assert RunMetrics.of_virtual_run(scenario).end.stability is Stability.SETTLED
     certificate = certify_run(trilat_net.simulate(scenario))
     assert certificate.end.stability is Stability.SETTLED
     assert certificate.stability is Stability.NOT_STABLE

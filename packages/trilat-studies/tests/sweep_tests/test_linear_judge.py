@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 from study_builders import plan_quick_sweep, replace_judge, run_plan
 from trilat_studies.sweep import plan_sweep, read_results
-from trilat_studies.sweep.stability_map import ZERO_RATE, build_stability_map
+from trilat_studies.sweep.stability_map import ZERO_RATE, StabilityMap
 from trilat_studies.sweep.sweep_cell import CellClass, CellResult
 
 from trilat_net.analysis.theory import iterate_linear_edges
@@ -27,7 +27,7 @@ def test_linear_cells_have_the_known_edge(
     results = run_plan(plan, tmp_path / "o").results
     assert read_results(tmp_path / "o").rows == results.rows
 
-    chart = build_stability_map(results, (), 1)
+    chart = StabilityMap.of_sweep(results, (), 1)
     (panel,) = chart.plane.panels
     assert chart.plane.is_linear
     assert chart.lines[0][0].text == ZERO_RATE

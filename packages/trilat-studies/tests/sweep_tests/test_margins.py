@@ -14,7 +14,6 @@ from trilat_studies.sweep.margin_search import (
     KeyMargin,
     SearchRange,
     SweepMargins,
-    parse_search_range,
     search_margins,
 )
 from trilat_studies.sweep.stability_map import StabilityEdge
@@ -155,7 +154,7 @@ def test_the_facts_are_json_and_name_the_command() -> None:
 
 
 def test_a_range_is_read_as_written() -> None:
-    assert parse_search_range("control.d=0.2:3") == WITHIN
+    assert SearchRange.parse("control.d=0.2:3") == WITHIN
     assert WITHIN.format_axis() == "control.d=0.2,3"
 
 

@@ -15,12 +15,7 @@ from trilat_studies.sweep.sweep_results import (
     describe_sweep_plan,
     summarize_sweep,
 )
-from trilat_studies.sweep.sweep_run import (
-    DurationEstimate,
-    estimate_sweep,
-    open_sweep_folder,
-    refuse_oversized_sweep,
-)
+from trilat_studies.sweep.sweep_run import DurationEstimate, open_sweep_folder
 
 from trilat_net.errors import LogRefused, UsageError
 
@@ -82,7 +77,7 @@ def test_without_randomness_one_seed_is_run(tmp_path: Path, judge: Judge) -> Non
 def test_runs_of_an_estimate_are_not_repeated(tmp_path: Path, judge: Judge) -> None:
     """The runs that measured the time of a sweep are among its results."""
     sweep = plan_quick_sweep(tmp_path)
-    expected = estimate_sweep(sweep, jobs=1)
+    expected = DurationEstimate.of_sweep(sweep, jobs=1)
     assert [entry.cell for entry in expected.entries] == [0, 1, 3, 5, 7, 9, 11]
     assert expected.runs == 12
     assert expected.seconds > 0.0
@@ -96,24 +91,26 @@ def test_runs_of_an_estimate_are_not_repeated(tmp_path: Path, judge: Judge) -> N
 def test_an_estimate_leaves_finished_runs_out(tmp_path: Path) -> None:
     """An estimate measures the first cells that have not run, and nothing after the last cell."""
     sweep = plan_quick_sweep(tmp_path)
-    assert estimate_sweep(sweep, [(0, 1), (1, 1)], 1).entries[0].cell == 3
-    assert estimate_sweep(sweep, [(n, 1) for n in range(12)], 1) == DurationEstimate(0, 0.0, [])
+    assert DurationEstimate.of_sweep(sweep, [(0, 1), (1, 1)], 1).entries[0].cell == 3
+    assert DurationEstimate.of_sweep(sweep, [(n, 1) for n in range(12)], 1) == DurationEstimate(
+        0, 0.0, []
+    )
 
 
 @pytest.mark.usefixtures("judge")
 def test_an_estimate_counts_seeds_of_random_links(tmp_path: Path) -> None:
     constant = plan_quick_sweep(tmp_path, seeds=10)
     lossy = plan_quick_sweep(tmp_path, "link.loss=0.1", seeds=10)
-    assert estimate_sweep(constant, jobs=1).runs == 12
-    assert estimate_sweep(lossy, jobs=1).runs == 120
+    assert DurationEstimate.of_sweep(constant, jobs=1).runs == 12
+    assert DurationEstimate.of_sweep(lossy, jobs=1).runs == 120
 
 
 def test_enormous_sweeps_are_refused_with_count_and_time(judge: Judge) -> None:
     over = ["link.delay_ms=0:9999:1", "control.d=0.1:20:0.1"]
     sweep = plan_sweep("p_d_margin", over=over)
-    estimate = estimate_sweep(sweep, jobs=2)._replace(seconds=90_000.0)
+    estimate = DurationEstimate.of_sweep(sweep, jobs=2)._replace(seconds=90_000.0)
     with pytest.raises(UsageError) as error:
-        refuse_oversized_sweep(sweep, estimate, jobs=2)
+        estimate.refuse_oversized_sweep(sweep, jobs=2)
     assert error.value.exit_code == 2
     for word in (
         "2000000 cells (10000 x 200)",
@@ -125,8 +122,8 @@ def test_enormous_sweeps_are_refused_with_count_and_time(judge: Judge) -> None:
 
     many = DurationEstimate(1_000_001, 60.0, [])
     with pytest.raises(UsageError, match="would take about 60 s"):
-        refuse_oversized_sweep(sweep, many)
-    refuse_oversized_sweep(sweep, DurationEstimate(1_000_000, 86_400.0, []))
+        many.refuse_oversized_sweep(sweep)
+    DurationEstimate(1_000_000, 86_400.0, []).refuse_oversized_sweep(sweep)
     assert len(judge.texts) == 8
 
 
@@ -197,7 +194,7 @@ def test_the_opening_names_axes_laws_and_seeds(tmp_path: Path) -> None:
         "trio: 174 cells (29 x 3 x laws pd_d, adaptive), 10 seeds each where anything is random",
         "  over control.Kd=0.2:3:0.1: 0.2, 0.3, ..., 3.0",
         "  over link.delay_ms=0:40:20: 0, 20, 40",
-        "  0.5 s each, an undecided one up to 1 s",
+        "  0.5 s each, undecided runs up to 1 s",
     ]
 
 
@@ -217,7 +214,7 @@ def test_a_summary_counts_every_run_once(tmp_path: Path) -> None:
 
     text = "\n".join(others)
     assert "undecided after 0.5 s and continued, the longest to 4 s" in text
-    assert "in 1 cell nothing is random: one seed was run there" in text
+    assert "nothing is random in 1 cell: only one seed was run there" in text
     assert "stable with some seeds and not with others" in text
     assert "95 % interval" in text
     assert "all in places.csv" in text

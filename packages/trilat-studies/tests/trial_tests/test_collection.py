@@ -16,9 +16,6 @@ from trilat_studies.measure_run import (
     RunMetrics,
     SiteStats,
     WindowStats,
-    evaluate_expectations,
-    measure_log,
-    measure_virtual_run,
     run_compiled_in_batches,
     run_in_batches,
 )
@@ -67,13 +64,13 @@ def test_runs_and_their_logs_have_equal_figures(changes: dict[str, Any]) -> None
     assert make_short_scenario().ticks("m1") > BATCH_RECORDS
     scenario = make_short_scenario(**changes)
     log = trilat_net.simulate(scenario)
-    assert_equal_metrics(measure_virtual_run(scenario), measure_log(log))
+    assert_equal_metrics(RunMetrics.of_virtual_run(scenario), RunMetrics.of_log(log))
 
 
 def test_figures_follow_their_definitions() -> None:
     """Errors, spread, poses and times of a run follow from the arrays of its log."""
     scenario = make_short_scenario(**{"expect.synchronised_rad": 0.3})
-    metrics = measure_virtual_run(scenario)
+    metrics = RunMetrics.of_virtual_run(scenario)
     log = trilat_net.simulate(scenario)
     errors_rad = {name: np.abs(log[name].e) for name in log.sites}
     in_last_second = log["m1"].t_s > log["m1"].t_s[-1] - 1.0
@@ -94,7 +91,7 @@ def test_figures_follow_their_definitions() -> None:
 
 def test_an_undisturbed_run_has_constant_ages() -> None:
     """Over links of 20 ms every sample is 20 ms old, and no sample is late or missing."""
-    metrics = measure_virtual_run(make_short_scenario())
+    metrics = RunMetrics.of_virtual_run(make_short_scenario())
     for age in metrics.ages.values():
         assert age.mean_ms == age.max_ms == 20.0
     assert metrics.late_samples == 0
@@ -104,18 +101,18 @@ def test_an_undisturbed_run_has_constant_ages() -> None:
 
 def test_a_run_without_convergence_has_no_convergence_time() -> None:
     scenario = make_short_scenario(**{"expect.synchronised_rad": 1e-6})
-    assert measure_virtual_run(scenario).synchronised_at_s is None
+    assert RunMetrics.of_virtual_run(scenario).synchronised_at_s is None
 
 
 def test_a_link_without_samples_has_no_age() -> None:
     scenario = make_short_scenario(links={"m1->s": {"delay_ms": 9000.0}})
-    ages = measure_virtual_run(scenario).ages
+    ages = RunMetrics.of_virtual_run(scenario).ages
     assert ages["m1->s"].mean_ms is ages["m1->s"].max_ms is None
     assert ages["m2->s"].max_ms == 20.0
 
 
 def test_a_diverged_run_has_its_instant() -> None:
-    metrics = measure_virtual_run(make_short_scenario(**{"limits.qd_limit_rad_s": 0.3}))
+    metrics = RunMetrics.of_virtual_run(make_short_scenario(**{"limits.qd_limit_rad_s": 0.3}))
     assert metrics.end.diverged_at_s is not None
     assert metrics.simulated_s == pytest.approx(metrics.end.diverged_at_s, abs=0.01)
     assert metrics.missing == 0
@@ -128,12 +125,12 @@ def test_a_diverged_run_has_its_instant() -> None:
 )
 def test_every_missing_record_of_a_log_is_counted(missing_ticks: set[int]) -> None:
     log_bytes = edit_log_bytes(make_log_bytes("free"), record=drop_records("s", missing_ticks))
-    assert measure_log(open_bytes(log_bytes)).missing == len(missing_ticks)
+    assert RunMetrics.of_log(open_bytes(log_bytes)).missing == len(missing_ticks)
 
 
 def test_missing_records_of_all_sites_are_counted() -> None:
     empty = edit_log_bytes(make_log_bytes("free"), record=lambda _: None)
-    assert measure_log(open_bytes(empty)).missing == 3 * 120
+    assert RunMetrics.of_log(open_bytes(empty)).missing == 3 * 120
 
 
 def test_a_site_without_records_leaves_metrics_open() -> None:
@@ -141,7 +138,7 @@ def test_a_site_without_records_leaves_metrics_open() -> None:
     log_bytes = edit_log_bytes(
         make_log_bytes("free"), record=drop_records("s", set(range(120)))
     )
-    metrics = measure_log(open_bytes(log_bytes))
+    metrics = RunMetrics.of_log(open_bytes(log_bytes))
     assert metrics.synchronised_at_s is None
     assert metrics.end_spread_rad is None
     assert metrics.ages["m1->s"].mean_ms is None
@@ -345,7 +342,7 @@ def test_incomplete_windows_have_no_numbers(to_s: float, known: bool) -> None:
 
 def test_window_quantities_follow_their_definitions(log: Log) -> None:
     """The wall's force is the force whose torque J' F stands in the records."""
-    (window,) = measure_log(log).windows
+    (window,) = RunMetrics.of_log(log).windows
     site = log["s"]
     inside = (site.t_s >= 0.5) & (site.t_s < 1.5)
     push_nm = -site.tau_x[inside]
@@ -373,8 +370,8 @@ def test_window_quantities_follow_their_definitions(log: Log) -> None:
 
 
 def test_runs_and_their_logs_have_equal_windows(log: Log) -> None:
-    (window,) = measure_virtual_run(log.scenario).windows
-    (expected,) = measure_log(log).windows
+    (window,) = RunMetrics.of_virtual_run(log.scenario).windows
+    (expected,) = RunMetrics.of_log(log).windows
     assert window.keys() == set(QUANTITIES)
     for key in QUANTITIES:
         assert window[key] == pytest.approx(expected[key], rel=1e-12)
@@ -388,7 +385,7 @@ def test_a_window_of_all_sites_has_the_largest(log: Log) -> None:
         "torque_peak_nm": [0.0, 1.0],
     }
     scenario = make_window_scenario(expect={"windows": [everywhere]})
-    (window,) = measure_virtual_run(scenario).windows
+    (window,) = RunMetrics.of_virtual_run(scenario).windows
 
     errors_rad = []
     torques_nm = []
@@ -402,7 +399,7 @@ def test_a_window_of_all_sites_has_the_largest(log: Log) -> None:
 
 def test_a_run_that_ended_before_has_no_window() -> None:
     scenario = make_window_scenario(**{"limits.qd_limit_rad_s": 0.05})
-    assert measure_virtual_run(scenario).windows == ({},)
+    assert RunMetrics.of_virtual_run(scenario).windows == ({},)
 
 
 @pytest.mark.parametrize(
@@ -445,10 +442,10 @@ def test_any_metric_may_be_expected() -> None:
 
     log = trilat_net.simulate(scenario)
     compared = trilat_net.compare(log, log).metrics
-    run = measure_virtual_run(scenario)
-    assert run.metrics == measure_log(log).metrics
+    run = RunMetrics.of_virtual_run(scenario)
+    assert run.metrics == RunMetrics.of_log(log).metrics
 
-    outcomes = {outcome.key: outcome for outcome in evaluate_expectations(scenario.expect, run)}
+    outcomes = {outcome.key: outcome for outcome in run.compare_with(scenario.expect)}
     assert [outcomes[f"metrics.{key}"].held for key in expectations] == [False, True, False]
     assert outcomes["metrics.chatter_nm"].value == compared.row("chatter_nm").values[0]
     assert "nothing is learnt" in outcomes["metrics.theta_error_last"].measured

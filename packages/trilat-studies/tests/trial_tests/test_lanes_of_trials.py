@@ -5,7 +5,7 @@ from typing import Any
 import msgspec
 import pytest
 from study_builders import record_lane_times, use_lanes, use_single_runs
-from trilat_studies.measure_run import measure_virtual_run, measure_virtual_runs
+from trilat_studies.measure_run import RunMetrics
 from trilat_studies.trials import Trial, run_trials, trials
 
 from trilat_net.scenario import Scenario, load_scenario, reseed_scenario
@@ -38,10 +38,12 @@ def test_metrics_do_not_depend_on_lanes() -> None:
     runs = list_runs()
     reasons = {}
     together = {}
-    for index, metrics, obstacle in measure_virtual_runs(runs):
+    for index, metrics, obstacle in RunMetrics.of_virtual_runs(runs):
         together[index] = msgspec.json.encode(metrics)
         reasons[index] = obstacle
-    alone = {n: msgspec.json.encode(measure_virtual_run(run)) for n, run in enumerate(runs)}
+    alone = {
+        n: msgspec.json.encode(RunMetrics.of_virtual_run(run)) for n, run in enumerate(runs)
+    }
     assert together == alone
     assert [reasons[n] for n in range(6)] == [""] * 6
     assert [reasons[7], reasons[8]] == [PLAIN_REASON, "metrics that need a log"]

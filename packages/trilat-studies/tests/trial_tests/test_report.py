@@ -8,12 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from study_builders import make_trial_result
 from trilat_studies.measure_run import ExpectationResult
-from trilat_studies.trials import (
-    MAX_FAILURES_SHOWN,
-    TrialReport,
-    encode_junit_xml,
-    format_margin,
-)
+from trilat_studies.trials import MAX_FAILURES_SHOWN, TrialReport, format_margin
 
 
 def outcome(margin: float, key: str = "rms_error_max_rad") -> ExpectationResult:
@@ -140,7 +135,7 @@ but `name` of suites and cases, the counts of a suite, and both of a property, w
 
 
 def document(report: TrialReport) -> Xml.Element:
-    return Xml.fromstring(encode_junit_xml(report, 1_700_000_000 * 10**9, "host"))
+    return Xml.fromstring(report.encode_junit_xml(1_700_000_000 * 10**9, "host"))
 
 
 def mixed() -> TrialReport:

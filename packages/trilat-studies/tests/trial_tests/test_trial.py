@@ -12,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from study_builders import UNMET_LIMIT, make_quick_scenario
 from trilat_studies.run_commands import list_assignments
-from trilat_studies.trials import Trial, TrialResult, evaluate_live_log
+from trilat_studies.trials import Trial, TrialResult
 
 import trilat_net
 from tests.log.builders import drop_records, edit_log_bytes, make_log_bytes
@@ -141,7 +141,7 @@ def write_log(folder: Path, data: bytes) -> Path:
 
 def test_an_orderly_session_is_judged_by_its_records(trial: Trial, tmp_path: Path) -> None:
     log = write_log(tmp_path, make_log_bytes("free"))
-    result = evaluate_live_log(trial, log, [], 1.0)
+    result = trial.evaluate_live_log(log, [], 1.0)
     assert result.held
     assert [o.key for o in result.outcomes] == [
         "peak_error_max_rad",
@@ -154,8 +154,8 @@ def test_an_orderly_session_is_judged_by_its_records(trial: Trial, tmp_path: Pat
 
 
 def test_a_session_problem_fails_the_trial(trial: Trial, tmp_path: Path) -> None:
-    result = evaluate_live_log(
-        trial, write_log(tmp_path, make_log_bytes("free")), ["s was killed by SIGKILL"], 1.0
+    result = trial.evaluate_live_log(
+        write_log(tmp_path, make_log_bytes("free")), ["s was killed by SIGKILL"], 1.0
     )
     assert list_failed_keys(result) == ["session"]
     assert "SIGKILL" in result.failures[0]
@@ -165,7 +165,7 @@ def test_missing_records_fail_the_trial(trial: Trial, tmp_path: Path) -> None:
     log = write_log(
         tmp_path, edit_log_bytes(make_log_bytes("free"), record=drop_records("s", {50}))
     )
-    result = evaluate_live_log(trial, log, [], 1.0)
+    result = trial.evaluate_live_log(log, [], 1.0)
     assert list_failed_keys(result) == ["no_gaps", "executed again"]
 
 
@@ -176,7 +176,7 @@ def test_a_record_that_contradicts_its_inputs_fails(trial: Trial, tmp_path: Path
         return record
 
     log = write_log(tmp_path, edit_log_bytes(make_log_bytes("free"), record=change_torque))
-    assert list_failed_keys(evaluate_live_log(trial, log, [], 1.0)) == ["executed again"]
+    assert list_failed_keys(trial.evaluate_live_log(log, [], 1.0)) == ["executed again"]
 
 
 @pytest.mark.parametrize("content", [None, b"no log", "empty"])
@@ -188,7 +188,7 @@ def test_without_records_there_is_only_a_reason(
         write_log(tmp_path, edit_log_bytes(make_log_bytes("free"), record=lambda _: None))
     elif isinstance(content, bytes):
         write_log(tmp_path, content)
-    result = evaluate_live_log(trial, log, ["m1 ended with code 2"], 1.0)
+    result = trial.evaluate_live_log(log, ["m1 ended with code 2"], 1.0)
     assert not result.held
     assert "m1 ended with code 2" in result.error
     assert "run.mcap" in result.error

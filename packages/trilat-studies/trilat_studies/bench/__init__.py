@@ -2,7 +2,7 @@
 
 All laws run with the same random seeds, and one procedure tunes their gains, so that no law has
 an advantage. `plan_bench` selects the runs, `run_bench` executes them and stores them in a
-folder, and `BenchResults` makes tables of them.
+folder, and `BenchResults` composes tables of their results.
 """
 
 from .bench_plan import BenchPlan, plan_bench

@@ -27,13 +27,7 @@ from trilat_net.files import write_whole
 from trilat_net.presentation import FigureSize, style
 from trilat_net.work import MeanInterval, encode_csv
 
-from .bench_results import (
-    BenchCellResult,
-    BenchResults,
-    build_bench_page,
-    encode_runs,
-    name_law,
-)
+from .bench_results import BenchCellResult, BenchResults, build_bench_page, name_law
 
 FIGURES_OF_BENCH = {
     "stable": ("worst judgement of the runs", ""),
@@ -41,16 +35,16 @@ FIGURES_OF_BENCH = {
     "effort": ("effort, N m", "effort_nm"),
     "stiffness": ("stiffness at the hand, N/m", "stiffness_n_m"),
 }
-"""For each figure its label and its quantity. The judgement has no quantity."""
+"""Label and quantity of each figure. The figure of the judgements has no quantity."""
 JUDGEMENTS = {
     Stability.NOT_STABLE: "#a23b53",
     Stability.OPEN: "#e2c044",
     Stability.SETTLED: "#8fb8de",
     Stability.STABLE: "#1f5a99",
 }
-"""Colour of each judgement, from the worst to the best. The best ones are blue."""
+"""Colour of each judgement, from the worst to the best. The best judgements are blue."""
 _WIDTH_IN = 7.0
-"""Width of a figure, which is that of two columns of a paper, in inches."""
+"""Width of a figure in inches, equal to two columns of a paper."""
 _ROW_IN = 0.14
 """Height of a row, in inches."""
 _HEAD_IN = 0.65
@@ -60,7 +54,8 @@ _PALETTE = "cividis"
 _NONE = "#a23b53"
 """Colour of cells without a number.
 
-The slave touched no wall, the arms did not come to rest, or a run diverged.
+A number is missing if the slave touched no wall, the arms did not come to rest, or a run
+diverged.
 """
 
 
@@ -148,7 +143,8 @@ def _draw_bench(results: BenchResults, name: str) -> Figure:
             entries = [Patch(color=colour, label=text) for text, colour in JUDGEMENTS.items()]
             figure.legend(handles=entries[::-1], loc="outside upper center", ncols=len(entries))
         else:
-            # All panels have the same scale, so the last image stands for all of them.
+            # All panels have the same scale, so the colour bar of the last image applies to all
+            # of them.
             figure.colorbar(image, ax=list(panels), label=label, fraction=0.03)
     return figure
 
@@ -156,7 +152,7 @@ def _draw_bench(results: BenchResults, name: str) -> Figure:
 def _choose_scale(fields: list[Array]) -> Normalize:
     """Returns a logarithmic colour scale from the smallest to the largest number of a figure.
 
-    All panels have the same scale. If there are no numbers, it goes from 0.1 to 1.
+    All panels have the same scale. If there are no numbers, the scale goes from 0.1 to 1.
 
     Args:
         fields: The numbers of the panels. NaN is ignored.
@@ -196,7 +192,7 @@ def _collect(results: BenchResults, task: str, quantity: str) -> Array:
     Args:
         results: The results of the benchmark.
         task: The task of the panel.
-        quantity: The quantity. Empty for the judgement.
+        quantity: The quantity. If empty, the judgement is used.
 
     Returns:
         The numbers, shape (laws, links). A missing number is NaN.
@@ -220,11 +216,11 @@ def _compute_number(result: BenchCellResult, quantity: str) -> float | None:
 
     Args:
         result: Result of one law in one task over one link.
-        quantity: Quantity of which the mean is returned. Empty for the judgement, of which the
-            index in `JUDGEMENTS` is returned.
+        quantity: Quantity whose mean is returned. If empty, the index of the judgement in
+            `JUDGEMENTS` is returned.
 
     Returns:
-        The number. None if the runs lack the quantity.
+        The number. `None` if the runs lack the quantity.
     """
     if not quantity:
         return list(JUDGEMENTS).index(result.judgement)
@@ -251,7 +247,7 @@ def _label_laws(axes: Axes, results: BenchResults, task: str) -> None:
 def _mark_cells(axes: Axes, results: BenchResults, task: str) -> None:
     """Marks fields of a figure whose mean value hides runs that are not stable, or are open.
 
-    A cross stands for a run that is not stable, a dot for a run whose stability is open.
+    A cross marks a run that is not stable, and a dot a run whose stability is open.
 
     Args:
         axes: The panel.
@@ -297,7 +293,7 @@ def write_bench(results: BenchResults, folder: Path, command: str) -> list[Path]
     texts = {
         "bench.md": build_bench_page(results, command, pictures),
         "places.csv": encode_csv(results.to_rows()),
-        "runs.csv": encode_runs(results),
+        "runs.csv": results.encode_runs(),
     }
     for name, text in texts.items():
         write_whole(folder / name, text)

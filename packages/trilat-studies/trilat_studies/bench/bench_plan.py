@@ -5,16 +5,16 @@ is shipped with the program, so `trilat sim` can reproduce every run. One law in
 one link is called a cell. It runs once per random seed.
 
 The gains of all laws are tuned by one procedure, `trilat bench --tune`, which stores them in a
-file. It selects the gains with the smallest error among those that also stay stable if all
-delays grow by the factor `TUNING_MARGIN`.
+file. Among the gains that stay stable even if all delays grow by the factor `TUNING_MARGIN`, it
+selects those with the smallest error.
 
 Invariant:
     - Gains are never set by hand. They come from `trilat bench --tune` only.
     - Gains carry a fingerprint of the scenario for which they were tuned, and of the motion of
-      the arms under the law. If the fingerprint differs today, the user is told so.
+      the arms under the law. If the fingerprint no longer matches, the user is told so.
     - If no tried gains of a law stay stable with longer delays, the law gets no gains and does
       not run.
-    - A selection that cannot run is refused before the first run.
+    - A selection that cannot run is rejected before the first run.
 """
 
 import hashlib
@@ -51,7 +51,7 @@ has the same two sites, but the arms lie in a level plane, so gravity does not a
 _OUT = (-0.4557864690179811, 1.3957985827210313)
 """Joint angles in rad at which the end effector is 0.30 m further out than at the start.
 
-Its height is that of the start.
+The height of the end effector is the same as at the start.
 """
 _LESS_OUT = (-0.4901506797631161, 1.484043235051833)
 """Joint angles in rad at which the end effector is only 0.24 m further out.
@@ -75,9 +75,9 @@ _CUT_S = (2.0, 5.0)
 _BURST_SAMPLES = 100.0
 """Mean number of samples that are lost in succession."""
 _FIRST = 0.75
-"""Parameter a of the dominance factors that lets the first user lead, as before a handover."""
+"""Parameter a of `_build_dominance` with which the first user leads, as before a handover."""
 _SECOND = 0.25
-"""Parameter a of the dominance factors that lets the second user lead, as after a handover."""
+"""Parameter a of `_build_dominance` with which the second user leads, as after a handover."""
 
 
 def _build_hand(
@@ -121,18 +121,18 @@ def _build_dominance(a: float) -> dict[str, dict[str, float]]:
 
 
 class _BenchTask(NamedTuple):
-    """A task of the benchmark: what the operators do, and what the slave arm touches.
+    """A task of the benchmark: actions of the operators, and contacts of the slave arm.
 
     Attributes:
         about: Description of the task for the user.
         settings: Overrides of a shipped scenario. With them, the scenario describes the task.
         users: Number of users that the task needs.
         cut_s: Time interval, in s, during which the slave arm has no connection to any other
-            arm. None if no connection fails.
+            arm. `None` if no connection fails.
         duration_s: Time from the start over which errors and efforts are measured, in s. A run
             lasts at least as long.
-        gravity: Factor by which the gravity parameters that the laws get differ from the true
-            ones.
+        gravity: Ratio of the gravity parameters that the laws get to the true gravity
+            parameters.
     """
 
     about: str
@@ -157,7 +157,7 @@ TASKS = {
         "a user moves the slave by 0.3 m", {"sites.m1.hands": [_build_hand(_OUT)]}
     ),
     "contact": _BenchTask(
-        "as free, but after half of the way the slave meets a wall of 2000 N/m",
+        "like the task free, but half-way the slave hits a wall of 2000 N/m",
         {"sites.m1.hands": [_build_hand(_OUT)], "sites.s.environment": [_WALL]},
     ),
     "handover": _BenchTask(
@@ -181,7 +181,7 @@ TASKS = {
         cut_s=_CUT_S,
     ),
     "gravity-90": _BenchTask(
-        "as free, but the laws get 90 % of the true gravity parameters",
+        "like the task free, but the laws get 90 % of the true gravity parameters",
         {"sites.m1.hands": [_build_hand(_OUT)]},
         gravity=0.9,
     ),
@@ -203,7 +203,7 @@ def _build_constant_links() -> dict[str, Settings]:
             link_keys: dict[str, Any] = {"model": "constant", "delay_ms": rtt_ms / 2}
             if percent:
                 name += f"-loss{percent}"
-                # at 1 kHz a single lost sample costs a site only one tick
+                # At 1 kHz, a single lost sample makes the reference only one tick older.
                 link_keys |= {"loss": percent / 100, "loss_burst": _BURST_SAMPLES}
             links[name] = link_keys
     return links
@@ -223,15 +223,15 @@ Over these links `ROUND_TRIPS` round trips take longer than the tasks, so the ru
 SHORTER_REACH: Settings = {"sites.m1.hands": [_build_hand(_LESS_OUT)]}
 """Overrides that give the task `contact` a shorter reach.
 
-The stiffness at the hand follows from the difference between both reaches.
+The stiffness at the hand is computed from the difference between both reaches.
 """
 
 EQUAL_LAWS = {"six_channel": "four_channel"}
-"""Laws that the suite leaves out, and the law of the suite that computes the same torque.
+"""Laws that the suite leaves out, each with the law of the suite that computes the same torque.
 
-`six_channel` is `four_channel` with a check that the dominance factors follow from one factor.
-The factors of all tasks do, because a task has the same factors for all laws. With other
-factors, `six_channel` would be another task and not another law.
+`six_channel` is `four_channel` with a check that all dominance factors are functions of one
+parameter. All tasks have such factors, because a task has the same factors for all laws. With
+other factors, `six_channel` would be compared in a different task.
 """
 _ROLES = ("master", "master", "slave")
 _TUNED_LAWS = {
@@ -251,8 +251,8 @@ The tuning also runs it without the wall, as free motion.
 _OTHER_TUNING_TASKS = {("three", "sync"): "free"}
 """Laws that are tuned in another task, by the form of the suite and the name of the law.
 
-Under gravity the arms of `sync` rest at q = 0 only. The wall keeps the slave away from it, so
-no gains come to rest in `contact`.
+Under gravity, the arms can rest only at q = 0 with the law `sync`. The wall keeps the slave
+away from this pose, so the arms do not come to rest in `contact` with any gains.
 """
 
 
@@ -284,7 +284,7 @@ _GRID = tuple(name for name in LINKS if name.startswith("rtt"))
 _LOSSY = ("rtt68-loss50", "rtt136-loss50", "rtt544-loss50")
 _COARSE = tuple(name for name in LINKS if "-loss" not in name or name in _LOSSY)
 FULL_SEEDS = 1
-"""Runs over a random link in the large studies: two cores then take about an hour."""
+"""Number of runs over a random link in the large studies. Two cores then take about an hour."""
 STUDIES = {
     "full": _BenchStudy(
         about="all laws in all tasks",
@@ -327,12 +327,12 @@ def build_settings(form: str, task: str, link: str, seed: int | None = None) -> 
             whether gravity acts on them.
         task: Name of the task, a key of `TASKS`.
         link: Name of the delay and loss between the arms, a key of `LINKS`.
-        seed: Seed of the run. None keeps the seed of the scenario.
+        seed: Seed of the run. If `None`, the seed of the scenario is kept.
     """
     bench_task = TASKS[task]
     link_keys = dict(LINKS[link])
     delay_ms = link_keys.get("delay_ms", _MEAN_MS.get(link, 0.0))
-    # 2e-3: a round trip is two delays, which are in ms
+    # The factor 2e-3 converts a one-way delay in ms to a round trip in s.
     round_trips_s = 2e-3 * ROUND_TRIPS * delay_ms
     settings = {
         **bench_task.settings,
@@ -343,7 +343,7 @@ def build_settings(form: str, task: str, link: str, seed: int | None = None) -> 
     if bench_task.cut_s is not None:
         link_keys["outages_s"] = [list(bench_task.cut_s)]
         if form == "three":
-            # the outage is that of the slave: the users still receive each other
+            # The outage concerns the slave only: the users still receive each other's samples.
             settings["links.m1->m2.outages_s"] = []
             settings["links.m2->m1.outages_s"] = []
     if form == "level":
@@ -356,7 +356,7 @@ def build_settings(form: str, task: str, link: str, seed: int | None = None) -> 
 GAINS_FILE = Path(str(resources.files("trilat_studies.bench") / "bench_gains.json"))
 """File of the tuned gains, which is part of the program."""
 KNOWLEDGE = ModelInformation()
-"""What the laws know about the arms while they are tuned: gravity exactly, for all laws."""
+"""Knowledge of the laws about the arms during the tuning: all laws know gravity exactly."""
 TUNING_BUDGET = 16
 """Number of candidates per gain of a law, at each round trip."""
 TUNING_MARGIN = 1.5
@@ -364,28 +364,30 @@ TUNING_MARGIN = 1.5
 MARGIN_LENGTHS = 3.0
 """Factor by which the run with longer delays is longer than the tuning run.
 
-Without it, a law that comes to rest slowly would appear to be unstable.
+With an equally long run, a law whose arms come to rest slowly would appear to be unstable.
 """
 
 
 class TunedGains(msgspec.Struct, frozen=True):
     """Gains of a control law, tuned for one kind of scenario and one round trip of the network.
 
-    The procedure tries `tried` candidates. Of those that come to rest at the pose of the task,
-    and still do so when delays grow by `TUNING_MARGIN`, it selects the candidate with the
-    smallest error.
+    The procedure tries `tried` candidates. Some candidates come to rest at the pose of the
+    task, even when delays grow by `TUNING_MARGIN`. Among these, the procedure selects the
+    candidate with the smallest error.
 
     Attributes:
         form: Kind of scenario in which the law runs, a key of `BASES`.
         law: Name of the control law.
         round_trip_ms: The round trip, in ms.
-        gains: The selected gains by name. Empty if no candidate had the margin.
+        gains: The selected gains by name. Empty if no candidate stayed stable with longer
+            delays.
         settled: Number of candidates that came to rest at the pose.
         tried: Number of all candidates.
         passed: Number of candidates that came to rest with a smaller error than the selected
-            candidate, but lack the margin.
-        error_rad: Error of the selected candidate, in rad. None if no candidate was selected.
-        effort_nm: Effort of the selected candidate, in N m. None if no candidate was selected.
+            candidate, but do not stay stable with longer delays.
+        error_rad: Error of the selected candidate, in rad. `None` if no candidate was selected.
+        effort_nm: Effort of the selected candidate, in N m. `None` if no candidate was
+            selected.
         fingerprint: Fingerprint of the scenario and of the law, see `fingerprint_tuning`.
     """
 
@@ -447,9 +449,9 @@ Since the second procedure, a law may define its own objective.
 def _probe_law(task: TuningScenario, space: SearchSpace) -> str:
     """Runs a law in a tuning task with fixed gains, and returns its error and effort as a text.
 
-    The text tells whether the law still moves the arms as it did when its gains were tuned. A
-    digest of its source code would not do: it also changes when a sentence, a name or an import
-    does.
+    The text shows whether the law still moves the arms as it did when its gains were tuned. A
+    digest of the source code is no substitute, because it also changes with a comment, a name
+    or an import.
 
     Args:
         task: The task in which the law was tuned.
@@ -489,7 +491,7 @@ def fingerprint_tuning(form: str, law: str, round_trip_ms: int) -> str:
 
 
 def read_gains(path: Path = GAINS_FILE) -> dict[tuple[str, str, int], TunedGains]:
-    """Reads from a file the control gains that were tuned for the benchmark before.
+    """Reads the control gains from the file of tuned gains of the benchmark.
 
     Args:
         path: The file.
@@ -506,14 +508,15 @@ def read_gains(path: Path = GAINS_FILE) -> dict[tuple[str, str, int], TunedGains
 def find_stale(entries: Iterable[TunedGains]) -> list[str]:
     """Lists the tuned gains that are out of date.
 
-    They are those whose law or scenario has changed since they were tuned, see
+    Gains are out of date if the law or the scenario has changed since the tuning, see
     `fingerprint_tuning`.
 
     Args:
         entries: The gains to check.
 
     Returns:
-        A string for each, such as "wave (three, 68 ms)". Empty if all are up to date.
+        A text for each entry that is out of date, such as "wave (three, 68 ms)". Empty if all
+        entries are up to date.
     """
     return [
         str(gains) for gains in entries if fingerprint_tuning(*gains.key) != gains.fingerprint
@@ -523,8 +526,9 @@ def find_stale(entries: Iterable[TunedGains]) -> list[str]:
 def choose_round_trip(mean_ms: float) -> int:
     """Returns the tuned round trip, in ms, whose gains a link with a given round trip uses.
 
-    It is the shortest tuned round trip that is not shorter than that of the link. A link that
-    is longer than all of them uses the longest.
+    It is the shortest tuned round trip that is not shorter than the round trip of the link. If
+    the link's round trip is longer than all tuned round trips, the longest tuned round trip is
+    returned.
 
     Args:
         mean_ms: Mean round trip of the link, in ms.
@@ -571,7 +575,7 @@ def tune_laws(
     """Tunes control laws for the benchmark, at each of several round trips of the links.
 
     The round trips are `TUNED_ROUND_TRIPS_MS`. Gains that are known and up to date are not
-    tuned again, so that an interrupted tuning continues.
+    tuned again, so an interrupted tuning continues.
 
     Args:
         laws_by_form: Names of the laws to tune, by the kind of scenario in which they run, such
@@ -582,7 +586,7 @@ def tune_laws(
             tunings.
         budget: Number of choices of gains to try, per gain of a law. A law with three gains
             gets three times this number.
-        known: Gains that were tuned before. Those that are out of date are ignored.
+        known: Gains that were tuned before. Gains that are out of date are ignored.
         store: Function that is called with the gains of each law at each round trip as soon as
             they are tuned. It is not called for known gains.
 
@@ -645,8 +649,8 @@ def _select_gains(form: str, round_trip_ms: int, search: CandidateSearch) -> Tun
             settled.append(index)
     settled.sort(key=lambda index: scores[index].error_rad or 0.0)
 
-    # The margin costs another run, so it is checked in the order of the errors until a
-    # candidate has it.
+    # Checking the margin takes another run. Candidates are therefore checked in the order of
+    # their errors until one has the margin.
     selected = None
     rejected = 0
     for candidate in settled:
@@ -670,7 +674,7 @@ def _select_gains(form: str, round_trip_ms: int, search: CandidateSearch) -> Tun
 
 
 def write_gains(tuned: Sequence[TunedGains], path: Path = GAINS_FILE) -> None:
-    """Writes tuned control gains into a file, and keeps other gains that the file has.
+    """Writes tuned control gains into a file, and keeps the other gains in the file.
 
     Args:
         tuned: The gains to write. They replace gains in the file that were tuned for the same
@@ -719,7 +723,7 @@ class BenchCell(NamedTuple):
     def inputs(self) -> str:
         """Hash of everything that determines these simulations: scenario, task, link and gains.
 
-        Stored results with another hash are out of date and are not used.
+        Stored results with a different hash are out of date and are not used.
         """
         parts = (
             _load_base_text(self.form),
@@ -755,12 +759,12 @@ class BenchPlan(NamedTuple):
 
     Attributes:
         study: Name of the study, which is a selection of tasks, laws and links.
-        cells: The combinations of a task, a control law and a link that run, in the order in
-            which they run.
+        cells: The combinations of a task, a control law and a link that are run, in running
+            order.
         laws: Pairs of a selected law and the kind of scenario in which it runs (a key of
             `BASES`). A law without any run still has a row in the tables, without numbers.
         without: Tunings of selected laws that found no stable gains. These laws do not run over
-            the links for which they were tuned there.
+            the links that would use those tunings.
     """
 
     study: str
@@ -786,7 +790,7 @@ class BenchPlan(NamedTuple):
         """Number of simulations of the benchmark: one per random seed and combination.
 
         A combination is a control law in a task over a network link. Repetitions that confirm a
-        result come in addition.
+        result are not counted.
         """
         return sum(len(cell.seeds) for cell in self.cells)
 
@@ -831,11 +835,11 @@ def plan_bench(
 
     Args:
         study: A key of `STUDIES`.
-        tasks: Names of the selected tasks. Empty selects all tasks of the study.
-        laws: Names of the selected laws. Empty selects all laws of the study.
-        links: Names of the selected links, which may be any keys of `LINKS`. Empty selects all
-            links of the study.
-        seeds: Number of seeds. None uses the number of the study.
+        tasks: Names of the selected tasks. If empty, all tasks of the study are selected.
+        laws: Names of the selected laws. If empty, all laws of the study are selected.
+        links: Names of the selected links, which may be any keys of `LINKS`. If empty, all
+            links of the study are selected.
+        seeds: Number of seeds. If `None`, the number of the study is used.
 
     Returns:
         The checked plan, ready to run.
@@ -864,7 +868,7 @@ def plan_bench(
         _list_cells(study=bench_study, tasks=tasks, laws=laws, links=links, seeds=seeds)
     )
     cells = [cell for cell in tuned_cells if cell.tuned.gains]
-    # by name, so that gains that several cells share are listed once
+    # keyed by name, so that gains that several cells share are listed once
     without = {str(cell.tuned): cell.tuned for cell in tuned_cells if not cell.tuned.gains}
     if not cells:
         raise UsageError(_explain_no_cells(tasks, laws, list(without)))
@@ -881,8 +885,8 @@ def _explain_no_cells(tasks: Sequence[str], laws: Sequence[str], without: list[s
     Args:
         tasks: Names of the selected tasks.
         laws: Names of the selected laws.
-        without: Tunings of these laws that found no gains. Empty if the laws do not fit the
-            tasks.
+        without: Tunings of these laws that found no gains. Empty if the reason is that the laws
+            do not fit the tasks.
     """
     law_names = ", ".join(laws)
     if without:
@@ -901,7 +905,7 @@ NO_GAINS = "no gains"
 
 
 def explain_no_cell(law: str, form: str, task: str) -> str:
-    """Explains in a table why the benchmark does not simulate a control law in a task.
+    """Returns a table entry that explains why the benchmark does not simulate a law in a task.
 
     Args:
         law: Name of the control law.
@@ -911,8 +915,8 @@ def explain_no_cell(law: str, form: str, task: str) -> str:
 
     Returns:
         - "-" if the task needs two users, and the form has a single user.
-        - "no handover" if one user hands the control over to the other in this task, and the
-          law cannot change how much each user leads.
+        - "no handover" if one user hands over the control to the other in this task, and the
+          law cannot change the users' shares.
         - "exact model" if the gravity parameters are wrong in this task, and the law takes the
           exact model of the arm instead.
         - `NO_GAINS` otherwise. In this case, the tuning of the law found no stable gains.
@@ -1019,8 +1023,8 @@ def _analyse_link(link: str) -> tuple[bool, float]:
         link: A key of `LINKS`.
 
     Returns:
-        True if its delays or losses are random.
-        Its mean one-way delay, in ms.
+        True if the delays or losses of the link are random; and the mean one-way delay of the
+        link, in ms.
     """
     settings = format_settings({"link": dict(LINKS[link])})
     scenario = TuningScenario.load(BASES["two"], settings).scenario
@@ -1041,7 +1045,7 @@ def _select_names(
         option: The option, without its dashes.
         names: Names from the user.
         default: Names that replace an empty selection.
-        known: Names that exist. None if these are the names in `default`.
+        known: Names that exist. If `None`, these are the names in `default`.
 
     Raises:
         UsageError: A name is unknown.

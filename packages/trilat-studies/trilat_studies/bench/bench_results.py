@@ -6,7 +6,7 @@ stable, which properties its runs have, and the means of the measured quantities
 task over one link is called a cell.
 
 Invariant:
-    - The output depends on the runs alone. It contains no time of day, so equal results give
+    - The output depends only on the runs. It contains no time of day, so equal results give
       equal bytes.
     - A mean or share over at least `LEAST_SEEDS` seeds has its 95 % confidence interval.
     - Every run that is not stable is visible in the tables.
@@ -29,7 +29,7 @@ from ..side_by_side import describe_runs_alone
 from .bench_plan import STUDIES, TASKS, BenchCell, BenchPlan, TunedGains, explain_no_cell
 
 LEAST_CONTACT_N = 1.0
-"""Smallest mean force of the wall, in N, at which the slave counts as touching it.
+"""Smallest mean force of the wall, in N, at which the slave counts as touching the wall.
 
 The mean is taken over the last quarter of the task.
 """
@@ -39,7 +39,7 @@ PASSIVE_J = -1e-3
 It is not 0, because the energy is a numerical integral.
 """
 CONFIRMATION_LENGTHS = 2.0
-"""Duration of the repetition of a run that is not stable, in durations of the run."""
+"""Factor by which the repetition of a run that is not stable is longer than the run."""
 LEAST_SEEDS = 20
 """Smallest number of runs for which an interval is computed."""
 
@@ -47,12 +47,12 @@ LEAST_SEEDS = 20
 def name_run(key: str, to_s: float) -> str:
     """Returns the name under which a journal stores the finished simulations of one law.
 
-    It belongs to one control law in one task over one network link.
+    The simulations belong to one control law in one task over one network link.
 
     Args:
         key: Key of the cell, see `BenchCell.key`.
-        to_s: Duration in s of runs that are repeated over a longer time, which is part of their
-            name. 0 for the first runs.
+        to_s: Duration in s of runs that are repeated over a longer time, which becomes part of
+            the name. 0 for the first runs.
     """
     return f"{key} to {to_s:g} s" if to_s else key
 
@@ -60,8 +60,8 @@ def name_run(key: str, to_s: float) -> str:
 class BenchRun(msgspec.Struct, frozen=True):
     """A finished run of the suite, with its judgement and its measured numbers.
 
-    A worker process creates it, and the journal of the suite stores it. The numbers from
-    `error_rad` on are None if the run diverged.
+    A worker process creates it, and the journal of the suite stores it. The attribute
+    `error_rad` and all later attributes are `None` if the run diverged.
 
     Attributes:
         name: Name of the cell, as in "contact/wave/rtt272".
@@ -78,27 +78,27 @@ class BenchRun(msgspec.Struct, frozen=True):
             for a first run.
         at_limit: True if the run would have needed more ticks (control periods) than the safety
             limit allows.
-        confirmed: True if the repeated run was not stable either. False if it was, so that it
-            refuted the first run. None if there is no repeated run, because the first run was
-            not judged "not stable", or diverged.
+        confirmed: True if the repeated run was not stable either. False if the repeated run was
+            stable, which refuted the first run. `None` if there is no repeated run, because the
+            first run diverged or was not judged "not stable".
         bounded: True if no joint exceeded the velocity `BOUND_RAD_S`, or moved more than
             `THROWN_RAD` away from its start.
-        energy_j: Smallest value over time of the energy that operators, friction and wall had
-            put into the arms until then, in J.
-        settled_s: Time from which all arms stay at their final poses, in s. None if there is no
-            such time within the run.
+        energy_j: Minimum over time of the total energy that operators, friction and wall had
+            put into the arms, in J.
+        settled_s: Time from which all arms stay at their final poses, in s. `None` if there is
+            no such time within the run.
         error_rad: RMS over time and joints of the difference between the slave and the average
             of the users, weighted with the dominance factors and without delay, in rad.
         effort_nm: RMS of tau - G(q), the torque without gravity, over sites and joints, in N m.
         hand_nm: RMS torque of the operators over the joints of the arms that have an operator,
             in N m.
-        wall_n: Mean force of the wall in the last quarter of the task, in N. None without a
-            wall.
-        force_peak_n: Largest force of the wall, in N. None without a wall.
+        wall_n: Mean force of the wall in the last quarter of the task, in N. `None` if there is
+            no wall.
+        force_peak_n: Largest force of the wall, in N. `None` if there is no wall.
         stiffness_n_m: Stiffness that the user feels 2 s after contact, in N/m, from two runs
-            with different reaches. None without such contact in both.
-        impedance_n_s_m: |Z| at 1 Hz that the user feels in contact minus that in free motion,
-            in N s/m. None without contact.
+            with different reaches. `None` unless both runs have such a contact.
+        impedance_n_s_m: |Z| at 1 Hz that the user feels in contact, minus |Z| in free motion,
+            in N s/m. `None` if there was no contact.
         free_impedance_n_s_m: |Z| at 1 Hz that the user feels in free motion, in N s/m. It is
             measured in the task `contact` only.
     """
@@ -129,7 +129,7 @@ class BenchRun(msgspec.Struct, frozen=True):
 
     @property
     def cell(self) -> str:
-        """Name that identifies this run in the journal of finished runs, with its seed.
+        """Name that identifies this run, with its seed, in the journal of finished runs.
 
         The name consists of the task, the law, the link, and a digest of the scenario and the
         gains. If this run repeats a first run over a longer time, the name also contains the
@@ -150,7 +150,7 @@ class BenchRun(msgspec.Struct, frozen=True):
 
     @property
     def confirmation_s(self) -> float:
-        """Duration for which this run is repeated if it was judged not stable, in s.
+        """Duration of the repetition of this run if the run was judged not stable, in s.
 
         The repetition is longer than the run. If it is not stable either, it confirms the
         judgement; if it is stable, it refutes it.
@@ -161,8 +161,8 @@ class BenchRun(msgspec.Struct, frozen=True):
     def masked(self) -> bool:
         """True if the slave should touch a wall but did not.
 
-        The numbers of such a run are those of free motion. They would look better than those of
-        a run with contact, so that they are not shown.
+        The numbers of such a run are those of free motion. They are not shown, because they
+        would look better than those of a run with contact.
         """
         return self.wall_n is not None and self.wall_n < LEAST_CONTACT_N
 
@@ -248,9 +248,9 @@ class BenchCellResult(NamedTuple):
     def is_passive(self) -> bool:
         """True if the control law never generated energy in these runs.
 
-        This means that at no time the arms had returned more energy to the operators and the
-        other surroundings than they had received from them. False if a run diverged, which
-        means that the motion grew without bound.
+        This means that at no time had the arms returned more energy to their surroundings,
+        including the operators, than they had received. False if a run diverged, which means
+        that the motion grew without bound.
         """
         return self.energy_j is not None and self.energy_j >= PASSIVE_J
 
@@ -259,11 +259,11 @@ class BenchCellResult(NamedTuple):
         """Lowest net energy that the environment had put into the arms at any time, in J.
 
         The environment is the operators, the friction and the wall. The value is the minimum
-        over time and over all runs of this law in this task over this link. It is negative if
-        the arms gave back more energy than they had received, so the control law generated
-        energy.
+        over time and over all runs of this law in this task over this link. A negative value
+        means that the arms gave back more energy than they had received, so the control law
+        generated energy.
 
-        None if a run diverged.
+        The value is `None` if a run diverged.
         """
         values = [run.energy_j for run in self.runs if run.energy_j is not None]
         return min(values) if len(values) == len(self.runs) else None
@@ -272,7 +272,8 @@ class BenchCellResult(NamedTuple):
     def interval(self) -> tuple[float, float] | None:
         """95 % confidence interval of the share of stable runs, by Wilson's method.
 
-        None for fewer than `LEAST_SEEDS` runs, of which an interval would say nothing.
+        The interval is `None` for fewer than `LEAST_SEEDS` runs, because it would be too wide
+        to be useful.
         """
         if len(self.runs) < LEAST_SEEDS:
             return None
@@ -285,9 +286,9 @@ class BenchCellResult(NamedTuple):
             quantity: Name of the quantity, a key of `QUANTITIES`.
 
         Returns:
-            The mean. With at least `LEAST_SEEDS` runs, it has a 95 % confidence interval. None
-            if a run lacks the quantity, or if the slave should touch a wall but missed it in a
-            run.
+            The mean. With at least `LEAST_SEEDS` runs, it has a 95 % confidence interval.
+            `None` if a run lacks the quantity, or if the slave should touch a wall but missed
+            it in a run.
         """
         values = [getattr(run, quantity) for run in self.runs]
         if None in values or self.masked:
@@ -298,7 +299,7 @@ class BenchCellResult(NamedTuple):
 
 
 class BenchResults(Result):
-    """Results of the benchmark or of a part of it, to be printed, written and searched.
+    """Results of the benchmark, or of a part of it, for texts, files and searches.
 
     The benchmark simulates control laws in several tasks over several network links. `places`
     has one result per combination of law, task and link.
@@ -382,8 +383,8 @@ class BenchResults(Result):
 
         Args:
             task: Name of the task, such as "contact".
-            law: Name of the control law to select. Empty selects all laws.
-            link: Name of the link to select. Empty selects all links.
+            law: Name of the control law to select. If empty, all laws are selected.
+            link: Name of the link to select. If empty, all links are selected.
         """
         for result in self.places:
             cell = result.cell
@@ -399,13 +400,21 @@ class BenchResults(Result):
             link: Name of the link.
 
         Returns:
-            The result. None if the plan does not contain the cell.
+            The result. `None` if the plan does not contain the cell.
         """
         return next(self.select(task, law, link), None)
 
+    def encode_runs(self) -> str:
+        """Encodes all simulations of a benchmark as a CSV table, one line per simulation."""
+        cells = {cell.name: cell for cell in self.plan.cells}
+        rows = [
+            _build_cell_columns(cells[run.name]) | msgspec.to_builtins(run) for run in self.runs
+        ]
+        return encode_csv(rows, [*_CELL_COLUMNS, *BenchRun.__struct_fields__])
+
 
 def _list_used_gains(results: BenchResults) -> list[TunedGains]:
-    """Returns the tuned gains with which the control laws were simulated, each once.
+    """Returns the tuned gains with which the control laws were simulated, without repetitions.
 
     Several tasks and network links may share the same gains.
     """
@@ -414,9 +423,9 @@ def _list_used_gains(results: BenchResults) -> list[TunedGains]:
 
 
 def _confirm_run(runs: dict[tuple[str, int], BenchRun], cell: BenchCell, seed: int) -> BenchRun:
-    """Returns a run, or its repetition over twice its length if there is one.
+    """Returns a run, or its repetition over twice the duration if there is a repetition.
 
-    A run that is not stable is repeated. The longer run decides, and its numbers count.
+    A run that is not stable is repeated. The longer run decides, and its values are used.
 
     Args:
         runs: All finished runs, by the name of the cell in the journal and by seed.
@@ -455,7 +464,7 @@ UNSTABLE_MARK = "!"
 
 
 def _list_quantities(results: BenchResults) -> list[tuple[str, str]]:
-    """Lists which measured quantities are printed for which task.
+    """Lists the measured quantities that are printed for each task.
 
     Args:
         results: Results of the benchmark or of a part of it.
@@ -474,7 +483,7 @@ def _list_quantities(results: BenchResults) -> list[tuple[str, str]]:
 def name_law(law: str, form: str) -> str:
     """Returns the name of a control law for tables, as in "wave (two sites)".
 
-    The note shows that only two arms take part.
+    The note in parentheses shows that only two arms take part.
 
     Args:
         law: Name of the control law.
@@ -485,10 +494,10 @@ def name_law(law: str, form: str) -> str:
 
 
 def _tabulate_verdicts(results: BenchResults) -> TextTable:
-    """Returns a table of how many links each law copes with: a row per law, a column per task.
+    """Returns a table of the number of links over which each law is stable, for each task.
 
-    An entry counts the links over which the law is stable, those over which it only settles,
-    those over which this is undecided (open), and those over which it is not stable.
+    The table has a row per law and a column per task. An entry has four counts: the links over
+    which the law is stable, only settles, is undecided (open), and is not stable.
 
     Args:
         results: Results of the suite or of a part of it.
@@ -503,7 +512,7 @@ def _tabulate_verdicts(results: BenchResults) -> TextTable:
 
 
 def _count_verdicts(results: BenchResults, law: str, form: str, task: str) -> str:
-    """Returns over how many links a law is stable, settled, open and not stable, for a table.
+    """Counts the links over which a law is stable, settled, open and not stable, for a table.
 
     Args:
         results: Results of the benchmark or of a part of it.
@@ -512,7 +521,8 @@ def _count_verdicts(results: BenchResults, law: str, form: str, task: str) -> st
         task: Name of the task.
 
     Returns:
-        A text such as "12 / 0 / 1 / 3". If the law did not run in the task, the reason.
+        A text such as "12 / 0 / 1 / 3". If the law did not run in the task, the text is the
+        reason.
     """
     judgements = [result.judgement for result in results.select(task, law)]
     if not judgements:
@@ -524,7 +534,7 @@ def _tabulate_properties(results: BenchResults, task: str) -> TextTable:
     """Returns a table of the properties of a task's runs: a row per law.
 
     There is a column per property, such as passivity. An entry such as 3/12 means that all runs
-    over 3 of the 12 links have the property. Two more columns have the smallest energy, and the
+    over 3 of the 12 links have the property. Two more columns show the smallest energy, and the
     number of links over which the slave did not touch the wall.
 
     Args:
@@ -651,7 +661,7 @@ def _describe_result(result: BenchCellResult, quantity: str) -> str:
 
 
 def _tabulate_round_trips(results: BenchResults) -> TextTable:
-    """Returns a table of how the error of each law grows with delay and with losses.
+    """Returns a table that shows how the error of each law grows with delay and with losses.
 
     A row is a task and a control law. Its columns are the error at the shortest round trip,
     the error at the longest round trip divided by the error at the shortest, and the error
@@ -690,7 +700,8 @@ def _tabulate_round_trips(results: BenchResults) -> TextTable:
 def _find_error(results: BenchResults, task: str, law: str, link: str) -> float | None:
     """Returns the mean position error of a law in a task over a link, in rad.
 
-    None if the law did not run there, or if an arm left its limits or missed its wall.
+    The result is `None` if the law did not run over this link, or if an arm left its limits or
+    did not touch the wall.
     """
     result = results.find(task, law, link)
     mean = None if result is None else result.compute_mean("error_rad")
@@ -710,7 +721,7 @@ def _format_ratio(numerator: float | None, denominator: float | None) -> str:
 def _describe_bench(results: BenchResults) -> Iterator[str]:
     """Yields lines that introduce the results.
 
-    They name the study, its runs, its tasks, and the laws that did not run.
+    The lines name the study, its runs, its tasks, and the laws that did not run.
 
     Args:
         results: Results of the suite or of a part of it.
@@ -747,8 +758,8 @@ def _describe_bench(results: BenchResults) -> Iterator[str]:
 def _tabulate_gains(results: BenchResults) -> TextTable:
     """Returns a table of the gains of each law at each round trip, and how they were selected.
 
-    The column "stable" has the number of stable candidates and of all candidates. The column
-    "without margin" has the number of candidates with smaller errors that were rejected,
+    The column "stable" shows the number of stable candidates and of all candidates. The column
+    "without margin" shows the number of candidates with smaller errors that were rejected
     because they are not stable when delays grow.
 
     Args:
@@ -810,19 +821,6 @@ def build_bench_page(
     return "\n\n".join(parts) + "\n"
 
 
-def encode_runs(results: BenchResults) -> str:
-    """Encodes all simulations of a benchmark as a CSV table, one line per simulation.
-
-    Args:
-        results: Results of the suite or of a part of it.
-    """
-    cells = {cell.name: cell for cell in results.plan.cells}
-    rows = [
-        _build_cell_columns(cells[run.name]) | msgspec.to_builtins(run) for run in results.runs
-    ]
-    return encode_csv(rows, [*_CELL_COLUMNS, *BenchRun.__struct_fields__])
-
-
 _FORMER_KEYS = ("reflected", "reflected_half", "observed", "least_j")
 """Keys of quantities that are no longer measured.
 
@@ -843,8 +841,8 @@ def _build_cell_columns(cell: BenchCell) -> dict[str, Any]:
 def _build_row(result: BenchCellResult) -> dict[str, Any]:
     """Returns the results of one law in one task over one link, as a row of a table.
 
-    It has judgements, and means with intervals, for JSON and CSV. Unknown numbers are None, for
-    example the force of the wall in a task without a wall.
+    The row has judgements, and means with intervals, for JSON and CSV. Unknown values are
+    `None`, for example the force of the wall in a task without a wall.
 
     Args:
         result: Results of the cell.

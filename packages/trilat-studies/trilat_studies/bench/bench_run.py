@@ -1,9 +1,9 @@
 """Executes the runs of the benchmark suite, decides whether each is stable, and measures it.
 
 `run_bench` is called with a plan of runs and a folder, in which finished runs are stored.
-Whether a run is stable is decided as by `trilat certify`: from the end of the run, from the
-characteristic roots of its control loop, and where these do not suffice, from repetitions of
-the run with a small push, which show whether disturbances grow.
+Stability is judged in the same way as by `trilat certify`: from the end of the run and from the
+characteristic roots of its control loop. If these do not suffice, the run is repeated with a
+small push, which shows whether disturbances grow.
 
 Some runs are too short for a decision. They are repeated with a duration of `TIME_CONSTANTS` of
 their slowest time constants. A run that is not stable is repeated over twice its length.
@@ -11,13 +11,13 @@ Errors, efforts and forces are measured over the time of the task only, from the
 that `trilat sim` writes.
 
 Invariant:
-    - The numbers of a run depend on its scenario alone. The number of processes, their order
-      and interruptions have no influence.
+    - The results of a run depend only on its scenario. The number of processes, their order and
+      interruptions have no influence.
     - A run that is in the journal of the folder is not executed again. A run with other gains
       counts as another run, and so does the repetition of a run over twice its length.
-    - The duration of a run has no limit except `MAX_RUN_TICKS`. If this limit ends a run, its
-      text says so.
-    - A folder contains only runs of one version of the program on one kind of arithmetic, see
+    - The duration of a run has no limit except `MAX_RUN_TICKS`. If this limit ends a run, the
+      explanation of its judgement says so.
+    - A folder contains only runs of one version of the program with one kind of arithmetic, see
       `describe_program`.
 """
 
@@ -88,7 +88,7 @@ All joints stay within `SETTLED_ERROR_RAD` of their final angles.
 TIME_CONSTANTS = 6.0
 """Duration of a run whose judgement needs more time, in units of its slowest time constant."""
 MAX_RUN_TICKS = 3_000_000
-"""Largest number of ticks to which a run is made longer, over all sites.
+"""Largest number of ticks, over all sites, to which a run is extended.
 
 It is a safety limit for the memory: three sites at 1 kHz reach it after 1000 s, when their
 records take a quarter of a gigabyte. A repetition over twice the length may take twice as many.
@@ -96,8 +96,8 @@ records take a quarter of a gigabyte. A repetition over twice the length may tak
 STIFFNESS_S = 2.0
 """Time after the first contact at which the stiffness is measured, in s.
 
-Laws that integrate an error in contact become stiffer with time, so a later measurement would
-be one of the duration of the run.
+Laws that integrate an error in contact become stiffer with time, so the result of a later
+measurement would depend on its time.
 """
 STIFFNESS_WINDOW_S = 0.2
 """Duration over which positions and forces are averaged for the stiffness, in s."""
@@ -115,7 +115,7 @@ It is half of the least force of the wall that counts as contact, so the slave k
 class BenchRunItem(NamedTuple):
     """Everything that a worker process needs to execute one run of the benchmark.
 
-    The object can be pickled, and is thus sent to the process.
+    The object is pickled and sent to the process.
 
     Attributes:
         cell: The task, control law and link of the run, with the tuned gains.
@@ -136,7 +136,7 @@ class BenchRunItem(NamedTuple):
     def run(self) -> BenchRun:
         """Simulates a run of the benchmark, judges its stability, and measures its performance.
 
-        The function needs nothing but its argument. Therefore any worker process can call it.
+        The function depends only on its argument, so any worker process can call it.
 
         Returns:
             The finished run, ready for the journal. It has the judgement of its stability and
@@ -156,14 +156,14 @@ class JudgedRun(NamedTuple):
         scenario: Scenario of the run. Its duration is that of the run.
         records: All records of the run, by site.
         end: Analysis of the end of the run.
-        twins: Growth of the small disturbances of the twins. None if the roots decide without
+        twins: Growth of the small disturbances of the twins. `None` if the roots decide without
             them.
         roots: Characteristic roots of the loop at the end of the run.
         stability: The judgement.
         text: Explanation of the judgement.
         at_limit: True if the run would have needed more than `MAX_RUN_TICKS` ticks (control
             periods).
-        rests_on: What the judgement rests on, as in the stability certificate.
+        rests_on: Evidence for the judgement, as in the stability certificate.
     """
 
     scenario: Scenario
@@ -248,7 +248,7 @@ def _run_bench_tasks(items: Sequence[BenchRunItem]) -> Iterator[BenchRun]:
                 n = chosen[index]
                 finished[n] = _measure_item(part[n], scenarios[n], whole)
         except CodeFailed:
-            # One by one, the runs before the one whose code fails are kept.
+            # One by one, so that runs before a run whose code fails are kept.
             finished.clear()
         for n, item in enumerate(part):
             yield finished[n] if n in finished else item.run()
@@ -296,7 +296,8 @@ def _measure_item(item: BenchRunItem, scenario: Scenario, whole: WholeRun) -> Be
         at_limit=judged.at_limit,
     )
     if judged.diverged:
-        # Errors and efforts of a run that ended early cannot be compared with those of others.
+        # Errors and efforts of a run that ended early cannot be compared with those of other
+        # runs.
         return run
 
     task = TASKS[cell.task]
@@ -342,10 +343,10 @@ def _compute_longest_s(scenario: Scenario) -> float:
 
 
 def _find_slowest_s(judged: JudgedRun) -> float:
-    """Returns the slowest time constant of a run, in s. 0 if nothing decays.
+    """Returns the slowest time constant of a run, in s, or 0 if nothing decays.
 
-    It is that of the slowest root of the loop. If the loop has no roots, it is that of the
-    slowest decay of an envelope of the motion, or of a push in a twin.
+    It is the time constant of the slowest root of the loop. If the loop has no roots, it is the
+    time constant of the slowest decay of an envelope of the motion, or of a push in a twin.
     """
     root_per_s = judged.roots.rate_per_s
     if root_per_s is not None:
@@ -382,7 +383,7 @@ def _measure(run: BenchRun, judged: JudgedRun, duration_s: float) -> BenchRun:
         spec = scenario.sites[name]
         arm = build_arm_rows(scenario, name)
 
-        # the torque that holds the arm against gravity is no effort of the law
+        # The torque that holds the arm against gravity does not count as effort of the law.
         effort = record.tau - arm.gravity_torque(record.q)
         squared_efforts.append(np.mean(effort**2))
         if spec.hands:
@@ -418,7 +419,7 @@ def _measure(run: BenchRun, judged: JudgedRun, duration_s: float) -> BenchRun:
 def _is_bounded(scenario: Scenario, records: dict[str, RecordBatch]) -> bool:
     """Returns True if no joint was thrown far away or became too fast in a run.
 
-    A run can be judged as settled and still be unusable, because an arm swung round before.
+    A run can be judged as settled and still be unusable, because an arm has swung round.
 
     Args:
         scenario: The scenario, which has the start angles.
@@ -438,9 +439,9 @@ def _is_bounded(scenario: Scenario, records: dict[str, RecordBatch]) -> bool:
 def _compute_hand_torque(scenario: Scenario, name: str, record: RecordBatch) -> Array:
     """Computes the torque of the operators on the joints of an arm.
 
-    The records have -tau_x, the sum of all torques from outside. It also contains the viscous
-    friction -D qd of the joints, which is removed by adding D qd. Walls are not removed: the
-    function is meant for arms that touch none.
+    The records contain -tau_x, the sum of all external torques. This sum includes the viscous
+    friction -D qd of the joints, which is removed by adding D qd. Forces of walls are not
+    removed: the function is meant for arms that touch no wall.
 
     Args:
         scenario: The scenario.
@@ -496,7 +497,7 @@ def _find_settled_s(records: dict[str, RecordBatch]) -> float | None:
         records: All records of the run, by site.
 
     Returns:
-        The time in s. None if it is less than `REST_S` before the end of the run, because the
+        The time in s. `None` if it is less than `REST_S` before the end of the run, because the
         arms may then still be moving.
     """
     settled_s = 0.0
@@ -513,12 +514,12 @@ def _find_settled_s(records: dict[str, RecordBatch]) -> float | None:
 
 
 def _measure_contact(run: BenchRun, item: BenchRunItem, judged: JudgedRun) -> BenchRun:
-    """Measures how stiff and how heavy the wall feels to the user, over the coupled arms.
+    """Measures the stiffness and the impedance that the user feels at the wall.
 
     Args:
         run: The run without these numbers.
         item: The run of the task `contact`, as it was executed.
-        judged: The same run with its records. "Far" is the full reach of the user.
+        judged: The same run with its records.
 
     Returns:
         The run with the numbers that could be measured.
@@ -540,7 +541,7 @@ def _measure_contact(run: BenchRun, item: BenchRunItem, judged: JudgedRun) -> Be
 
 
 def _find_contact_s(scenario: Scenario, records: dict[str, RecordBatch]) -> float | None:
-    """Returns the time at which the slave first touches a wall, in s. None if it does not.
+    """Returns the time at which the slave first touches a wall, in s, or `None` if it does not.
 
     The rendered stiffness is measured a fixed time after this contact.
 
@@ -564,8 +565,7 @@ def _run_variant(
 ) -> tuple[Scenario, dict[str, RecordBatch]] | None:
     """Executes a benchmark run with other settings, without a judgement.
 
-    Two variants of a run, for example with and without a sine, show a response by their
-    difference.
+    The difference between two variants, for example with and without a sine, shows a response.
 
     Args:
         item: The run.
@@ -573,7 +573,7 @@ def _run_variant(
         duration_s: Duration, in s.
 
     Returns:
-        The scenario and its records. None if the run diverged.
+        The scenario and its records. `None` if the run diverged.
     """
     built = item.cell.build(item.seed)
     overrides = (*built.overrides, *format_settings(settings))
@@ -589,8 +589,8 @@ def _estimate_stiffness(
     """Estimates the stiffness that the user feels along the normal of the wall.
 
     The same run is executed with a shorter reach of the user. The stiffness is the difference
-    of the forces, divided by the difference of the positions of the user's arm. In each run,
-    they are measured `STIFFNESS_S` after its first contact.
+    between the forces, divided by the difference between the positions of the user's arm. In
+    each run, force and position are measured `STIFFNESS_S` after the first contact.
 
     Args:
         item: The run with the longer reach.
@@ -598,7 +598,8 @@ def _estimate_stiffness(
         contact_s: Time of the first contact of the longer reach, in s.
 
     Returns:
-        The stiffness in N/m. None if one of the runs has no contact for so long.
+        The stiffness in N/m. `None` if one of the runs ends earlier than `STIFFNESS_S` after
+        its first contact, or has no contact.
     """
     shorter_run = _run_variant(item, SHORTER_REACH, TASKS[item.cell.task].duration_s)
     if shorter_run is None:
@@ -617,11 +618,11 @@ def _estimate_stiffness(
 
 
 class _Push(NamedTuple):
-    """Where and how hard the user pushes, along the normal of the wall.
+    """Position and force of the user's push along the normal of the wall.
 
     Attributes:
         position_m: Position of the user's end effector along x, in m.
-        force_n: Force of the user on it along x, in N.
+        force_n: Force of the user on the end effector along x, in N.
     """
 
     position_m: float
@@ -631,15 +632,16 @@ class _Push(NamedTuple):
 def _measure_push(
     scenario: Scenario, records: dict[str, RecordBatch], time_s: float
 ) -> _Push | None:
-    """Measures where the user's end effector is and how hard the user pushes, at a given time.
+    """Measures the position of the user's end effector and the user's force at a given time.
 
     Args:
         scenario: The scenario.
         records: All records of the run, by site.
-        time_s: The time, in s. Numbers are averaged over `STIFFNESS_WINDOW_S` around it.
+        time_s: The time, in s. Position and force are averaged over `STIFFNESS_WINDOW_S` around
+            this time.
 
     Returns:
-        The position and the force. None if the run ends before.
+        The position and the force. `None` if the run ends earlier.
     """
     window_s = (time_s - 0.5 * STIFFNESS_WINDOW_S, time_s + 0.5 * STIFFNESS_WINDOW_S)
     tip_motion = _measure_tip(scenario, records, window_s)
@@ -669,8 +671,8 @@ def _measure_tip(
 ) -> _TipMotion | None:
     """Computes the motion of the user's end effector, and the force on it, within a window.
 
-    The force F of the operator on the end effector follows from the torque tau of the operator
-    on the joints: J' F = tau, where J is the Jacobian of the end effector.
+    The force F of the operator on the end effector is computed from the operator's torque tau
+    on the joints by solving J' F = tau, where J is the Jacobian of the end effector.
 
     Args:
         scenario: The scenario.
@@ -678,7 +680,7 @@ def _measure_tip(
         window_s: Start and end of the window, in s.
 
     Returns:
-        The motion along x. None if the run ends within the window.
+        The motion along x. `None` if the run ends within the window.
     """
     start_ns, end_ns = (round(time_s * NS_PER_S) for time_s in window_s)
     if records[USER].t_ns[-1] < end_ns - NS_PER_S // scenario.sites[USER].rate_hz:
@@ -705,12 +707,12 @@ def _estimate_impedance(
 ) -> tuple[float, float] | None:
     """Estimates the impedance |Z| at `IMPEDANCE_HZ` that the user feels, with and without wall.
 
-    The user's arm is shaken by a small sine of force along the normal of the wall. Z is the
+    The user's arm is excited by a small sinusoidal force along the normal of the wall. Z is the
     ratio of the phasors of the user's force and of the velocity, both along the normal. Each
-    phasor is that of the difference between the shaken run and the same run without the sine,
-    so that slow changes of the motion do not count. The run in free motion lacks the wall, and
-    its user moves to the pose that the user has in contact, so that the inertia of the arm is
-    the same.
+    phasor is computed from the difference between the excited run and the same run without the
+    sine, so that slow changes of the motion do not count. In the run in free motion there is no
+    wall, and the user moves to the pose that the user has in contact, so that the inertia of
+    the arm is the same.
 
     Args:
         item: The run of the task `contact`.
@@ -718,7 +720,7 @@ def _estimate_impedance(
         contact_s: Time of the first contact, in s.
 
     Returns:
-        |Z| in contact and in free motion, in N s/m. None if a run is too short or diverges.
+        |Z| in contact and in free motion, in N s/m. `None` if a run is too short or diverges.
     """
     start_s = contact_s + STIFFNESS_S
     end_s = start_s + IMPEDANCE_PERIODS / IMPEDANCE_HZ
@@ -755,9 +757,10 @@ def _estimate_impedance(
 def _run_window(
     item: BenchRunItem, settings: Settings, window_s: tuple[float, float]
 ) -> _TipMotion | None:
-    """Repeats a simulation with other settings, and returns how the user's arm moved.
+    """Repeats a simulation with other settings, and returns the motion of the user's arm.
 
-    Only a given interval of time is returned. None if an arm left its limits.
+    Only the motion within a given time window is returned. The result is `None` if an arm left
+    its limits.
 
     Args:
         item: The run.
@@ -771,12 +774,13 @@ def _run_window(
 def _compute_impedance(shaken: _TipMotion, still: _TipMotion) -> float:
     """Computes the impedance |Z| that the user feels at one frequency, in N s/m.
 
-    The user's arm is shaken by a sine in one of two otherwise equal runs. The difference of the
-    two runs is the response to the sine alone; Z is its force over its velocity.
+    The user's arm is excited by a sine in one of two otherwise equal runs. The difference
+    between the two runs is the response to the sine. Z is the ratio of its force and its
+    velocity.
 
     Args:
         shaken: Motion of and force on the user's end effector in the run with the sine.
-        still: The same in the run without the sine.
+        still: Motion and force in the run without the sine.
     """
     records = len(shaken.force_n)
     turns = IMPEDANCE_PERIODS * np.arange(records) / records
@@ -795,7 +799,7 @@ def _measure_error_rad(scenario: Scenario, records: dict[str, RecordBatch]) -> f
 
     Args:
         scenario: The scenario.
-        records: Records by site, all over the same times.
+        records: Records by site, which must cover the same times.
     """
     slave = records[SLAVE]
     t_s = slave.t_ns / NS_PER_S
@@ -820,13 +824,12 @@ def prepare_bench_folder(plan: BenchPlan, path: Path | None = None) -> BenchFold
 
     Args:
         plan: Plan of the benchmark.
-        path: The folder. None uses a folder that is named after the study, as in
-            runs/bench-full.
+        path: The folder. If `None`, it is named after the study, as in runs/bench-full.
 
     Raises:
-        UsageError: The folder cannot be made, or has other content. The same error is raised
-            if its runs come from another version of the program, or from a machine that
-            computes with other rounding, because these results must not be mixed.
+        UsageError: The folder cannot be created or has other content. The same error is raised
+            if its runs come from another version of the program, or from a machine with
+            different rounding, because such results must not be mixed.
     """
     if path is None:
         path = Path("runs") / f"bench-{plan.study}"
@@ -855,13 +858,13 @@ def prepare_bench_folder(plan: BenchPlan, path: Path | None = None) -> BenchFold
 
 
 def _check_origin(path: Path, folder_origin: str, origin: str) -> None:
-    """Refuses a folder whose runs come from another version or arithmetic than this program.
+    """Rejects a folder whose runs come from another version or arithmetic than this program's.
 
-    Runs of both would not be comparable, because equal scenarios might give other numbers.
+    Runs of both would not be comparable, because equal scenarios might give different results.
 
     Args:
         path: The folder.
-        folder_origin: JSON text that describes the program that made the folder.
+        folder_origin: JSON text that describes the program that created the folder.
         origin: JSON text that describes this program.
 
     Raises:
@@ -892,8 +895,9 @@ def run_bench(
         jobs: Number of processes, as for `trilat_net.bench`.
         on: Cluster that executes the runs, as for `trilat_net.bench`.
         progress: Function that is called with the number of finished runs and of all runs.
-        confirm: Accepted for older programs, and has no effect: every run that is not stable is
-            repeated over twice its length, because a longer run may show that it is stable.
+        confirm: Has no effect, and is accepted for older programs. Every run that is not stable
+            is repeated over twice its duration, because a longer run may show that it is
+            stable.
 
     Returns:
         The results of all runs.
@@ -926,7 +930,7 @@ def run_bench(
 
 
 def _find_kind(item: BenchRunItem) -> tuple[str, str, str]:
-    """Returns a key that is equal for runs that differ in numbers only, such as the delay."""
+    """Returns a key that is equal for runs that differ only in numbers, such as the delay."""
     return item.cell.form, item.cell.law, item.cell.task
 
 
@@ -935,7 +939,7 @@ RUNS_OF_A_JUDGEMENT = 8
 
 
 def _choose_lanes(items: Sequence[BenchRunItem]) -> dict[tuple[str, str, str], str]:
-    """Chooses the runs that are computed side by side with others or with their twins.
+    """Chooses the runs that are computed side by side with other runs or with their own twins.
 
     Args:
         items: The runs that are to be executed.
@@ -960,7 +964,7 @@ def _run_pending(
     on: Workers,
     progress: Progress,
 ) -> None:
-    """Executes the runs that the journal lacks, and stores each run when it ends.
+    """Executes the runs that are not yet in the journal, and stores each run when it ends.
 
     An interrupted benchmark therefore continues where it was. Nothing happens if the journal
     contains all runs.

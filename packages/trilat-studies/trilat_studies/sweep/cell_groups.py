@@ -1,14 +1,14 @@
 """Orders the runs of a sweep so that many of them can be simulated side by side.
 
-A sweep runs a scenario with many combinations of parameters, called cells. Runs that differ in
-numbers only, such as a gain or a delay, share the vector instructions of the processor. A
+A sweep runs a scenario with many combinations of parameters, called cells. Runs that differ
+only in numbers, such as a gain or a delay, are computed together with vector instructions. A
 parameter may also change the structure of the scenario: the control law, the joints of an arm,
-the sites or their tick rates. This module divides the cells into groups of one structure, which
-run one after the other.
+the sites or their tick rates. This module divides the cells into groups with the same
+structure. The groups run one after the other.
 
 Invariant:
     - Every cell of the grid belongs to exactly one group.
-    - Groups change the order of the runs, and no result.
+    - Groups change the order of the runs, but not the results.
 """
 
 from collections.abc import Hashable, Iterator, Sequence
@@ -116,7 +116,7 @@ def find_cell_groups(plan: SweepPlan) -> CellGroups:
 
 
 def _find_structure(plan: SweepPlan, dimension: int, index: int) -> Hashable:
-    """Returns the structure of the scenario of a cell: the first cell with a value on one axis.
+    """Returns the structure of the first scenario that has a given value on one axis.
 
     Args:
         plan: The sweep: its scenario, axes, control laws and seeds.
@@ -124,8 +124,8 @@ def _find_structure(plan: SweepPlan, dimension: int, index: int) -> Hashable:
         index: Index of its value.
 
     Returns:
-        The structure. If the run cannot share vector instructions with others, it is the
-        reason. None if the cell is not a valid scenario.
+        The structure. If the run cannot be computed together with others, the reason is
+        returned instead. `None` if the cell is not a valid scenario.
     """
     stride = prod(plan.shape[dimension + 1 :])
     cell = plan.cell(index * stride)

@@ -6,8 +6,8 @@ again and again, until their corners are neighbours in the grid. A cell is one p
 grid.
 
 Invariant:
-    - The chosen cells are a function of the plan and of the results. They do not depend on the
-      order of the runs or on interruptions.
+    - The chosen cells depend only on the plan and on the results, not on the order of the runs
+      or on interruptions.
     - A box is halved if two of its known points lie on different sides of the edge. An edge
       that enters and leaves a coarse box between two of its corners is not seen.
     - A cell is chosen at most once.
@@ -65,9 +65,9 @@ class EdgeRefinement:
         self._chosen = np.zeros(plan.cells, bool)
 
     def find_next_cells(self, sides: Mapping[int, int]) -> list[int]:
-        """Stores the results of the last simulations, and returns which ones are needed next.
+        """Stores the results of the last simulations, and returns the cells to simulate next.
 
-        They are combinations of the swept parameters (cells) near an edge of stability.
+        These cells are combinations of the swept parameters near an edge of stability.
 
         Args:
             sides: Side of each cell that has run since the last call.
@@ -104,7 +104,7 @@ class EdgeRefinement:
         """Estimates how many parameter combinations will be simulated in a refined sweep.
 
         It is assumed that the edge of stability crosses each panel of the map once. The
-        estimate serves to tell the user how long the sweep will take.
+        estimate is used to tell the user how long the sweep will take.
         """
         panels = sum(1 for _ in self._iterate_panels())
         along_edge = 0
@@ -126,9 +126,9 @@ class EdgeRefinement:
         yield from itertools.product(*indices)
 
     def _find_lines(self, dimension: int, level: int) -> NDArray[np.int64]:
-        """Returns the indices along one axis at which the grid of one resolution has its lines.
+        """Returns the indices along one axis at which the grid of a given level has lines.
 
-        Level 0 is the coarse grid. Each further level halves the distance of the lines.
+        Level 0 is the coarse grid. Each further level halves the distance between the lines.
         """
         last = self._shape[dimension] - 1
         stride = 1 << (self._halvings - level)
@@ -144,8 +144,7 @@ class EdgeRefinement:
     def _mark_panel(self, panel: tuple[int | slice, ...]) -> NDArray[np.bool_]:
         """Marks the parameter combinations of a panel that must be simulated in this round.
 
-        They are the points that halve the boxes of the grid which the edge of stability
-        crosses.
+        These points halve those boxes of the grid that the edge of stability crosses.
 
         Args:
             panel: Index of the panel.
@@ -158,7 +157,7 @@ class EdgeRefinement:
         coarse_lines = [self._find_lines(n, self._level - 1) for n in self._dimensions]
         fine_lines = [self._find_lines(n, self._level) for n in self._dimensions]
 
-        # boxes of the level before all of whose corners have run
+        # boxes of the previous level whose corners have all run
         has_corners = is_chosen[np.ix_(*coarse_lines)]
         for axis in range(len(coarse_lines)):
             # A box needs both of its corners along each axis.
@@ -170,7 +169,7 @@ class EdgeRefinement:
                 lines_in_box.append(lines[(lines >= low) & (lines <= high)])
             points = np.ix_(*lines_in_box)
             # The edge crosses the box if its known points lie on different sides. A point
-            # between two corners may be known from the box beside this one.
+            # between two corners may be known from the neighbouring box.
             known = sides[points]
             known = known[known != NOT_KNOWN]
             if len(known) and (known != known[0]).any():

@@ -1,8 +1,8 @@
 """Lists the gains that a parameter sweep did not vary, as a note for its figures.
 
 A stability map over two parameters also depends on all gains that were the same in every run.
-Without them, nobody could repeat the map. An entry of the list is, for example, "p_d of s: K
-10, gravity 1".
+Without these gains, the map could not be reproduced. An entry of the list is, for example, "p_d
+of s: K 10, gravity 1".
 
 Invariant:
     - A gain is named unless an axis of the sweep changes it for every arm. The defaults of a
@@ -21,12 +21,12 @@ from trilat_net.scenario import Scenario, describe_value
 
 from .sweep_plan import SweepPlan
 
-FAIR_COMPARISON = "laws at their best gains compare fairly by: trilat compare --tune"
+FAIR_COMPARISON = "to compare laws at their best gains, use: trilat compare --tune"
 """Advice that is printed below a comparison of control laws by a sweep."""
 
 
 def describe_fixed_gains(plan: SweepPlan) -> list[str]:
-    """Lists the gains that a sweep did not vary, on which its results depend, too.
+    """Lists the gains that a sweep did not vary, but on which its results also depend.
 
     An entry is a text such as "p_d of s: K 10, gravity 1". Sites with the same law and the same
     gains share a string. A string that applies to all sites names no site.

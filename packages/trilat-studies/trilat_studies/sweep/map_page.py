@@ -8,7 +8,7 @@ colour of a cell depends on the runs of the sweep:
 - With several random seeds per cell, it shows the fraction of runs that are stable. Undecided
   runs are left out.
 - If growth exponents were measured, which are the rates at which small disturbances grow, it
-  shows the exponent. White stands for zero.
+  shows the exponent. White means zero.
 
 Vector files contain the cells as an image, because viewers show seams between adjacent shapes.
 The colours differ in lightness, for grey print and colour-blind readers.
@@ -16,8 +16,8 @@ The colours differ in lightness, for grey print and colour-blind readers.
 Invariant:
     - The page contains only results, lines and commands. Equal results give equal bytes.
     - The colour of a cell depends on its own results alone.
-    - A cell is hatched if half or more of its runs are undecided, or if it should have an
-      exponent and has none.
+    - A cell is hatched if half or more of its runs are undecided, or if its exponent is
+      missing.
 """
 
 import math
@@ -75,7 +75,7 @@ _HATCHED: Any = {
 _LINE_STYLES: tuple[dict[str, Any], ...] = (
     {"color": "#000000", "linestyle": "-", "linewidth": 1.2},
     {"color": "#000000", "linestyle": (0, (4, 1.6)), "linewidth": 1.2},
-    # The last style is that of measured lines, which lie below the others.
+    # The last style is used for measured lines, which lie below the others.
     {"color": "#ddaa33", "linestyle": "-", "linewidth": 2.6},
 )
 # Look of the measured edges of the classes on a map of growth exponents.
@@ -234,7 +234,7 @@ def _wrap_caption(fixed: Sequence[str], form: FigureSize) -> list[str]:
 
     Args:
         fixed: Gains that were not swept, one text per control law.
-        form: Size of the figure, from which the length of a line follows.
+        form: Size of the figure, which determines the length of a line.
     """
     if not fixed:
         return []
@@ -255,7 +255,7 @@ def _write_caption(
         caption: Lines of the caption.
         height_in: Height of the figure, in inches.
         shares_labels: True if the panels share a label. The layout engine moves panels but not
-            this label, so that the space for the label is reserved here.
+            this label, so the space for the label is reserved here.
 
     Returns:
         The position of the top of the caption, as a fraction of the height.
@@ -363,10 +363,11 @@ def _hatch_undecided(axes: Axes, plane: MapPlane, panel: MapPanel) -> None:
 def _draw_edges(
     axes: Axes, plane: MapPlane, edges: Sequence[tuple[float, StabilityEdge]]
 ) -> None:
-    """Draws where runs change between stable and not stable, in each column.
+    """Draws the edges between stable and not stable runs in each column.
 
     The edge of a column lies between two grid points, and is drawn as a vertical line between
-    them. On a map of growth exponents the lines show whether both ways of judging agree.
+    them. On a map of growth exponents, the lines show whether the exponents agree with the
+    verdicts.
 
     Args:
         axes: The panel of the figure.
@@ -454,7 +455,7 @@ def _find_line_style(line: MapLine) -> dict[str, Any]:
 def _extend_positions(axis: PlaneAxis) -> Array:
     """Returns the positions of an axis's values, extended by the borders of the panel.
 
-    A line that is known at the first and the last value is thereby drawn up to the border.
+    A line that is known at the first and the last value is thus drawn up to the border.
     """
     borders = axis.compute_borders()
     first_border = borders[:1]
@@ -465,7 +466,7 @@ def _extend_positions(axis: PlaneAxis) -> Array:
 def _extrapolate_rows(rows: Array, positions: Array) -> Array:
     """Returns a field with an extrapolated row before the first and after the last row.
 
-    The lines of a map are thereby drawn up to its border, half a cell beyond the grid points.
+    The lines of a map are thus drawn up to its border, half a cell beyond the grid points.
 
     Args:
         rows: The field, shape (n, m).
@@ -481,7 +482,7 @@ def _extrapolate_rows(rows: Array, positions: Array) -> Array:
 
 
 def _extrapolate_row(rows: Array, positions: Array) -> Array:
-    """Extends a field of numbers by a row, on the straight line through two nearest rows.
+    """Extends a field of numbers by a row, by linear extrapolation from the two nearest rows.
 
     Args:
         rows: The nearest row and the one behind it, shape (2, m).
@@ -497,10 +498,9 @@ def _extrapolate_row(rows: Array, positions: Array) -> Array:
 
 
 def _find_undecided(plane: MapPlane, panel: MapPanel) -> Any:
-    """Returns which cells of a map have simulations without a clear result, to hatch them.
+    """Returns which cells of a map are hatched, because their simulations have no clear result.
 
-    These are the cells of which half or more of the runs are undecided. On a map of growth
-    exponents, they are the cells without an exponent.
+    Such a cell has half or more undecided runs or, on a map of growth exponents, no exponent.
 
     Returns:
         Flags, shape (y, x).
@@ -554,8 +554,8 @@ def _set_ticks(axis: Axis, plane_axis: PlaneAxis) -> None:
 def _find_exponent_limit(plane: MapPlane) -> float:
     """Returns the growth exponent at which the colour scale of a map ends, in 1/s.
 
-    The limit is 1, 2 or 5 times a power of ten. Four fifths of the exponents do not exceed it,
-    so that a few large exponents do not make all others pale.
+    The limit is 1, 2 or 5 times a power of ten. Four fifths of the exponents do not exceed this
+    limit, so that a few large exponents do not make all others pale.
     """
     # The cells that ran in a refined sweep lie along the edge, where exponents are small.
     panels = plane.panels
@@ -569,7 +569,7 @@ def _find_exponent_limit(plane: MapPlane) -> float:
     decade = 10.0**power
     for step in (1.0, 2.0, 5.0):
         limit = step * decade
-        if limit >= least * (1.0 - 1e-9):  # also if both are equal up to rounding
+        if limit >= least * (1.0 - 1e-9):  # also true if both are equal up to rounding
             return limit
     return 10.0 * decade
 
@@ -577,7 +577,7 @@ def _find_exponent_limit(plane: MapPlane) -> float:
 def _draw_colour_bar(figure: Figure, grid: Sequence[Axes], plane: MapPlane) -> None:
     """Draws the colour bar of growth exponents or of stable shares.
 
-    The pointed ends of the bar of exponents stand for all exponents beyond its limits.
+    The pointed ends of the bar of exponents represent all exponents beyond its limits.
 
     Args:
         figure: The Matplotlib figure.
@@ -750,8 +750,8 @@ def write_map(chart: StabilityMap, folder: Path, width_in: float = COLUMN_IN) ->
 def build_map_page(chart: StabilityMap, picture: str) -> str:
     """Composes the Markdown page of a stability map.
 
-    The page has the commands that make the map, the picture, the number of runs of each class,
-    notes, and for each panel a table of the measured edges of stability.
+    The page has the commands that create the map, the picture, the number of runs of each
+    class, notes, and for each panel a table of the measured edges of stability.
 
     Args:
         chart: The map.
@@ -786,7 +786,7 @@ def build_map_page(chart: StabilityMap, picture: str) -> str:
 def _list_notes(chart: StabilityMap) -> list[str]:
     """Returns the notes below a map: the origin of its lines, and gains that were not swept.
 
-    A line that several panels have is explained once.
+    A line that several panels share is explained once.
     """
     origins = []
     for lines in chart.lines:
@@ -803,7 +803,7 @@ def _list_notes(chart: StabilityMap) -> list[str]:
         )
     if plane.refused:
         refused = count_nouns(plane.refused, "cell")
-        notes.append(f"refused, and without runs: {refused}, not valid as scenarios")
+        notes.append(f"no runs, because the scenario is not valid: {refused}")
 
     notes += [f"gains that were not swept: {text}" for text in chart.fixed]
     if chart.fixed:
@@ -816,7 +816,7 @@ def _list_notes(chart: StabilityMap) -> list[str]:
 def _describe_refined_cells(plane: MapPlane) -> str:
     """Returns how many parameter combinations ran, as in "1243 of 40401 cells ran".
 
-    A refined sweep simulates only those near an edge of stability.
+    A refined sweep simulates only the cells near an edge of stability.
     """
     ran = sum(int((panel.runs > 0).sum()) for panel in plane.panels)
     cells = sum(panel.runs.size for panel in plane.panels)
@@ -896,7 +896,7 @@ def tabulate_edges(plane: MapPlane, panel: MapPanel, lines: Sequence[MapLine]) -
 
 
 def _list_crossings(line: MapLine, plane: MapPlane) -> Iterator[tuple[float, StabilityEdge]]:
-    """Yields where a line of theory crosses the columns of a map.
+    """Yields the crossings of a line of theory with the columns of a map.
 
     The table of edges, the measured limits of stability, compares them with these crossings.
 
@@ -918,7 +918,7 @@ def _list_crossings(line: MapLine, plane: MapPlane) -> Iterator[tuple[float, Sta
 
 
 def _format_edge(edge: StabilityEdge) -> str:
-    """Returns an edge of stability as text, such as "40 to 60", between which values it lies.
+    """Returns an edge of stability as text, such as "40 to 60" for an edge between 40 and 60.
 
     An edge that is computed from theory has a single value, such as "52.3".
     """
@@ -930,7 +930,7 @@ def _format_edge(edge: StabilityEdge) -> str:
 def _format_nearest_edge(value: float, edges: Sequence[StabilityEdge]) -> str:
     """Returns the measured edge that is nearest to a predicted value, as text.
 
-    "-" if there are no edges.
+    The text is "-" if there are no edges.
 
     Args:
         value: Value on the vertical axis, usually that of a line of theory.

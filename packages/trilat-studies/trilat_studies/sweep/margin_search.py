@@ -1,16 +1,16 @@
-"""Searches stability margins: the values of a scenario key at which stability begins or ends.
+"""Finds stability margins: the values of a scenario key at which stability begins or ends.
 
-A sweep runs one scenario on a grid of parameters. At each grid point, this module searches the
+A sweep runs one scenario on a grid of parameters. At each grid point, this module finds the
 edges of stability along one further key, such as "control.d". It runs the scenario at evenly
 spaced values of the key (the scan), and narrows each interval in which stability changes by
-bisection. The edges are reported beside those that theory predicts, as a table, a Markdown page
-and plain values.
+bisection. The edges are reported next to the edges that theory predicts, as a table, a Markdown
+page and plain values.
 
 Invariant:
     - An edge lies between two values that were run, one of them stable and the other not.
-    - Undecided values widen an edge, and count for neither side.
+    - Undecided values widen an edge, and count as neither stable nor unstable.
     - All edges that the scan detects are kept.
-    - The margin of a grid point is a function of its scenario, its seed and the range.
+    - The margin of a grid point depends only on its scenario, its seed and the range.
 """
 
 import json
@@ -47,21 +47,21 @@ _MAX_HALVINGS = 60
 
 StabilityTest = Callable[[float], bool | None]
 """Function that runs the scenario at a value of the key. It returns True if the run is stable,
-False if it is not stable, and None if it is undecided.
+False if it is not stable, and `None` if it is undecided.
 """
 
 
 class KeyMargin(NamedTuple):
     """Limits of stability along one scenario key, found by running selected values of the key.
 
-    An edge is where neighbouring values change from stable to not stable or back.
+    At an edge, neighbouring values change from stable to not stable or back.
 
     Attributes:
         spans: The edges in rising order. There may be several, for example if stability is lost
             at one value and regained at a larger value.
-        stable: If there are no edges, True if all decided values are stable, and False if none
-            is stable. None if there are edges, or if no value was decided.
-        undecided: Number of values at which it remained open whether the run is stable.
+        stable: If there are no edges, True if all decided values are stable, and False if no
+            value is stable. `None` if there are edges, or if no value was decided.
+        undecided: Number of values at which the stability of the run remained undecided.
         runs: Number of values that were run.
     """
 
@@ -80,14 +80,14 @@ class KeyMargin(NamedTuple):
         *,
         whole: bool = False,
     ) -> "KeyMargin":
-        """Searches the limits of stability between two values of a scenario key.
+        """Finds the limits of stability between two values of a scenario key.
 
         The function runs a number of evenly spaced values, and then narrows each interval in
         which stability changes by bisection.
 
         Args:
             stable: Function that runs the scenario at a value of the key. It returns True if
-                the run is stable, False if it is not stable, and None if it is undecided.
+                the run is stable, False if it is not stable, and `None` if it is undecided.
             low: Lower end of the range.
             high: Upper end of the range.
             tolerance: Width of an interval, as a fraction of the value, at which the bisection
@@ -103,8 +103,8 @@ class KeyMargin(NamedTuple):
         def classify(value: float) -> bool | None:
             """Returns whether the scenario is stable at a value of the searched parameter.
 
-            Scan and bisection may come to the same value. It is simulated once, and the result
-            is kept. None means that the run is undecided.
+            If scan and bisection reach the same value, it is simulated only once. The result is
+            `None` if the run is undecided.
             """
             if value not in results:
                 results[value] = stable(value)
@@ -133,7 +133,7 @@ def _narrow_edge(
 ) -> StabilityEdge:
     """Narrows the interval between a stable value and one that is not stable by bisection.
 
-    If undecided values lie between the two sides, both ends of this zone are searched.
+    If undecided values lie between the two sides, both ends of this zone are located.
 
     Args:
         classify: Function that returns whether a value is stable.
@@ -164,17 +164,17 @@ def _narrow_edge(
 def _bisect(
     holds: Callable[[float], bool], low: float, high: float, *, tolerance: float, whole: bool
 ) -> tuple[float, float]:
-    """Narrows the interval between a value where a condition holds and one where it does not.
+    """Narrows the interval between a value where a condition holds and one where it fails.
 
     Args:
         holds: The condition. It holds at `low` and does not hold at `high`.
         low: Lower end of the interval.
         high: Upper end of the interval.
         tolerance: Largest width of the result, as a fraction of its larger end.
-        whole: True to use whole numbers only, down to a width of 1.
+        whole: True to use only whole numbers, down to a width of 1.
 
     Returns:
-        A value where the condition holds, and a larger value where it does not.
+        A value at which the condition holds, and a larger value at which it does not.
     """
     for _ in range(_MAX_HALVINGS):
         largest_width = 1.0 if whole else tolerance * max(abs(low), abs(high))
@@ -217,11 +217,43 @@ class SearchRange(NamedTuple):
         high = format_override_value(self.high)
         return f"{self.key}={low},{high}"
 
+    @classmethod
+    def parse(cls, text: str, tolerance: float = MARGIN_TOLERANCE) -> "SearchRange":
+        """Parses the setting and range of a search for limits, such as "control.d=0.2:3".
+
+        Args:
+            text: Text of the form KEY=FROM:TO.
+            tolerance: Largest width of an edge, as a fraction of its value.
+
+        Raises:
+            UsageError: The text does not have this form, or the tolerance is not within (0, 1).
+        """
+        key, _, ends = text.partition("=")
+        low, colon, high = ends.partition(":")
+        try:
+            search_range = cls(key.strip(), float(low), float(high), tolerance)
+        except ValueError:
+            raise UsageError(
+                f"--margin must have the form KEY=FROM:TO, as in control.d=0.2:3, not {text!r}"
+            ) from None
+
+        if not 0.0 < tolerance < 1.0:
+            raise UsageError(
+                f"--tolerance must be a fraction of the value at the edge, as in 0.005, "
+                f"not {tolerance:g}"
+            )
+
+        is_rising = -float("inf") < search_range.low < search_range.high < float("inf")
+        if not colon or not search_range.key or not is_rising:
+            form = "KEY=FROM:TO with FROM below TO, as in control.d=0.2:3"
+            raise UsageError(f"--margin must have the form {form}, not {text!r}")
+        return search_range
+
 
 class _MarginItem(NamedTuple):
     """Task for a worker process: find the limits of stability at one grid point of a sweep.
 
-    The object can be pickled.
+    The object can be pickled and sent to the process.
 
     Attributes:
         plan: The sweep: its scenario, axes, control laws and seeds.
@@ -252,9 +284,10 @@ class GridPointMargin(NamedTuple):
         margin: The limits that were found by runs.
         linear: The limits within the range at which the linearised loop becomes unstable, in
             rising order.
-        remark: Remark on the linear analysis. Empty if there is none.
+        remark: Remark on the linear analysis. Empty if there is no remark.
         closed: The limit within the range according to a stability criterion in closed form.
-            None if no criterion applies, or if its limit lies outside.
+            `None` if no criterion applies, or if the limit of the criterion lies outside the
+            range.
     """
 
     cell: SweepCell
@@ -265,38 +298,6 @@ class GridPointMargin(NamedTuple):
     closed: float | None
 
 
-def parse_search_range(text: str, tolerance: float = MARGIN_TOLERANCE) -> SearchRange:
-    """Parses the setting and range of a search for limits, such as "control.d=0.2:3".
-
-    Args:
-        text: Text of the form KEY=FROM:TO.
-        tolerance: Largest width of an edge, as a fraction of its value.
-
-    Raises:
-        UsageError: The text does not have this form, or the tolerance is not within (0, 1).
-    """
-    key, _, ends = text.partition("=")
-    low, colon, high = ends.partition(":")
-    try:
-        search_range = SearchRange(key.strip(), float(low), float(high), tolerance)
-    except ValueError:
-        raise UsageError(
-            f"--margin must have the form KEY=FROM:TO, as in control.d=0.2:3, not {text!r}"
-        ) from None
-
-    if not 0.0 < tolerance < 1.0:
-        raise UsageError(
-            f"--tolerance must be a fraction of the value at the edge, as in 0.005, "
-            f"not {tolerance:g}"
-        )
-
-    is_rising = -float("inf") < search_range.low < search_range.high < float("inf")
-    if not colon or not search_range.key or not is_rising:
-        form = "KEY=FROM:TO with FROM below TO, as in control.d=0.2:3"
-        raise UsageError(f"--margin must have the form {form}, not {text!r}")
-    return search_range
-
-
 def search_margins(
     plan: SweepPlan,
     within: SearchRange,
@@ -304,7 +305,7 @@ def search_margins(
     progress: Progress = ignore_progress,
     on: Workers = None,
 ) -> list[GridPointMargin]:
-    """Searches the limits of stability along one scenario key, at each grid point of a sweep.
+    """Finds the limits of stability along one scenario key, at each grid point of a sweep.
 
     A grid point is a combination of the other swept parameters. A limit, called edge, is a
     value of the key at which runs change from stable to not stable or back.
@@ -313,10 +314,10 @@ def search_margins(
         plan: The sweep. Its last axis must be the searched key with two values, the ends of the
             range, as from `SearchRange.format_axis`.
         within: The searched key and its range.
-        jobs: Number of worker processes. None uses all cores.
+        jobs: Number of worker processes. If `None`, all cores are used.
         progress: Function that is called with the number of finished grid points and of all
             grid points.
-        on: Workers to use instead of processes of this computer.
+        on: Workers to use instead of processes on this computer.
 
     Returns:
         The edges of each grid point and random seed, in the order of the grid.
@@ -348,7 +349,7 @@ def search_margins(
 def _search_margin_task(task: _MarginItem) -> GridPointMargin:
     """Finds the limits of stability at one grid point of a sweep, by runs and by theory.
 
-    The function needs nothing but its argument. Therefore any worker process can call it.
+    The function depends only on its argument, so any worker process can call it.
 
     Args:
         task: The grid point (a combination of swept parameters), the seed of the runs, and the
@@ -363,7 +364,7 @@ def _search_margin_task(task: _MarginItem) -> GridPointMargin:
     key, low, high, tolerance = task.range
 
     def load(value: float) -> Scenario:
-        """Returns the scenario of one combination with a value of the searched setting.
+        """Returns the scenario of the grid point with a given value of the searched key.
 
         Args:
             value: Value of the scenario key along which the limit of stability is searched.
@@ -378,7 +379,7 @@ def _search_margin_task(task: _MarginItem) -> GridPointMargin:
             value: Value of the searched key.
 
         Returns:
-            True if the run is stable, False if it is not. None if it is undecided.
+            True if the run is stable, False if it is not, and `None` if it is undecided.
         """
         scenario = load(value)
         longest_s = max(task.plan.longest_s, scenario.duration_s)
@@ -386,7 +387,7 @@ def _search_margin_task(task: _MarginItem) -> GridPointMargin:
 
     whole = False
     try:
-        load(low + (high - low) / 3.0**0.5)  # an irrational number, never a whole one
+        load(low + (high - low) / 3.0**0.5)  # an irrational number, never a whole number
     except ScenarioError:
         whole = True  # the key takes whole numbers only
     margin = KeyMargin.search(is_stable, low, high, tolerance, whole=whole)
@@ -405,9 +406,9 @@ def _search_margin_task(task: _MarginItem) -> GridPointMargin:
 
 
 def _find_nearest(value: float, edges: Sequence[float]) -> float | None:
-    """Returns the predicted limit of stability that is nearest to a measured one.
+    """Returns the predicted limit of stability that is nearest to a measured limit.
 
-    None if there are no predicted limits.
+    The result is `None` if there are no predicted limits.
     """
     return min(edges, key=lambda edge: abs(edge - value), default=None)
 
@@ -447,9 +448,9 @@ class SweepMargins(Result):
         """Returns a table of the limits of stability along the searched key, one row per limit.
 
         The columns are the values of the other swept parameters, the limit from runs, and the
-        limits from the linear analysis and from a closed-form stability criterion. Each limit
-        from theory also has its difference from the limit of the runs. If a combination of the
-        other parameters has no limit, it has a single row.
+        limits from the linear analysis and from a closed-form stability criterion. For each
+        limit from theory, its difference from the limit of the runs is also shown. If a
+        combination of the other parameters has no limit, it has a single row.
         """
         plan = self.plan
         several_seeds = len({point.seed for point in self.found}) > 1
@@ -506,7 +507,8 @@ class SweepMargins(Result):
     def to_dict(self) -> dict[str, Any]:
         """Converts the result to plain values, as `trilat sweep --margin --json` prints it.
 
-        "places" has an entry for each grid point, and "command" repeats the search.
+        The key "places" has an entry for each grid point, and "command" is the command that
+        repeats the search.
         """
         return {
             "command": self.command,
@@ -518,7 +520,7 @@ class SweepMargins(Result):
     def _describe_point(self, point: GridPointMargin) -> dict[str, Any]:
         """Returns the result of one combination of swept parameters as plain values for JSON.
 
-        These are its position in the grid, its random seed and its edges of stability.
+        The values are its position in the grid, its random seed and its edges of stability.
 
         Args:
             point: Margin of the grid point.
@@ -599,8 +601,8 @@ def _format_edge(margin: KeyMargin, span: StabilityEdge | None) -> list[str]:
 
     Args:
         margin: The edges of the grid point.
-        span: The edge. None if the grid point has no edges. The cell then says whether all
-            values were stable or none.
+        span: The edge. `None` if the grid point has no edges. The cell then states whether all
+            values or no values were stable.
     """
     if span is None:
         texts = {
@@ -622,8 +624,8 @@ def _format_theory(span: StabilityEdge | None, value: float | None) -> list[str]
     The deviation is the difference from the measured limit.
 
     Args:
-        span: The measured edge. None if there is no edge, and thus no difference.
-        value: The edge from theory. None if there is no edge: both cells are then "-".
+        span: The measured edge. `None` if there is no edge, and thus no difference.
+        value: The edge from theory. `None` if there is no edge. Both cells are then "-".
     """
     if value is None:
         return ["-", "-"]

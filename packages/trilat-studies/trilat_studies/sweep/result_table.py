@@ -1,6 +1,6 @@
-"""Writes and reads results.csv, the table of a sweep with one row per run, without loading it.
+"""Writes and reads results.csv, the table of a sweep with one row per run, row by row.
 
-A sweep may have millions of runs, whose rows need more memory than a machine has. Therefore
+A sweep may have millions of runs, whose rows need more memory than a machine has. Therefore,
 rows are written one by one, and a large table stays in its file while it is used.
 
 Invariant:
@@ -30,7 +30,7 @@ axis, `law`, `seed`, `random`, the further metrics under their keys, all fields 
 canonical text of the scenario that was run.
 """
 ROWS_IN_MEMORY = 20_000
-"""Number of rows up to which the rows of a table are kept in memory, about 5 kB each."""
+"""Largest number of rows of a table that are kept in memory, about 5 kB each."""
 _SCENARIO_COLUMN = "scenario_changes"
 """Column of the CSV table with the scenario of the row. To save space it contains only the
 differences from the swept scenario, as JSON.
@@ -43,7 +43,7 @@ trace exceeds the default limit of the csv module, 131 072 characters.
 
 
 def iterate_csv(rows: Iterable[Mapping[str, Any]], columns: Sequence[str]) -> Iterator[str]:
-    """Yields a table as CSV text line by line, so that a large one needs little memory.
+    """Yields a table as CSV text line by line, so that a large table needs little memory.
 
     Args:
         rows: The rows, as values by column.
@@ -57,7 +57,7 @@ def iterate_csv(rows: Iterable[Mapping[str, Any]], columns: Sequence[str]) -> It
 class ResultTable:
     """Columns of the file results.csv of a parameter sweep, to write and read its rows.
 
-    Each swept parameter has a column, so that the columns depend on the sweep.
+    Each swept parameter has a column, so the columns depend on the sweep.
 
     Args:
         plan: The sweep: its scenario, axes, control laws and seeds.
@@ -98,7 +98,7 @@ class ResultTable:
         # A run that was not simulated has no motion.
         row["motion"] = row["motion"] or None
         if self._has_text_axis:
-            # An axis of words may contain numbers, whose texts do not show that they are.
+            # An axis of words may contain numbers. Their texts look the same as those of words.
             values = self._plan.cell(row["cell"]).values
             for axis, value in zip(self._plan.axes, values, strict=True):
                 row[axis.key] = value
@@ -142,7 +142,7 @@ class StoredRows(Sequence[ResultRow]):
         for name in table.columns:
             if name not in self._names:
                 raise UsageError(
-                    f"{file}: contains no results of a sweep: the column {name!r} is missing"
+                    f"{file} contains no results of a sweep: the column {name!r} is missing"
                 )
 
     def __len__(self) -> int:
@@ -221,7 +221,7 @@ class StoredRows(Sequence[ResultRow]):
             yield
         except (OSError, ValueError, TypeError, IndexError, KeyError, csv.Error) as error:
             raise UsageError(
-                f"{self._file}: cannot be read as results of a sweep: {error}"
+                f"{self._file} cannot be read as results of a sweep: {error}"
             ) from None
 
 
@@ -242,10 +242,11 @@ def read_rows(file: Path, plan: SweepPlan) -> Sequence[ResultRow]:
 def _read_next(reader: Iterator[list[str]]) -> list[str] | None:
     """Reads the next row of a CSV table, whose cells may hold the whole text of a scenario.
 
-    The limit of the csv module applies to the whole process. Therefore it is raised only here.
+    The limit of the csv module applies to the whole process. Therefore, it is raised only
+    during this call.
 
     Returns:
-        The fields of the row. None after the last row.
+        The fields of the row. `None` after the last row.
     """
     limit = csv.field_size_limit(_LONGEST_CELL)
     try:
@@ -271,8 +272,8 @@ def _list_result_columns(plan: SweepPlan) -> dict[str, type]:
 def list_axis_columns(plan: SweepPlan) -> dict[str, type]:
     """Returns the columns of a CSV table that identify a combination of swept parameters.
 
-    They are its number, the value of each axis, and the control law, with the types by which
-    the table is read again.
+    The columns are the number of the combination, the value of each axis, and the control law.
+    Each column has the type with which the table is read again.
     """
     column_types: dict[str, type] = {"cell": int}
     for axis in plan.axes:
@@ -282,10 +283,10 @@ def list_axis_columns(plan: SweepPlan) -> dict[str, type]:
 
 
 def format_table_cell(value: Any, kind: type) -> str:
-    """Converts a value to a field of a CSV table, from which a number reads back bit for bit.
+    """Converts a value to a field of a CSV table, from which numbers can be read bit for bit.
 
     Args:
-        value: The value. None becomes an empty text.
+        value: The value. `None` becomes an empty text.
         kind: Type of the column.
     """
     if value is None:

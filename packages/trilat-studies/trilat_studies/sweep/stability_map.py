@@ -14,13 +14,13 @@ Limits from theory are drawn as lines, so that they can be compared with the run
   imaginary axis. It accounts for sampling only with the integration scheme `digital`.
 
 Invariant:
-    - The measurements come from the results alone, and the lines from the plan alone.
+    - The measurements come only from the results, and the lines only from the plan.
     - Every run is counted at exactly one grid point. The majority of the decided runs decides
       whether a grid point is stable. A draw leaves the point undecided.
     - A measured edge lies between two decided grid points of a column, one of them stable and
       the other not. If undecided grid points lie between the two, the edge is wider.
-    - A line crosses a column between two neighbouring grid points, of which the theory calls
-      exactly one stable.
+    - A line crosses a column between two neighbouring grid points if exactly one of them is
+      stable according to theory.
 """
 
 import math
@@ -78,7 +78,7 @@ class PlaneAxis(NamedTuple):
     def is_evenly_spaced(self) -> bool:
         """True if the values on an axis of the map are equally spaced, up to rounding.
 
-        It is also true for fewer than three values.
+        The property is also true for fewer than three values.
         """
         steps = np.diff(self.values)
         if len(steps) < 2:
@@ -90,8 +90,8 @@ class PlaneAxis(NamedTuple):
     def positions(self) -> Array:
         """Positions at which the K swept values are drawn along an axis of a map, shape (K,).
 
-        Equally spaced values are drawn at their own positions. Other values, as in 1, 10, 100,
-        are drawn at equal distances, at their indices.
+        Equally spaced values are drawn at their own positions. Other values, such as 1, 10,
+        100, are drawn at equal distances, at their indices.
         """
         if self.is_evenly_spaced:
             return np.array(self.values)
@@ -100,7 +100,8 @@ class PlaneAxis(NamedTuple):
     def compute_borders(self) -> Array:
         """Returns the borders of a map's cells along an axis, halfway between the swept values.
 
-        If all values are at least zero, so are the borders: a delay of -100 ms does not exist.
+        If all values are at least zero, so are the borders, because a delay of -100 ms, for
+        example, does not exist.
 
         Returns:
             Positions, shape (n + 1,) for n values.
@@ -119,7 +120,7 @@ class PlaneAxis(NamedTuple):
         return borders
 
     def refine_columns(self) -> "_FineColumns":
-        """Returns x values for lines from theory, more finely spaced than those of the map.
+        """Returns x values for lines from theory, with a finer spacing than the map's columns.
 
         The intervals between the columns are divided, unless there are many columns already. If
         the values are equally spaced, values beside the outer columns let lines reach the
@@ -140,7 +141,7 @@ class PlaneAxis(NamedTuple):
         fine_values[::steps_per_interval] = values
         on_grid = np.arange(len(values)) * steps_per_interval
 
-        # The first and last cells extend past their values, so the lines do too.
+        # The first and last cells extend beyond their values, and so do the lines.
         if self.is_evenly_spaced:
             borders = self.compute_borders()
             # The borders are half a cell away.
@@ -163,7 +164,7 @@ class PlaneAxis(NamedTuple):
         Such a sweep begins with this grid, and then halves it along the edge of stability.
 
         Args:
-            halvings: Number of halvings of the refined sweep. 0 returns the whole axis.
+            halvings: Number of halvings of the refined sweep. If 0, the whole axis is returned.
         """
         stride = 2**halvings
         last = len(self.values) - 1
@@ -187,8 +188,8 @@ class MapPanel(NamedTuple):
         exponents_per_s: Growth exponent of each grid point, the mean over its seeds, in 1/s,
             shape (y, x). It is the rate at which a small disturbance grows; NaN if it was not
             measured.
-        simulated: Measured limits of stability of another sweep, which simulated its cells, as
-            pairs of a value of x and an interval of y.
+        simulated: Measured limits of stability from another sweep, whose cells were simulated.
+            They are pairs of a value of x and an interval of y.
     """
 
     title: str
@@ -227,8 +228,9 @@ class MapPanel(NamedTuple):
     def share(self) -> Array:
         """Fraction of simulations that are stable, at each grid point of a panel of the map.
 
-        Undecided simulations, for example too short ones, are left out. NaN if all of a grid
-        point are undecided. The shape is (number of y values, number of x values).
+        Undecided simulations, for example too short ones, are left out. The fraction is NaN if
+        all simulations of a grid point are undecided. The shape is (number of y values, number
+        of x values).
         """
         stable = self.stable
         decided = self.decided
@@ -240,7 +242,7 @@ class MapPanel(NamedTuple):
         """Fills the grid points that a refined sweep did not run, so that a map can be drawn.
 
         Such a point gets the class of the nearest point that was run. Growth exponents are
-        interpolated linearly between the grid points that have one.
+        interpolated linearly between the grid points that have an exponent.
         """
         from scipy.interpolate import griddata
         from scipy.ndimage import distance_transform_edt
@@ -260,7 +262,7 @@ class MapPanel(NamedTuple):
             all_points = np.indices(exponents_per_s.shape).reshape(2, -1).T
             nearest = find_nearest(np.isnan(exponents_per_s))
             filled = exponents_per_s[tuple(nearest)]
-            # points on one line span no area in which to interpolate
+            # Points on one line span no area in which to interpolate.
             has_area = min(np.ptp(known_points, axis=0)) > 0
             if has_area:
                 values = exponents_per_s[tuple(known_points.T)]
@@ -310,7 +312,7 @@ class MapPlane(NamedTuple):
     def seeds(self) -> int:
         """Largest number of simulations at a grid point, which differ in their random seeds.
 
-        1 if the sweep has a single seed.
+        It is 1 if the sweep has a single seed.
         """
         return max(int(panel.runs.max()) for panel in self.panels)
 
@@ -360,17 +362,18 @@ class MapPlane(NamedTuple):
         """Arranges the runs of a sweep for a map over two of the swept parameters.
 
         The axes are the first two swept keys with numeric values. Each combination of the other
-        keys gets a panel of its own. Rows are read one after the other, so that they need not
-        fit into memory.
+        keys gets a panel of its own. Rows are read one after the other, so they need not fit
+        into memory.
 
         Args:
             rows: One mapping per run. It has a value for each swept key, the result of the run
                 under the key "verdict", such as "converged", and possibly the rate at which a
                 disturbance grows under "exponent_per_s".
-            axes: The swept keys, in the order of the sweep. The key "law" stands for the
-                control law, if several laws were swept.
+            axes: The swept keys, in the order of the sweep. The key "law" means the control
+                law, if several laws were swept.
             scenario: The swept scenario, from which the labels are taken.
-            grid: All values of each swept key. None collects them from the rows.
+            grid: All values of each swept key. If `None`, the values are collected from the
+                rows.
 
         Returns:
             The axes and the panels.
@@ -428,9 +431,9 @@ class MapPlane(NamedTuple):
 
 
 class _PanelRuns:
-    """Counts the simulations of one panel of a map by grid point and by how they ended.
+    """Counts the simulations of one panel of a map by grid point and by result.
 
-    It also averages their growth exponents.
+    The growth exponents of each grid point are averaged.
 
     Args:
         x: Horizontal axis.
@@ -466,7 +469,7 @@ class _PanelRuns:
     def compute_exponents(self) -> Array:
         """Returns the mean rate at which a small disturbance grows, for each grid point.
 
-        It is negative where disturbances decay, see `MapPanel`.
+        The rate is negative where disturbances decay, see `MapPanel`.
         """
         runs = self.counts.sum(axis=2)
         exponents_per_s: Array = self._sums_per_s / np.maximum(runs, 1)
@@ -480,8 +483,8 @@ _CLASS_INDEX = {verdict.value: index for index, verdict in enumerate(CELL_CLASSE
 def _format_panel_title(settings: PanelSettings, scenario: Scenario) -> str:
     """Returns the title of a panel of the stability map, such as "p d, delay 200 ms".
 
-    Numbers are given with the name and unit of their key. Other values are given alone, with
-    spaces for underscores, except for the name of a law, which stays as it is.
+    Numbers are given with the name and unit of their key. Other values are given alone. Their
+    underscores become spaces, except in the name of a law.
     """
     texts = []
     for key, value in settings:
@@ -503,7 +506,8 @@ class StabilityEdge(NamedTuple):
     Attributes:
         low: Largest decided value below the edge.
         high: Smallest decided value above the edge.
-        stable_below: True if the values below the edge are stable, False if those above are.
+        stable_below: True if the values below the edge are stable, False if the values above it
+            are.
         sharp: True if the interval contains no undecided value.
     """
 
@@ -516,7 +520,7 @@ class StabilityEdge(NamedTuple):
     def middle(self) -> float:
         """Centre of the interval in which the limit of stability lies.
 
-        It has the unit of the parameter along which the limit was searched.
+        The unit is that of the parameter along which the limit was searched for.
         """
         return 0.5 * (self.low + self.high)
 
@@ -524,21 +528,21 @@ class StabilityEdge(NamedTuple):
 _GRAVITY = slice(3, 5)
 """Indices of the arm parameters of Eq. (24) that appear in the gravity torque."""
 _ROUNDING = 1e-6
-"""Tolerance of rounding errors, of delays in ticks and of the relative position of an edge."""
+"""Tolerance for rounding errors, for delays in ticks and for relative positions of edges."""
 
 
 class StabilityCriterion(NamedTuple):
     """A stability condition in closed form, evaluated for one scenario.
 
-    The condition is an inequality between parameters of the scenario, such as a gain and a
-    delay, which is known from theory.
+    The condition is an inequality from theory between parameters of the scenario, such as a
+    gain and a delay.
 
     Attributes:
         symbol: Equation of the limit of the condition, in TeX, for the legend of a figure.
         text: The same equation as plain text.
         source: Origin of the condition, and whether it is necessary or sufficient.
-        excess: Difference of the two sides of the inequality, in its unit. Positive if the
-            condition is met.
+        excess: Difference between the two sides of the inequality, in their unit. Positive if
+            the condition is met.
     """
 
     symbol: str
@@ -548,7 +552,7 @@ class StabilityCriterion(NamedTuple):
 
     @classmethod
     def evaluate(cls, scenario: Scenario) -> "StabilityCriterion | None":
-        """Evaluates for a scenario the stability condition in closed form that applies to it.
+        """Evaluates the closed-form stability condition that applies to a scenario.
 
         For example, equal arms under the law P+d are stable if the damping exceeds a certain
         multiple of the stiffness times the delay. A map shows where the condition is just met,
@@ -558,9 +562,9 @@ class StabilityCriterion(NamedTuple):
             scenario: The scenario to which the condition is applied.
 
         Returns:
-            The condition. None if the scenario violates a hypothesis of every known condition,
-            for example because it changes while it runs, or because a site stops following a
-            peer whose samples are too old.
+            The condition. `None` if the scenario violates a hypothesis of every known
+            condition, for example because a parameter changes during the run, or because a site
+            stops following a peer whose samples are too old.
         """
         stops_following = any(spec.on_stale.action != "use" for spec in scenario.sites.values())
         if scenario.timeline or stops_following:
@@ -588,12 +592,12 @@ def _evaluate_damping_criterion(scenario: Scenario) -> StabilityCriterion | None
 
         d > max(abs(lambda_min), 0.2172) K T.
 
-    Under these conditions the loop has no root on the unit circle for all masses down to d h,
+    Under these conditions, the loop has no root on the unit circle for any mass above d h,
     where h is the period of a tick. No damping stabilises lighter arms at this tick rate
     (docs/theory/damping-conditions.md, 13).
 
     Returns:
-        The condition. None if it does not cover the scenario.
+        The condition. `None` if it does not cover the scenario.
     """
     if scenario.scheme != "second_order":
         return None
@@ -617,7 +621,7 @@ def _evaluate_damping_criterion(scenario: Scenario) -> StabilityCriterion | None
     delays_ticks = []
     for delay_s in delays_s:
         delay_ticks = math.ceil(delay_s * rate_hz - _ROUNDING)
-        delays_ticks.append(max(1, delay_ticks))  # a sample is used in the next tick at best
+        delays_ticks.append(max(1, delay_ticks))  # used at the next tick at the earliest
     if len(K) == 2:
         mean_delay_ticks = 0.5 * sum(delays_ticks)
         pair_excess = _compute_pair_excess(K, d, mean_delay_ticks, rate_hz)
@@ -651,16 +655,16 @@ def _evaluate_damping_criterion(scenario: Scenario) -> StabilityCriterion | None
     )
 
 
-_DAMPING_SOURCE = "P+d: sufficient whatever the arms weigh, and necessary for the worst masses"
+_DAMPING_SOURCE = "P+d: sufficient for arms of any mass, and necessary for the worst masses"
 
 
 def _find_scalar_gains(spec: SiteSpec) -> tuple[float, float] | None:
     """Returns the gains K and d of a site's P+d law, if they are the same for all joints.
 
-    Different gains are not covered by the criteria, because the arm couples its joints.
+    The criteria do not cover different gains, because the arm couples its joints.
 
     Returns:
-        K in N m/rad and d in N m s/rad. None if the site has another law, no full gravity
+        K in N m/rad and d in N m s/rad. `None` if the site has another law, no full gravity
         compensation, or joints with different gains.
     """
     law: Any = spec.control
@@ -688,9 +692,10 @@ def _sample_unit_circle(delay_ticks: float) -> tuple[Array, Array, Array]:
     - the discrete frequency v = 2 t, in units of 1/h. For small phi it equals phi;
     - the lag 2 t^3 / (1 + 3 t^2), by which the scheme reduces the damping.
 
-    The criteria take an extreme value over all phi, so the angles need no order. The first one
-    stands for the limit phi -> 0. Others lie densely within the first turn of the delay, where
-    phi * `delay_ticks` goes from 0 to 2 pi, and the rest between 0 and pi.
+    The criteria take an extreme value over all phi, so the angles need not be sorted. The first
+    angle approximates the limit phi -> 0. A dense part of the angles covers the first turn of
+    the delay, where phi * `delay_ticks` goes from 0 to 2 pi. The other angles lie between 0 and
+    pi.
 
     Args:
         delay_ticks: Delay of the loop, in ticks.
@@ -711,13 +716,13 @@ def _sample_unit_circle(delay_ticks: float) -> tuple[Array, Array, Array]:
 
 
 def _compute_required_ratio(least_eigenvalue: float, delay_ticks: int) -> float:
-    """Returns how much damping equal sites with the law P+d need, relative to K T.
+    """Returns the damping that equal sites with the law P+d need, relative to K T.
 
     K is the stiffness, d the damping, and T = n h the delay, where h is the tick period. Let a
-    be a number between the least eigenvalue of the matrix of dominance factors (how strongly
-    the sites follow each other) and the largest one, 1. A root on the unit circle at the angle
-    phi, with the discrete frequency v and the lag of `_sample_unit_circle`, requires
-    (docs/theory/damping-conditions.md, 13):
+    be a number between the least eigenvalue of the matrix of dominance factors (the weights
+    with which the sites follow each other) and the largest eigenvalue, 1. A root on the unit
+    circle at the angle phi, with the discrete frequency v and the lag of `_sample_unit_circle`,
+    requires (docs/theory/damping-conditions.md, 13):
 
         d / (K T) = (lag (1 - a cos(n phi)) - a sin(n phi)) / (v n)
 
@@ -747,7 +752,7 @@ def _compute_required_ratio(least_eigenvalue: float, delay_ticks: int) -> float:
 def _compute_pair_excess(
     K: list[float], d: list[float], mean_delay_ticks: float, rate_hz: float
 ) -> float:
-    """Returns by how much two sites with the law P+d exceed the damping that they need.
+    """Returns the excess of two sites' damping under the law P+d over the required damping.
 
     In continuous time, the loop is stable if 2 sqrt(d1 d2) > (T1 + T2) sqrt(K1 K2), with
     stiffnesses K, dampings d and delays T. In the sampled loop, two quantities depend on the
@@ -758,9 +763,9 @@ def _compute_pair_excess(
         effective damping of a site = d - K lag / v, at least 0
         effective mean delay = abs(sin(n phi) + lag cos(n phi)) / v
 
-    The difference of the two sides of the condition is computed with them, and the least value
-    over all frequencies counts. For phi -> 0, the effective quantities are d and
-    (T1 + T2) / 2.
+    The difference between the two sides of the condition is computed with these quantities, and
+    the least value over all frequencies is returned. For phi -> 0, the effective quantities are
+    d and (T1 + T2) / 2.
 
     Args:
         K: Stiffnesses of the two sites, in N m/rad.
@@ -788,10 +793,10 @@ def _compute_pair_excess(
 
 
 def _bound_least_inertia(arm: ArmModel) -> float:
-    """Returns a lower bound of the eigenvalues of the inertia matrix M(q), in kg m^2.
+    """Returns a lower bound on the eigenvalues of the inertia matrix M(q), in kg m^2.
 
-    The bound holds for all poses q. The planar arm with two joints has its least eigenvalue at
-    cos q2 = 1 or -1. Any other arm has at least the inertia of its drives.
+    The bound holds for all poses q. For the planar arm with two joints, the least eigenvalue
+    occurs at cos q2 = 1 or -1. For any other arm, the inertia of the drives is a lower bound.
     """
     if arm.chain is not None:
         return min(joint.armature_kg_m2 for joint in arm.chain.joints)
@@ -812,15 +817,17 @@ def _evaluate_sampling_criterion(scenario: Scenario) -> StabilityCriterion | Non
         Gamma g^2 h < Kp,
 
     where g is the gravitational acceleration, h the period of a tick and Kp the damping gain of
-    the law. This is a rule for arms of about 1 m: a squared length of 1 m^2 is left out. It
-    holds for the integration scheme `digital`, and for delays of at most one tick.
+    the law. This is a rule of thumb for arms of about 1 m, because a factor of length squared,
+    about 1 m^2, is left out. It holds for the integration scheme `digital`, and for delays of
+    at most one tick.
 
-    Only the gains of the parameters in the gravity torque matter, of which the largest counts.
+    Only the gains of the parameters in the gravity torque matter, and the largest of them is
+    used.
 
     Returns:
         The condition for the site with the smallest excess. The excess is Kp - Gamma g^2 h, and
-        is positive if the condition is met. None if a site has another law, or if the condition
-        does not cover the scenario for another reason.
+        is positive if the condition is met. `None` if a site has another law, or if the
+        condition does not cover the scenario for another reason.
     """
     delays_s = _list_delays_s(scenario)
     if scenario.scheme != "digital" or delays_s is None:
@@ -840,8 +847,8 @@ def _evaluate_sampling_criterion(scenario: Scenario) -> StabilityCriterion | Non
         symbol=r"$\Gamma g^2 h = K_p$",
         text="Gamma g² h = Kp",
         source=(
-            "a rule for arms of about 1 m and no delay: "
-            "the estimate of gravity against the lag of a tick"
+            "a rule of thumb for arms of about 1 m and no delay: "
+            "gravity must not be estimated too fast for the tick rate"
         ),
         excess=min(site_excess),
     )
@@ -853,7 +860,7 @@ def _list_delays_s(scenario: Scenario) -> list[float] | None:
     Links with a dominance factor of 0 are left out: their samples have no effect.
 
     Returns:
-        The delays. None if a delay is not constant, or if a link loses messages.
+        The delays. `None` if a delay is not constant, or if a link loses messages.
     """
     delays_s = []
     for site in scenario.names:
@@ -885,19 +892,19 @@ _ABOUT_ROOTS = "where the rightmost root of the linearised loop crosses the imag
 
 _NO_COLUMNS: Array = np.zeros((0, 0))
 _FINE_COLUMNS = 24
-"""Least number of steps along x with which a line from theory is drawn."""
+"""Smallest number of steps along x with which a line from theory is drawn."""
 
 
 class _FineColumns(NamedTuple):
-    """Columns at which a line from theory is computed, between and beside those of a map.
+    """Columns at which a line from theory is computed, between and beside a map's own columns.
 
-    A map with few columns shows a line from theory only at these. Between them a straight
-    connection would be wrong, because the line is curved.
+    A line from theory is curved. If it were computed only at the few columns of a coarse map,
+    the straight connections between them would be wrong.
 
     Attributes:
         values: Values of x, in rising order.
         positions: Positions along the axis at which they are drawn.
-        on_grid: Indices of the columns that are those of the map.
+        on_grid: Indices of those columns that are also columns of the map.
     """
 
     values: tuple[float, ...]
@@ -906,7 +913,7 @@ class _FineColumns(NamedTuple):
 
 
 def _keep_columns(axis: PlaneAxis) -> _FineColumns:
-    """Returns the columns of a map alone, for lines of theory without points between them.
+    """Returns only the columns of a map, for lines of theory without points between them.
 
     Args:
         axis: Horizontal axis of the map.
@@ -946,12 +953,13 @@ class MapLine(NamedTuple):
     def drawn_excess(self) -> Array:
         """The quantity whose zero is the line, at the columns between which the line is drawn.
 
-        These are the fine columns if the line was computed there, otherwise those of the map.
+        The fine columns are used if the line was computed at them, otherwise the columns of the
+        map.
         """
         return self.fine_excess if self.fine_positions else self.excess
 
     def thin_out(self, columns: _FineColumns) -> "MapLine":
-        """Divides a line of theory into its points at a map's columns and those between.
+        """Divides a line of theory into points at a map's columns and points between them.
 
         Args:
             columns: The columns at which the line is given.
@@ -968,7 +976,7 @@ class MapLine(NamedTuple):
     def crosses_map(self) -> bool:
         """True if this line lies between grid points of the map and is therefore visible.
 
-        This is so if somewhere four neighbouring grid points all have a value, and only some of
+        This is the case if any four neighbouring grid points all have a value, and only some of
         them are on the stable side of the line.
         """
         excess = self.drawn_excess
@@ -1024,7 +1032,7 @@ class MapLine(NamedTuple):
             y: Vertical axis of the map.
 
         Returns:
-            The line. None if no condition is known for the scenario, or if the line does not
+            The line. `None` if no condition is known for the scenario, or if the line does not
             cross the map.
         """
         first_criterion: StabilityCriterion | None = None
@@ -1067,7 +1075,7 @@ class MapLine(NamedTuple):
 ZERO_EXPONENT = "exponent = 0"
 """Name of the measured line of zero growth exponents."""
 _ABOUT_TWINS = (
-    "where a small push of the run neither grows nor dies away, straight from cell to cell"
+    "where a small push neither grows nor dies away, interpolated linearly between cells"
 )
 """Explanation of this line on the page of the map."""
 
@@ -1087,7 +1095,7 @@ def _trace_zero_exponent(plane: MapPlane, panel: MapPanel) -> MapLine | None:
         panel: Part of the map with the exponent at each grid point.
 
     Returns:
-        The line. None if it does not cross this part of the map.
+        The line. `None` if it does not cross this part of the map.
     """
     name = ZERO_RATE if plane.is_linear else ZERO_EXPONENT
     line = MapLine(
@@ -1116,13 +1124,14 @@ def trace_linear_analysis(
         y: Vertical axis.
 
     Returns:
-        The line, or None if it does not cross the panel; and remarks of the analysis for the
+        The line, or `None` if it does not cross the panel; and remarks of the analysis for the
         reader of the map, without duplicates.
     """
     decay_columns = []
     all_remarks = list[str]()
     for column in columns:
-        # A growth rate of -infinity means that nothing moves: the grid point is on no side.
+        # A growth rate of -infinity means that nothing moves. The grid point is then on neither
+        # side.
         decay_per_s = [np.nan if np.isinf(rate) else -rate for rate in column.growth_per_s]
         # The drawn line must pass through the precise positions of the limit.
         placed_decay_per_s = _place_zeros(y.values, decay_per_s, column.edges)
@@ -1143,8 +1152,8 @@ def _find_sign_changes(values: Sequence[float]) -> list[int]:
     """Returns the indices n at which the values n and n + 1 have different signs.
 
     Between such values lies an edge of stability, for example where a growth rate becomes
-    positive. Zero counts as negative. Values that are not finite take part in no change of
-    sign.
+    positive. Zero counts as negative. Values that are not finite do not take part in any change
+    of sign.
     """
     indices = list[int]()
     for n, (value, following) in enumerate(pairwise(values)):
@@ -1161,18 +1170,18 @@ def _place_zeros(
     """Changes a quantity along a column so that its linear interpolation is zero at the edges.
 
     The lines of a map are drawn where the linear interpolation between grid points is zero. The
-    quantity may be nonlinear between two grid points. This zero would then differ from the true
+    quantity may be nonlinear between two grid points, so this zero would differ from the true
     zero, the edge. Therefore the value above each edge is changed. Let v be the value below the
     edge, u the value above it, and f the position of the edge in the interval, from 0 to 1. The
-    linear interpolation is zero there if
+    linear interpolation is zero at the edge if
 
         v + f (u - v) = 0,   that is,   u = v (1 - 1/f).
 
     u keeps its sign, which is opposite to that of v. The values are changed from the bottom to
     the top. Therefore v is the value that may have been changed for an edge below it.
 
-    All other values stay. They decide where the line passes between this column and the next
-    one, if it is so steep that it crosses neither column nearby.
+    All other values stay. They determine where a line that is too steep to cross this column or
+    the next one passes between them.
 
     Args:
         values: Values of the axis along the column, in rising order, shape (y,).
@@ -1215,14 +1224,14 @@ def find_criterion_edge(
         high: Upper end of the searched interval.
 
     Returns:
-        The value. None if the criterion has the same sign at both ends, or if it does not apply
-        to a value between them.
+        The value. `None` if the criterion has the same sign at both ends, or if it does not
+        apply to a value between them.
     """
     # imported late: SciPy costs half a second, and most commands do not need it
     from scipy.optimize import brentq
 
     def excess(value: float) -> float:
-        """Returns by how much a value satisfies the condition. Negative if it is violated."""
+        """Returns the margin of the condition at a value, negative if it is violated."""
         evaluated = criterion(value)
         if evaluated is None:
             raise ScenarioError("no criterion covers it")
@@ -1251,7 +1260,7 @@ class StabilityMap(NamedTuple):
         plane: The measurements, as panels.
         lines: Lines of each panel, in the order of the panels.
         remarks: Remarks on the lines for the reader of the map.
-        commands: Commands that make the map again.
+        commands: Commands that create the map again.
         title: Title of the map's page.
         fixed: Gains that were not swept, one text per control law.
     """
@@ -1263,86 +1272,92 @@ class StabilityMap(NamedTuple):
     title: str
     fixed: tuple[str, ...] = ()
 
+    @classmethod
+    def of_sweep(
+        cls,
+        results: SweepResults,
+        commands: tuple[str, ...],
+        jobs: int | None = None,
+        progress: Progress = ignore_progress,
+        *,
+        linearly: bool = True,
+        on: Workers = None,
+        simulated: SweepResults | None = None,
+    ) -> "StabilityMap":
+        """Builds the stability map of a sweep: the results of its runs, and limits from theory.
 
-def build_stability_map(
-    results: SweepResults,
-    commands: tuple[str, ...],
-    jobs: int | None = None,
-    progress: Progress = ignore_progress,
-    *,
-    linearly: bool = True,
-    on: Workers = None,
-    simulated: SweepResults | None = None,
-) -> StabilityMap:
-    """Builds the stability map of a sweep: the results of its runs, and limits from theory.
+        The map shows with which values of two parameters a scenario is stable. Limits from
+        theory are drawn as lines. They are computed only if the map has two numeric axes.
 
-    The map shows with which values of two parameters a scenario is stable. Limits from theory
-    are drawn as lines. They are computed only if the map has two numeric axes.
+        Args:
+            results: Results of the sweep: its plan and one row per run.
+            commands: Commands that create the map. The page of the map shows them.
+            jobs: Number of worker processes for the linear analysis. If `None`, all cores are
+                used.
+            progress: Function that is called while the linear analysis runs.
+            linearly: True to add the line on which the linearised loop becomes unstable. This
+                line takes most of the time.
+            on: Workers that compute the linear analysis. If `None`, processes on this computer
+                are started.
+            simulated: Another sweep over the same axes, whose measured limits are drawn as
+                well.
 
-    Args:
-        results: Results of the sweep: its plan and one row per run.
-        commands: Commands that make the map. The page of the map shows them.
-        jobs: Number of worker processes for the linear analysis. None uses all cores.
-        progress: Function that is called while the linear analysis runs.
-        linearly: True to add the line on which the linearised loop becomes unstable. This line
-            takes most of the time.
-        on: Workers that compute the linear analysis. None starts processes on this computer.
-        simulated: Another sweep over the same axes, whose measured limits are drawn as well.
+        Returns:
+            The map.
 
-    Returns:
-        The map.
+        Raises:
+            UsageError: There is nothing to draw, there would be too many panels, or the other
+                sweep has other axes.
+        """
+        plan = results.plan
+        plane = _build_plane_of_sweep(results)
+        if simulated is not None:
+            plane = _add_simulated_edges(plane, _build_plane_of_sweep(simulated))
+        stability_map = cls(
+            plane=plane,
+            lines=((),) * len(plane.panels),
+            remarks=(),
+            commands=commands,
+            title=plan.base.title or plan.base.name,
+            fixed=tuple(describe_fixed_gains(plan)),
+        )
+        x = plane.x.thin_out(plan.refine)
+        y = plane.y.thin_out(plan.refine)
+        if not y.key or len(y.values) < 2:
+            return stability_map
 
-    Raises:
-        UsageError: There is nothing to draw, there would be too many panels, or the other sweep
-            has other axes.
-    """
-    plan = results.plan
-    plane = _build_plane_of_sweep(results)
-    if simulated is not None:
-        plane = _add_simulated_edges(plane, _build_plane_of_sweep(simulated))
-    stability_map = StabilityMap(
-        plane=plane,
-        lines=((),) * len(plane.panels),
-        remarks=(),
-        commands=commands,
-        title=plan.base.title or plan.base.name,
-        fixed=tuple(describe_fixed_gains(plan)),
-    )
-    x = plane.x.thin_out(plan.refine)
-    y = plane.y.thin_out(plan.refine)
-    if not y.key or len(y.values) < 2:
-        return stability_map
+        loaders = [make_panel_loader(plan, panel, x.key, y.key) for panel in plane.panels]
+        fine = _choose_columns(loaders, x, y)
+        panel_lines = []
+        for panel, load in zip(plane.panels, loaders, strict=True):
+            measured_line = _trace_zero_exponent(plane, panel)
+            closed_form_line = MapLine.trace_closed_form(
+                load, x._replace(values=fine.values), y
+            )
+            if closed_form_line is not None:
+                closed_form_line = closed_form_line.thin_out(fine)
+            panel_lines.append([measured_line, closed_form_line])
+        remarks = list[str]()
+        # The cells of a sweep that is judged linearly have the growth rates already.
+        if linearly and not plane.is_linear:
+            tasks = [(load, x_value, y) for load in loaders for x_value in fine.values]
+            with open_worker_pool(jobs, on, most=len(tasks)) as pool:
+                columns = iter(pool.map(_analyse_column, tasks, progress))
+            # The results come in the order of the tasks, panel by panel and column by column.
+            for lines in panel_lines:
+                panel_columns = [next(columns) for _ in fine.values]
+                line, line_remarks = trace_linear_analysis(panel_columns, y)
+                lines.append(None if line is None else line.thin_out(fine))
+                remarks += line_remarks
 
-    loaders = [make_panel_loader(plan, panel, x.key, y.key) for panel in plane.panels]
-    fine = _choose_columns(loaders, x, y)
-    panel_lines = []
-    for panel, load in zip(plane.panels, loaders, strict=True):
-        measured_line = _trace_zero_exponent(plane, panel)
-        closed_form_line = MapLine.trace_closed_form(load, x._replace(values=fine.values), y)
-        if closed_form_line is not None:
-            closed_form_line = closed_form_line.thin_out(fine)
-        panel_lines.append([measured_line, closed_form_line])
-    remarks = list[str]()
-    # The cells of a sweep that is judged linearly have the growth rates already.
-    if linearly and not plane.is_linear:
-        tasks = [(load, x_value, y) for load in loaders for x_value in fine.values]
-        with open_worker_pool(jobs, on, most=len(tasks)) as pool:
-            columns = iter(pool.map(_analyse_column, tasks, progress))
-        # The results come in the order of the tasks, panel by panel and column by column.
-        for lines in panel_lines:
-            panel_columns = [next(columns) for _ in fine.values]
-            line, line_remarks = trace_linear_analysis(panel_columns, y)
-            lines.append(None if line is None else line.thin_out(fine))
-            remarks += line_remarks
-
-    if plan.refine:
-        panel_lines = [
-            [lines[0], *(_spread_line(line, x, y, fine, plane) for line in lines[1:])]
-            for lines in panel_lines
-        ]
-    crossing_lines = [tuple(filter(None, lines)) for lines in panel_lines]
-    distinct_remarks = tuple(dict.fromkeys(remarks))
-    return stability_map._replace(lines=tuple(crossing_lines), remarks=distinct_remarks)
+        if plan.refine:
+            panel_lines = [
+                [lines[0], *(_spread_line(line, x, y, fine, plane) for line in lines[1:])]
+                for lines in panel_lines
+            ]
+        crossing_lines = [tuple(filter(None, lines)) for lines in panel_lines]
+        distinct_remarks = tuple(dict.fromkeys(remarks))
+        return stability_map._replace(lines=tuple(crossing_lines), remarks=distinct_remarks)
 
 
 def _build_plane_of_sweep(results: SweepResults) -> MapPlane:
@@ -1397,7 +1412,7 @@ def _spread_line(
     Lines of theory are smooth, and the limit in each column of the coarse grid is exact.
 
     Args:
-        line: The line over the coarse grid. None is returned as None.
+        line: The line over the coarse grid. `None` is returned as `None`.
         x: Horizontal axis of the coarse grid.
         y: Vertical axis of the coarse grid.
         fine: Columns at which the line was computed.
@@ -1427,8 +1442,8 @@ def _spread_line(
 def _choose_columns(loaders: Sequence[PanelLoader], x: PlaneAxis, y: PlaneAxis) -> _FineColumns:
     """Returns the columns at which lines from theory are computed.
 
-    They are those of the map if the scenario is not valid between them, for example because
-    only whole numbers are.
+    They are only the columns of the map if the scenario is not valid between them, for example
+    because its key accepts only whole numbers.
     """
     fine = x.refine_columns()
     try:
@@ -1443,7 +1458,7 @@ def _choose_columns(loaders: Sequence[PanelLoader], x: PlaneAxis, y: PlaneAxis) 
 def _analyse_column(task: tuple[PanelLoader, float, PlaneAxis]) -> GrowthColumn:
     """Computes the linear analysis of one column of a panel: growth rates along y.
 
-    Any worker process can call it, so that columns are computed at the same time.
+    Worker processes call this function, so that columns are computed at the same time.
 
     Args:
         task: Function that loads scenarios of the panel, the column's value of x, and the
@@ -1457,7 +1472,7 @@ def _analyse_column(task: tuple[PanelLoader, float, PlaneAxis]) -> GrowthColumn:
 def make_panel_loader(plan: SweepPlan, panel: MapPanel, x: str, y: str) -> PanelLoader:
     """Returns a function that loads the scenario at any point of a panel.
 
-    The lines from theory need scenarios between the grid points of the sweep, too. The function
+    The lines from theory also need scenarios between the grid points of the sweep. The function
     can be pickled, so that other processes can call it.
 
     Args:

@@ -6,9 +6,9 @@ or undecided. A run that is undecided at the end of its duration is extended and
 again.
 
 Invariant:
-    - A result is a function of the cell's scenario and of the longest allowed duration.
-    - A log of the same run gets the same decision, because a cell is judged by
-      `judge.judge_virtual_run`, and its roots are those of `loop_roots`.
+    - A result depends only on the cell's scenario and on the longest allowed duration.
+    - A log of the same run is judged in the same way, because both use
+      `judge.judge_virtual_run` and the roots of `loop_roots`.
     - To save space, a run stores only how the text of its scenario differs from the text of the
       sweep's scenario. The stored difference restores every text exactly.
 """
@@ -44,7 +44,7 @@ if TYPE_CHECKING:
 
 
 class CellClass(StrEnum):
-    """How a simulation of a parameter sweep ended, such as stable or undecided.
+    """Class of the end of a simulation in a parameter sweep, such as converged or undecided.
 
     The values are the words in tables and on pages.
     """
@@ -57,10 +57,10 @@ class CellClass(StrEnum):
 
     @property
     def stable(self) -> bool | None:
-        """True if a run of this class counts as stable, False if not, None if it is not known.
+        """True if a run of this class counts as stable, False if not, `None` if unknown.
 
-        Only converged runs count as stable. Nothing is known of runs that are undecided, and of
-        cells that are refused because they are not valid scenarios.
+        Only converged runs count as stable. The stability is unknown for undecided runs, and
+        for cells that were rejected because they are not valid scenarios.
         """
         if self in (CellClass.UNDECIDED, CellClass.REFUSED):
             return None
@@ -68,7 +68,7 @@ class CellClass(StrEnum):
 
     @classmethod
     def of_decision(cls, stability: Stability, behaviour: EndBehaviour) -> "CellClass":
-        """Returns the class of a run of a sweep, given the decision whether the run is stable.
+        """Returns the class of a run of a sweep, given the judgement of its stability.
 
         A run that is stable or settled counts as converged. A run that is not stable counts as
         diverged if it left its limits, drifts or grows, and otherwise as bounded.
@@ -85,7 +85,7 @@ class CellClass(StrEnum):
 
 
 RUN_CLASSES = tuple(verdict for verdict in CellClass if verdict is not CellClass.REFUSED)
-"""Classes of a cell that ran. A refused cell is not a valid scenario."""
+"""Classes of a cell that was run. A rejected cell is not a valid scenario and is not run."""
 TOTAL_KEYS = ("rms_error_rad", "effort_nm", "force_peak_n", "walls_j")
 """Fields of a result that summarise the whole run, see `RunTotals`."""
 
@@ -94,7 +94,7 @@ _DIVERGING = (EndBehaviour.DIVERGED, EndBehaviour.DRIFTS, EndBehaviour.GROWS)
 
 
 class CellResult(msgspec.Struct, frozen=True):
-    """Result of one simulation of a parameter sweep: how it ended, and what was measured.
+    """Result of one simulation of a parameter sweep: class of its end, and measured values.
 
     Below, e is the error of a site (arm controller) against its reference, and qd the velocity
     of a joint. A cell is a combination of parameter values.
@@ -102,9 +102,9 @@ class CellResult(msgspec.Struct, frozen=True):
     Attributes:
         verdict: Class of the cell.
         motion: Behaviour at the end, as in the stability certificate. It distinguishes growth
-            from divergence, and decay from convergence. None without a run: the cell is not a
-            valid scenario, or was judged by its linear loop. The numbers of its run are then
-            None as well.
+            from divergence, and decay from convergence. `None` if there was no run, because the
+            cell is not a valid scenario or was judged by its linear loop. The measured values
+            of the run are then `None` as well.
         ran_s: Duration of the run, in s, including extensions. It is shorter than planned if an
             arm left its limits.
         extended: Number of times that the duration was doubled.
@@ -112,24 +112,25 @@ class CellResult(msgspec.Struct, frozen=True):
             against its reference.
         end_speed_rad_s: Largest |qd| of the last second, in rad/s.
         error_rate_per_s: Rate of the trend exp(rate t) of |e| over the second half of the run,
-            in 1/s. None without a trend.
-        speed_rate_per_s: Rate of the trend of |qd|, in 1/s. None without a trend.
+            in 1/s. `None` if there is no trend.
+        speed_rate_per_s: Rate of the trend of |qd|, in 1/s. `None` if there is no trend.
         peak_error_rad: Largest |e| of the run, in rad.
-        settled_s: Time from which |e| stays below 0.01 rad, in s. None if |e| is not below
+        settled_s: Time from which |e| stays below 0.01 rad, in s. `None` if |e| is not below
             0.01 rad at the end.
-        diverged_s: Time at which the first site left its limits, in s. None if no site did.
-        rms_error_rad: See `RunTotals`. This field and those down to `walls_j` cover the
+        diverged_s: Time at which the first site left its limits, in s. `None` if no site did.
+        rms_error_rad: See `RunTotals`. The fields from this one to `walls_j` cover the
             scenario's duration without extensions.
         effort_nm: See `RunTotals`.
         force_peak_n: See `RunTotals`.
         walls_j: See `RunTotals`.
-        reasons: Reasons why the run is undecided, or its cell refused, as a string.
+        reasons: Reasons why the run is undecided, or why its cell was rejected, as a string.
         exponent_per_s: Growth exponent over the scenario's duration, from twins (repetitions
-            with a small push), in 1/s, see `measure_exponent`. None without twins, or if no
-            twin moved. In a sweep that is judged linearly, the real part of the rightmost root.
+            with a small push), in 1/s, see `measure_exponent`. `None` if there were no twins,
+            or if no twin moved. In a sweep that is judged linearly, it is the real part of the
+            rightmost root.
         stability: The decision whether the run is stable, as in the stability certificate.
             Empty in results of older versions.
-        rests_on: What the decision rests on, for example exact roots. Empty in results of older
+        rests_on: Evidence for the decision, for example exact roots. Empty in results of older
             versions.
     """
 
@@ -159,7 +160,8 @@ class CellResult(msgspec.Struct, frozen=True):
 
         Args:
             verdict: Class of the cell.
-            reasons: Why the cell is refused or undecided. Empty if the cell is decided.
+            reasons: Reasons why the cell is rejected or undecided. Empty if the cell is
+                decided.
         """
         return cls(
             verdict=verdict,
@@ -180,14 +182,13 @@ class CellResult(msgspec.Struct, frozen=True):
     def is_conclusive(self) -> bool:
         """Returns True if a longer run would very probably end in the same way.
 
-        This is so in each of the following cases:
+        This is the case if one of the following conditions is met:
 
         - An arm left its limits, the arms came to rest, or they drift.
         - The motion grows with a pronounced trend: over the second half of the run, the largest
           speed doubled, or error and speed both halved.
         - The motion is bounded and steady: over the second half of the run, the logarithms of
-        the
-          largest error and of the largest speed changed by at most `FLAT_LOG_CHANGE`.
+          the largest error and of the largest speed changed by at most `FLAT_LOG_CHANGE`.
 
         Decay is not conclusive. Near the limit of stability, a slowly growing motion can be
         hidden by a decaying motion until the decaying motion has vanished.
@@ -205,8 +206,10 @@ class CellResult(msgspec.Struct, frozen=True):
 
 
 TWINS_OF_A_CELL = 4
-"""Number of twins of a run, repeated runs with a small push each. The pushes act on all joints
-at once, on single joints, and under the adaptive law on its estimates.
+"""Number of twins of a run, which are repetitions with a small push.
+
+The pushes act on all joints at once, on single joints and, under the adaptive law, on the
+estimates.
 """
 FLAT_LOG_CHANGE = 0.02
 """Largest change of the logarithm of an amplitude over half a run that counts as constant."""
@@ -215,8 +218,8 @@ FLAT_LOG_CHANGE = 0.02
 def check_sweepable(scenario: Scenario) -> None:
     """Checks that a scenario can be run in a sweep.
 
-    A sweep runs in virtual time in the compiled loop. It refuses scenarios that need a live
-    network, or that this loop cannot run.
+    A sweep runs in virtual time in the compiled loop. Scenarios that need a live network, or
+    that this loop cannot run, are rejected.
 
     Args:
         scenario: The scenario.
@@ -260,9 +263,9 @@ class _CellInProgress:
             self._longest_s = self._end_s
 
     def find_next_end(self) -> float | None:
-        """Returns the time up to which the run has to continue, in s. None if it is finished.
+        """Returns the time to which the run must continue, in s, or `None` if it is finished.
 
-        A run is finished if a longer one would end in the same way, or at the longest duration.
+        A run is finished if a longer run would end in the same way, or at the longest duration.
         Otherwise its duration is doubled.
         """
         if self._is_finished or self._end_s >= self._longest_s:
@@ -280,10 +283,10 @@ class _CellInProgress:
         self._evaluate()
 
     def judge(self) -> CellResult:
-        """Decides how the simulation ended, with the help of the stability certificate.
+        """Classifies the end of the simulation with the help of the stability certificate.
 
-        It is called once, after the last extension, because the certificate needs the roots of
-        the control loop and takes longer than an evaluation.
+        The method is called once, after the last extension, because the certificate needs the
+        roots of the control loop, which take longer than an evaluation.
         """
         judged = judge_virtual_run(self._scenario, self.run)
         decision = judged.decision
@@ -314,9 +317,10 @@ class _CellInProgress:
 def classify_cell(text: str, longest_s: float) -> CellResult:
     """Runs a cell in virtual time and classifies the end of the run.
 
-    While a longer run might have another class (see `CellResult.is_conclusive`), the duration
-    is doubled and the same run continues, at most up to `longest_s`. The decision of the
-    stability certificate about the whole run then gives the class, see `CellClass.of_decision`.
+    As long as a longer run might have another class (see `CellResult.is_conclusive`), the
+    duration is doubled and the same run continues, at most up to `longest_s`. The decision of
+    the stability certificate about the whole run then gives the class, see
+    `CellClass.of_decision`.
 
     A run that chatters at a sampled wall, where its small motions grow, is not extended. Such
     chatter may end after minutes, once the estimates of the law have drifted, but this does not
@@ -337,13 +341,12 @@ def classify_cell(text: str, longest_s: float) -> CellResult:
 
 
 class _JudgedCell(NamedTuple):
-    """Result of a parameter combination that was simulated side by side with others.
-
-    It may have been simulated alone, if it has a property that does not permit this.
+    """Result of a parameter combination that was simulated, if possible with others.
 
     Attributes:
         result: Result of the cell.
-        obstacle: Property because of which the cell ran alone. Empty if there is none.
+        obstacle: Property because of which the cell was run alone. Empty if it ran side by side
+            with others.
     """
 
     result: CellResult
@@ -379,7 +382,7 @@ def classify_cells(scenarios: Iterable[Scenario], longest_s: float) -> Iterator[
 def _run_group(group: "RunGroup", cells: Sequence[_CellInProgress]) -> None:
     """Runs the cells of a group side by side, and extends those that are not conclusive.
 
-    A run is conclusive if a longer one would end in the same way. Finished cells leave the
+    A run is conclusive if a longer run would end in the same way. Finished cells leave the
     group, and the others continue to twice the duration.
 
     Args:
@@ -412,14 +415,14 @@ def measure_exponent(scenario: Scenario) -> float | None:
 
     A twin is a second execution of the run with a small push. The difference between the twin
     and the run changes as exp(exponent t), where t is the time, see `analysis.twin_growth`.
-    Several twins are run, and the largest of their rates over the later part of the run, by
-    which runs are judged, is returned.
+    Several twins are run. The result is the largest of their rates over the later part of the
+    run, which is also used to judge runs.
 
     Args:
         scenario: Scenario of the run.
 
     Returns:
-        The exponent in 1/s, negative if disturbances decay. None if no push moved anything.
+        The exponent in 1/s, negative if disturbances decay. `None` if no push had an effect.
     """
     run = FusedRun(scenario, SETTLED_ERROR_RAD)
     run.advance_to(scenario.duration_s)
@@ -473,10 +476,10 @@ def _chatters(scenario: Scenario, run: FusedRun) -> bool:
 
 
 def _has_pronounced_trend(outcome: CellResult) -> bool:
-    """Returns True if the trend of a growing motion is clear enough to stop watching it.
+    """Returns True if the trend of a growing motion is so clear that the run can be ended.
 
-    This is so if the largest speed doubled over the second half of the run, or if the largest
-    error and the largest speed both halved.
+    This is the case if the largest speed doubled over the second half of the run, or if the
+    largest error and the largest speed both halved.
 
     Args:
         outcome: Result of the run.
@@ -504,7 +507,7 @@ def _log_changes(outcome: CellResult) -> tuple[float, float]:
 def _build_result(
     run: FusedRun, end: RunEnd, totals: Mapping[str, Any], extended: int
 ) -> CellResult:
-    """Returns how a simulation of a sweep has ended, as far as it has been continued.
+    """Returns the result of a simulation of a sweep up to its present end.
 
     Args:
         run: The run.
@@ -550,9 +553,9 @@ def diff_lines(text: str, base: str) -> LineDiff:
     # In reversed order the first occurrence of a line is entered last, and so it is kept.
     first_index = {line: index for index, line in reversed(list(enumerate(base_lines)))}
     parts: list[str | tuple[int, int]] = []
-    next_index = 0  # index of the line in the base that follows the line before
+    next_index = 0  # index in the base after the previous line
     for line in text.split("\n"):
-        # most lines stand behind the line before in the base, too
+        # most lines follow the previous line in the base, too
         follows_base = next_index < len(base_lines) and base_lines[next_index] == line
         index = next_index if follows_base else first_index.get(line)
         if index is None:
@@ -599,10 +602,10 @@ class CellRun(msgspec.Struct, frozen=True):
         scenario: Canonical text of the run's scenario, as differences from the scenario of the
             sweep.
         outcome: Result of the run.
-        metrics: Further metrics of the sweep over the scenario's duration, by key. None for a
+        metrics: Further metrics of the sweep over the scenario's duration, by key. `None` for a
             metric that the run does not have.
         alone: Property because of which the run was computed alone, in a sweep whose runs are
-            computed side by side. Empty if there is none.
+            computed side by side. Empty if it was not computed alone.
     """
 
     cell: int

@@ -6,9 +6,9 @@ a cell. Each cell is run once per random seed. This module parses the axes, laws
 combines them with the scenario, and checks the result before anything runs.
 
 Invariant:
-    - A plan that cannot run is refused before the first run.
-    - Cells are numbered row by row. A cell is a function of the plan and of its number, so that
-      a large grid need not be stored.
+    - A plan that cannot run is rejected before the first run.
+    - Cells are numbered row by row. A cell is computed from the plan and its number, so a large
+      grid need not be stored.
     - The value of an axis is the text of an override, as a user would write it.
     - Ranges are counted in decimal numbers: 0.2:3:0.1 contains 0.3, not 0.30000000000000004.
 """
@@ -34,11 +34,11 @@ from ..run_commands import format_command, format_toml_value, set_options
 from . import sweep_cell
 
 _ON_GRID = Decimal("1e-9")
-"""Tolerance, in steps, within which the end of a range counts as its last value."""
+"""Largest distance, in steps, at which a value counts as equal to the end of a range."""
 _KEYS_WITH_OPTIONS = {
     "seed": "seeds have their own option, as in --seeds 1..20",
     "duration_s": "the duration of a cell depends on its verdict: --duration sets the first "
-    "one, --longest the limit",
+    "duration, --longest the limit",
 }
 """Keys that cannot be swept, each with the option that sets the key instead."""
 _MAX_AXIS_VALUES = 10**12
@@ -50,12 +50,12 @@ _VALUES_EXAMPLE = "as in KEY=0:1600:50 (from, to, step) or KEY=1,2,5"
 class _Steps:
     """Sequence of equally spaced numbers, as texts.
 
-    A text is made only when it is accessed, because a range may have so many values that a list
-    of them would not fit into memory.
+    A text is created only when it is accessed, because a list of all values of a long range
+    might not fit into memory.
 
     Args:
         first: First value.
-        step: Difference of neighbouring values.
+        step: Difference between neighbouring values.
         count: Number of values.
     """
 
@@ -186,8 +186,8 @@ def _build_range(key: str, first: Decimal, last: Decimal, step: Decimal) -> _Ste
     Args:
         key: Scenario key of the axis, for error messages.
         first: First value.
-        last: Largest possible value, or the smallest one if the step is negative.
-        step: Difference of neighbouring values.
+        last: Largest possible value, or the smallest value if the step is negative.
+        step: Difference between neighbouring values.
 
     Raises:
         ScenarioError: The step is 0 or has the wrong sign, or there are too many values.
@@ -284,9 +284,9 @@ def _split_outside_brackets(text: str, separator: str) -> list[str]:
 
 
 def _parse_value(text: str) -> Any:
-    """Returns the value that a text stands for: 0.2 for "0.2", True for "true".
+    """Returns the value that a text represents: 0.2 for "0.2", True for "true".
 
-    A text that is not valid TOML, such as gamma without quotes, stands for itself.
+    A text that is not valid TOML, such as gamma without quotes, is returned unchanged.
     """
     try:
         return tomllib.loads(f"value = {text}")["value"]
@@ -317,8 +317,9 @@ class SweepCell(NamedTuple):
         number: Number of the cell, counted row by row from 0. The law changes slowest, and the
             value of the last axis changes fastest.
         law: Control law of the cell. Empty if the sweep does not vary the law.
-        values: Value of the cell on each axis: a float if it is a number, and else a text.
-        overrides: Overrides KEY=VALUE that turn the scenario of the sweep into the cell's.
+        values: Value of the cell on each axis: a float if it is a number, otherwise a text.
+        overrides: Overrides KEY=VALUE that turn the scenario of the sweep into the scenario of
+            the cell.
     """
 
     number: int
@@ -345,8 +346,7 @@ class SweepPlan(NamedTuple):
             the first seed only, since all others would give the same run.
         longest_s: Longest duration to which a run is extended while its result is undecided, in
             s.
-        judge: How a run is judged, a name of `JUDGES`: by its end, or by repeated runs with a
-            small push.
+        judge: Method by which a run is judged, a name of `JUDGES`.
         metrics: Keys of further metrics from `docs/reference/metrics.md` that are measured in
             each run.
         refine: Number of times that the boxes along the stability edge are halved, see
@@ -403,7 +403,8 @@ class SweepPlan(NamedTuple):
                 f"there is no cell {number}: cells are numbered from 0 to {self.cells - 1}"
             )
 
-        # The number has one digit per dimension of the grid, and the last one changes fastest.
+        # The number has one digit per dimension of the grid, and the last digit changes
+        # fastest.
         remaining_number = number
         indices = list[int]()
         for count in reversed(self.shape):
@@ -423,7 +424,7 @@ class SweepPlan(NamedTuple):
         return SweepCell(number, law, tuple(values), tuple(overrides))
 
     def scenario(self, *more: str) -> Scenario:
-        """Loads the scenario of the sweep with further settings, such as one delay of many.
+        """Loads the scenario of the sweep with further settings, such as a swept delay.
 
         Args:
             more: Further overrides KEY=VALUE.
@@ -547,7 +548,7 @@ def plan_sweep(
     use the law in the scenario already, it keeps the gains of the scenario. Otherwise it gets
     its default gains. Overrides of gains apply in both cases.
 
-    The arguments are explained at `trilat_net.sweep`. Overrides are texts KEY=VALUE.
+    The arguments are explained in `trilat_net.sweep`. Overrides are texts KEY=VALUE.
 
     Returns:
         The checked plan.
@@ -593,7 +594,7 @@ def plan_sweep(
     _check_refinement(plan)
     if judge == "linear" and plan.metrics:
         raise UsageError(
-            "metrics need a run, and --judge linear makes none: leave out one of them"
+            "metrics need a run, but --judge linear runs nothing: leave out one of them"
         )
     if longest_s is None:
         longest_s = plan.default_longest_s
@@ -612,15 +613,15 @@ def plan_sweep(
 MOST_HALVINGS = 16
 """Largest number of times that the boxes along the stability edge are halved."""
 MOST_REFINED_CELLS = 100_000_000
-"""Largest number of cells of a grid that is refined, which takes 4 bytes for each."""
+"""Largest number of cells of a grid that is refined. Each cell takes 4 bytes."""
 _REFINED_AXES = 2
-"""Largest number of axes that are refined, which are those of a map."""
+"""Largest number of axes that are refined: a map has two axes."""
 
 
 def list_refined_axes(axes: Sequence[_SweepAxis]) -> list[int]:
-    """Returns which swept parameters are refined where the results of neighbours differ.
+    """Returns the indices of the axes that are refined where the results of neighbours differ.
 
-    These are the first two with numbers as values. The result has their indices.
+    These are the first two axes whose values are numbers.
 
     Args:
         axes: All axes of the sweep.
@@ -669,8 +670,8 @@ def _resolve_seeds(seeds: int | Sequence[int], scenario_seed: int) -> tuple[int,
     """Returns the seeds of a sweep, without duplicates.
 
     Args:
-        seeds: The seeds, or their number. A number n stands for n consecutive seeds that start
-            with the seed of the scenario.
+        seeds: The seeds, or their number. A number n means n consecutive seeds that start with
+            the seed of the scenario.
         scenario_seed: Seed of the scenario. It is the only seed if `seeds` is empty.
 
     Raises:
@@ -714,10 +715,10 @@ def _load_base(
 ) -> _Base:
     """Loads the scenario of a sweep before its axes and laws are applied.
 
-    The scenario may not be valid by itself. A link of another model may need the delay that an
-    axis sets, and an override may set a gain that only a swept law has. Therefore the scenario
-    is tried alone, then with the first value of each axis, then with the first law, and then
-    with both.
+    The scenario may not be valid by itself. For example, a link may need the delay that an axis
+    sets, or an override may set a gain that only a swept law has. Therefore the scenario is
+    tried alone, then with the first value of each axis, then with the first law, and then with
+    both.
 
     Args:
         written: Scenario as its author wrote it.
@@ -739,18 +740,18 @@ def _load_base(
                 problem = error
             else:
                 return _Base(scenario, forced=bool(law))
-        # If the scenario is not valid even as written, this call raises that error, which helps
-        # the user more than an error of the overrides.
+        # If the scenario is not valid even without overrides, this call raises that error,
+        # which helps the user more than an error of the overrides.
         written.load()
     assert problem is not None
     raise problem
 
 
 def _check_law_name(law: str) -> None:
-    """Refuses the name of a law that does not exist.
+    """Rejects the name of a law that does not exist.
 
     Raises:
-        UsageError: The name is neither that of a built-in law nor a class, as in mylaws:Law.
+        UsageError: The name is neither a built-in law nor a class, as in mylaws:Law.
     """
     built_in = [name for name in LAWS if name != "own"]
     if law not in built_in and ":" not in law:
@@ -794,18 +795,18 @@ def _list_law_overrides(
 def _check_axes(plan: SweepPlan, law_index: int) -> None:
     """Checks that the parameter combinations of a sweep can be simulated with one control law.
 
-    Checking all combinations (cells) of a large grid would take too long. The checked ones have
-    up to `_CHECKED_VALUES` evenly spread values of each axis, with the other axes at their
-    first values, and the corners of the grid. A single combination that is not valid is
-    allowed: the sweep refuses this cell alone.
+    Checking all combinations (cells) of a large grid would take too long. The corners of the
+    grid are checked, and up to `_CHECKED_VALUES` evenly spread values of each axis, with the
+    other axes at their first values. A single combination may be invalid: the sweep then
+    rejects only this cell.
 
     Args:
         plan: The sweep: its scenario, axes, control laws and seeds.
         law_index: Index of the law.
 
     Raises:
-        ScenarioError: A value cannot run with the first nor with the last values of the other
-            axes, no corner can run, or two values of an axis give the same scenario.
+        ScenarioError: A value can run neither with the first nor with the last values of the
+            other axes, no corner can run, or two values of an axis give the same scenario.
     """
     first_cell = [law_index] + [0] * len(plan.axes)
     last_cell = [law_index, *(len(axis.texts) - 1 for axis in plan.axes)]
@@ -857,8 +858,8 @@ def _is_valid(plan: SweepPlan, indices: Sequence[int]) -> bool:
 def spread_indices(count: int) -> list[int]:
     """Returns the indices of the values of an axis that are checked before a sweep runs.
 
-    They are evenly spread over `count` values, include the first and the last one, and are at
-    most `_CHECKED_VALUES`. A grid may be too large to check every cell.
+    At most `_CHECKED_VALUES` indices, including the first and the last one, are spread evenly
+    over `count` values. A grid may be too large to check every cell.
 
     Args:
         count: Number of values.
@@ -907,8 +908,8 @@ _GAINS = {
 def label_axis(key: str, scenario: Scenario | None = None) -> str:
     """Returns the label of an axis in a figure, such as "delay (ms)" for link.delay_ms.
 
-    A delay of links that draw their delays is called stated, because the newest sample counts,
-    so that the age of the samples in use is smaller.
+    If links draw their delays at random, the delay is called stated, because the age of the
+    samples in use is smaller: a newer sample may overtake an older one.
 
     Args:
         key: Scenario key of the axis.
@@ -949,7 +950,8 @@ def _describe_key(key: str, scenario: Scenario | None = None) -> tuple[str, str]
         scenario: Scenario in which the names of operators and walls are looked up.
 
     Returns:
-        The name in words, such as "K of s", and the unit, which is empty if there is none.
+        The name in words, such as "K of s", and the unit, which is empty if the setting has no
+        unit.
     """
     *tables, name = key.split(".")
     subscript = ""
@@ -965,14 +967,14 @@ def _describe_key(key: str, scenario: Scenario | None = None) -> tuple[str, str]
 
 
 def _describe_owner(tables: list[str], scenario: Scenario | None) -> str:
-    """Returns the site, link or actor to which a setting belongs, as the end of a label.
+    """Returns the phrase of a label that names the site, link or actor of a setting.
 
     Args:
-        tables: Names of the tables that contain the key, from the outermost one.
+        tables: Names of the tables that contain the key, from the outermost table.
         scenario: Scenario in which the kind of an operator or a wall is looked up.
 
     Returns:
-        A string such as " of s". Empty if the key is common to all sites or links.
+        A string such as " of s". Empty if the key applies to all sites or links.
     """
     match tables:
         case ["sites", site, ("hands" | "environment") as group, number]:

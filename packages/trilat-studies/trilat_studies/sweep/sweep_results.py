@@ -5,7 +5,7 @@ once per random seed. This module turns the finished runs into a CSV table with 
 It also combines the runs of a cell, prints a summary, and finds the command that repeats a run.
 
 Invariant:
-    - The bytes of the result files depend on the runs alone, and not on the time or the number
+    - The bytes of the result files depend only on the runs, and not on the time or the number
       of worker processes.
     - Reading the CSV table restores all numbers bit for bit.
     - Running the scenario of a row again reproduces the row.
@@ -127,7 +127,7 @@ class SweepResults(Result):
     def iterate_grid_points(self) -> "Iterator[GridPoint]":
         """Yields the summary of each combination of swept parameters.
 
-        `list_grid_points` returns the same as a list.
+        `list_grid_points` returns the same summaries as a list.
         """
         totals = list_totals(self.plan)
         groups = groupby(self.rows, key=lambda row: (row["cell"], row["law"]))
@@ -212,17 +212,17 @@ def read_results(path: Path) -> SweepResults:
     file = path / RESULTS_FILE if is_folder else path
     if not file.is_file():
         hint = f"; continue it with: trilat sweep --resume {path}" if is_folder else ""
-        raise UsageError(f"{file}: there are no results of a sweep{hint}")
+        raise UsageError(f"{file} does not exist: there are no results of a sweep{hint}")
     plan_file = file.with_name(PLAN_FILE)
     if not plan_file.is_file():
         raise UsageError(
-            f"{file}: contains no results of a sweep: there is no {PLAN_FILE} next to this file"
+            f"{file} contains no results of a sweep: there is no {PLAN_FILE} next to this file"
         )
     try:
         plan_text = plan_file.read_text(encoding="utf-8")
         plan = SweepPlan.from_facts(json.loads(plan_text))
     except (OSError, ValueError, KeyError, TypeError):
-        raise UsageError(f"{plan_file}: cannot be read as the plan of a sweep") from None
+        raise UsageError(f"{plan_file} cannot be read as the plan of a sweep") from None
 
     return SweepResults(plan, read_rows(file, plan))
 
@@ -232,7 +232,7 @@ def iterate_cells(
 ) -> Iterator[list[CellRun]]:
     """Yields the finished runs of each cell, ordered by cell and then by seed.
 
-    Worker processes finish in any order, and the results must not depend on it.
+    Worker processes finish in any order, on which the results must not depend.
 
     Args:
         plan: The sweep: its scenario, axes, control laws and seeds.
@@ -261,7 +261,7 @@ def build_cell_rows(plan: SweepPlan, runs: Sequence[CellRun]) -> Iterator[Result
 def _build_row(plan: SweepPlan, entry: CellRun, log: str) -> ResultRow:
     """Returns the table row of a finished simulation, with the command that repeats it.
 
-    It has the parameter values (cell) and the results.
+    The row has the parameter values (cell) and the results.
 
     Args:
         plan: The sweep: its scenario, axes, control laws and seeds.
@@ -302,7 +302,8 @@ def build_sim_command(
 
     Args:
         plan: The sweep: its scenario, axes, control laws and seeds.
-        overrides: Overrides KEY=VALUE that turn the swept scenario into that of the run.
+        overrides: Overrides KEY=VALUE that turn the swept scenario into the scenario of the
+            run.
         seed: Seed of the run.
         duration_s: Duration of the run, in s.
         log: Name of the log.
@@ -322,9 +323,9 @@ def build_sim_command(
 def reproduction_duration_s(plan: SweepPlan, outcome: CellResult) -> float:
     """Returns the duration with which a run must be started to reproduce its row, in s.
 
-    A run that diverged, that is, left the limits of its arms, ended before its planned
-    duration. It is started with the planned duration, and will end early again. Every
-    extension of an undecided run doubles the planned duration.
+    A run that diverged, which means that an arm left its limits, ended before its planned
+    duration. It is started with the planned duration, and will end early again. Every extension
+    of an undecided run doubles the planned duration.
 
     Args:
         plan: The sweep: its scenario, axes, control laws and seeds.
@@ -351,7 +352,7 @@ class GridPoint(NamedTuple):
         counts: Number of runs of each class, such as converged or diverged, in the order of
             `RUN_CLASSES`.
         means: Mean, with its 95 % interval, of each quantity of `list_totals`, over the runs
-            that stayed within the limits of their arms. None for fewer than two such runs.
+            that stayed within the limits of their arms. `None` for fewer than two such runs.
     """
 
     cell: int
@@ -371,7 +372,7 @@ class GridPoint(NamedTuple):
 
     @property
     def stable(self) -> int:
-        """Number of simulations of a combination that were judged stable, at most `decided`."""
+        """Number of simulations of a combination that were judged stable."""
         classes = zip(self.counts, RUN_CLASSES, strict=True)
         return sum(count for count, verdict in classes if verdict.stable)
 
@@ -379,7 +380,8 @@ class GridPoint(NamedTuple):
     def doubtful(self) -> bool:
         """True if the cell is stable with some seeds and not stable with others.
 
-        Chance then decides the result, and more seeds are needed to know how often.
+        The result then depends on chance, and more seeds are needed to estimate the
+        probabilities.
         """
         return 0 < self.stable < self.decided
 
@@ -387,17 +389,17 @@ class GridPoint(NamedTuple):
     def interval(self) -> tuple[float, float]:
         """95 % confidence interval of the probability that a decided simulation is stable.
 
-        The method is Wilson's. Also if 10 runs of 10 are stable, the lower end is below 1,
+        The method is Wilson's. Even if 10 of 10 runs are stable, the lower end is below 1,
         because other seeds might give another result.
         """
         return wilson_interval(self.stable, self.decided)
 
 
 def list_totals(plan: SweepPlan) -> list[str]:
-    """Lists the measured quantities of which a sweep computes means over the seeds.
+    """Lists the measured quantities whose means over the seeds a sweep computes.
 
-    They are the totals that every run computes, such as its RMS error, and the metrics that the
-    sweep requested.
+    These are the totals of every run, such as the RMS error, and the metrics that the sweep
+    requested.
 
     Args:
         plan: The sweep: its scenario, axes, control laws and seeds.
@@ -432,7 +434,7 @@ def encode_grid_points(plan: SweepPlan, points: Iterable[GridPoint]) -> Iterator
         """Returns the texts of one line of the CSV table, by column, for one grid point."""
         decided = point.decided
         stable_share = point.stable / decided if decided else None
-        # The values must stand in the order of the columns above.
+        # The values must be in the order of the columns above.
         values: list[Any] = [point.cell, *point.values, point.law]
         values += [sum(point.counts), *point.counts]
         values += [stable_share, *point.interval]
@@ -456,12 +458,12 @@ _TOTALS = {
 
 
 _MAX_CELLS_SHOWN = 8
-"""Largest number of doubtful or refused cells in the summary. The CSV files have all of them.
+"""Largest number of doubtful or rejected cells in the summary. The CSV files have all of them.
 """
 
 
 def describe_sweep_plan(plan: SweepPlan) -> list[str]:
-    """Tells the user how many simulations a sweep has, and over which values, as lines.
+    """Returns lines that tell the user the number of simulations and the values of a sweep.
 
     Args:
         plan: The sweep: its scenario, axes, control laws and seeds.
@@ -488,7 +490,7 @@ def describe_sweep_plan(plan: SweepPlan) -> list[str]:
 
     first_s = plan.base.duration_s
     longest_s = plan.longest_s
-    extended = f", an undecided one up to {longest_s:g} s" if longest_s > first_s else ""
+    extended = f", undecided runs up to {longest_s:g} s" if longest_s > first_s else ""
     if plan.refine:
         steps = count_nouns(1 << plan.refine, "cell")
         times = count_nouns(plan.refine, "time")
@@ -581,9 +583,9 @@ class _ValueRange:
         self.high = -math.inf
 
     def add(self, value: float | None) -> None:
-        """Updates the smallest and the largest value by the value of one simulation.
+        """Updates the smallest and the largest value with the value of one simulation.
 
-        A value of None, for a simulation that lacks the quantity, changes nothing.
+        `None`, for a simulation that lacks the quantity, changes nothing.
         """
         if value is None:
             return
@@ -602,12 +604,12 @@ class _RowTally:
     Attributes:
         counts: Number of runs of each class.
         extended: Number of runs that were extended.
-        longest_s: Duration of the longest of these, in s.
+        longest_s: Duration of the longest extended run, in s.
         within_limits: Number of runs whose arms stayed within their limits.
-        ranges: Range of each quantity over these runs.
+        ranges: Range of each quantity over the runs within their limits.
         exponents: Range of the growth exponents of all runs.
         not_random: Number of runs in which nothing is random.
-        refusals: Lines on the first cells that are not valid scenarios.
+        refusals: Lines about the first cells that are not valid scenarios.
     """
 
     def __init__(self, quantities: Iterable[str]) -> None:
@@ -658,7 +660,7 @@ def _summarize_seeds(results: SweepResults, not_random: int) -> Iterator[str]:
     """
     if not_random:
         cells = count_nouns(not_random, "cell")
-        yield f"in {cells} nothing is random: one seed was run there, for all"
+        yield f"nothing is random in {cells}: only one seed was run there"
 
     doubtful = []
     doubtful_count = 0

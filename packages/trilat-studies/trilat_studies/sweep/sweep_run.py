@@ -2,14 +2,14 @@
 
 A sweep runs one scenario on a grid of parameters. A cell is one combination of these
 parameters; it is run once per seed of the random numbers. The folder of a sweep contains the
-plan, a journal to which every finished run is appended, and in the end the results. A sweep
-that was interrupted continues after the last finished run.
+plan, a journal to which every finished run is appended, and finally the results. A sweep that
+was interrupted continues after the last finished run.
 
 Invariant:
-    - A folder belongs to one sweep on one kind of arithmetic. Any other sweep is refused,
+    - A folder belongs to one sweep with one kind of arithmetic. Any other sweep is rejected,
       because its results might differ.
-    - The results are a function of the plan. They do not depend on the number of processes, on
-      the order of the runs, or on interruptions.
+    - The results depend only on the plan, and not on the number of processes, on the order of
+      the runs, or on interruptions.
     - A run in the journal is not repeated.
 """
 
@@ -86,8 +86,8 @@ _DIFFERENCES = {
     "arithmetic": "another kind of arithmetic",
     "versions": "another version of the program",
 }
-"""Keys of a plan in which two sweeps may differ, with the words for a message. The first key
-that differs is reported.
+"""Keys of a plan in which two sweeps may differ, each with a phrase for a message. The first
+key that differs is reported.
 """
 
 
@@ -115,11 +115,11 @@ def _build_folder(path: Path, plan: SweepPlan, facts: Mapping[str, Any]) -> Swee
 
 
 def prepare_sweep_folder(plan: SweepPlan, path: Path | None) -> SweepFolder:
-    """Creates the folder of a sweep, or opens one in which some runs are finished.
+    """Creates the folder of a sweep, or opens a folder in which some runs are finished.
 
     Args:
         plan: The sweep: its scenario, axes, control laws and seeds.
-        path: Path of the folder. None creates a new folder with a default name.
+        path: Path of the folder. If `None`, a new folder with a default name is created.
 
     Raises:
         UsageError: The folder contains other files or another sweep, or cannot be created.
@@ -134,12 +134,12 @@ def prepare_sweep_folder(plan: SweepPlan, path: Path | None) -> SweepFolder:
 
 
 def open_sweep_folder(path: Path, expected: SweepPlan | None = None) -> SweepFolder:
-    """Opens the folder of a parameter sweep that was started before.
+    """Opens the folder of a parameter sweep that was started earlier.
 
     Args:
         path: Path of the folder.
-        expected: Sweep that the folder must contain. None accepts any sweep that was started
-            with the arithmetic and program versions of this process.
+        expected: Sweep that the folder must contain. If `None`, any sweep is accepted that was
+            started with the arithmetic and program versions of this process.
 
     Raises:
         UsageError: The folder contains no sweep, or another sweep.
@@ -152,14 +152,14 @@ def open_sweep_folder(path: Path, expected: SweepPlan | None = None) -> SweepFol
             stored_text = _format_fact(key, stored)
             current_text = _format_fact(key, current)
             raise UsageError(
-                f"{path}: contains a sweep with {difference}: {stored_text} in the folder, "
+                f"{path} contains a sweep with {difference}: {stored_text} in the folder, "
                 f"{current_text} now; results cannot be mixed: choose another folder"
             )
     return _build_folder(path, SweepPlan.from_facts(stored), stored)
 
 
 def _format_fact(key: str, facts: Mapping[str, Any]) -> str:
-    """Describes one property of a sweep, so that a message can name how two sweeps differ.
+    """Describes one property of a sweep, so that a message can state how two sweeps differ.
 
     Examples: "wall (sha256 0123456789ab)" for the scenario, "1..20" for the seeds, "60 s" for
     the longest time, "numpy 2.1, numba 0.60" for the versions.
@@ -210,17 +210,15 @@ def _read_facts(path: Path) -> dict[str, Any]:
     try:
         facts = json.loads(file.read_text(encoding="utf-8"))
     except FileNotFoundError:
-        raise UsageError(
-            f"{path}: this folder contains no sweep: {PLAN_FILE} is missing"
-        ) from None
+        raise UsageError(f"{path} contains no sweep: {PLAN_FILE} is missing") from None
     except (OSError, ValueError) as error:
         reason = getattr(error, "strerror", None) or "is not JSON"
-        raise UsageError(f"{file}: cannot be read: {reason}") from None
+        raise UsageError(f"{file} cannot be read: {reason}") from None
     # A plan does not store these keys if they have their defaults.
     optional = {"judge", "metrics", "refine"}
     required = {"source", "folder", "name", *_DIFFERENCES} - optional
     if not isinstance(facts, dict) or not required <= facts.keys():
-        raise UsageError(f"{file}: is not the plan of a sweep")
+        raise UsageError(f"{file} is not the plan of a sweep")
     return facts
 
 
@@ -240,18 +238,18 @@ MAX_RUNS = 1_000_000
 MAX_SWEEP_S = 86_400.0
 """Estimated duration above which the user must confirm a sweep, in s of real time."""
 _PROBES = 7
-"""Largest number of runs from which the duration of a sweep is estimated."""
+"""Largest number of runs that are made to estimate the duration of a sweep."""
 _PROBING_S = 3.0
-"""Time after which the estimate starts no further run, in s of real time."""
+"""Time after which no further run is started for the estimate, in s of real time."""
 _RESUME_HINT = "; finished runs are kept: continue with --resume"
 """Advice for the user after a worker died."""
 
 
 class DurationEstimate(NamedTuple):
-    """Estimated duration of those simulations of a sweep that remain.
+    """Estimated duration of the remaining simulations of a sweep.
 
     Attributes:
-        runs: Largest possible number of runs that remain.
+        runs: Largest possible number of remaining runs.
         seconds: Estimated duration of these runs, in s of real time.
         entries: Runs that were made for the estimate. The sweep does not repeat them.
     """
@@ -259,6 +257,82 @@ class DurationEstimate(NamedTuple):
     runs: int
     seconds: float
     entries: list[CellRun]
+
+    @classmethod
+    def of_sweep(
+        cls, plan: SweepPlan, done: Iterable[tuple[int, int]] = (), jobs: int | None = None
+    ) -> "DurationEstimate":
+        """Estimates the duration of a sweep from a few simulations spread over its parameters.
+
+        Args:
+            plan: The sweep: its scenario, axes, control laws and seeds.
+            done: Finished runs, as pairs of cell number and seed. These runs are not repeated.
+            jobs: Number of worker processes of the sweep. If `None`, all cores are used.
+        """
+        finished_runs = set(done)
+        refinement = EdgeRefinement(plan) if plan.refine else None
+        # A refined sweep must run only the cells that it chooses.
+        cells = refinement.list_coarse_cells() if refinement else range(plan.cells)
+        cell_count = refinement.count_most_cells() if refinement else plan.cells
+        last_cell = len(cells) - 1
+        # evenly spread cells without repetitions
+        probe_cells = dict.fromkeys(
+            cells[n * last_cell // (_PROBES - 1)] for n in range(_PROBES)
+        )
+        seed = plan.seeds[0]
+        probes = [
+            CellItem(plan, plan.cell(number), seed)
+            for number in probe_cells
+            if (number, seed) not in finished_runs
+        ]
+        if not probes:
+            runs = max(0, cell_count * len(plan.seeds) - len(finished_runs))
+            return cls(runs, 0.0, [])
+
+        # A short run first compiles the simulation kernel, once for all processes.
+        warm_up_s = min(1.0, plan.base.duration_s)
+        if plan.judge != "linear":
+            with suppress(ScenarioError):
+                warm_up = plan.scenario(*probes[0].cell.overrides, f"duration_s={warm_up_s!r}")
+                sweep_cell.classify_cell(warm_up.text, warm_up_s)
+
+        clock = SystemClock()
+        started_ns = clock.monotonic_ns()
+        entries: list[CellRun] = []
+        elapsed_s = 0.0
+        for probe in probes:
+            entries.append(probe.run())
+            elapsed_s = (clock.monotonic_ns() - started_ns) * 1e-9
+            if elapsed_s >= _PROBING_S:
+                break
+
+        # If nothing is random, a cell is run with one seed only.
+        seeds = len(plan.seeds) if any(entry.random for entry in entries) else 1
+        runs = max(len(entries), cell_count * seeds - len(finished_runs))
+        workers = min(jobs or count_cores(), runs)
+        seconds = elapsed_s / len(entries) * runs / workers
+        return cls(runs, seconds, entries)
+
+    def refuse_oversized_sweep(self, plan: SweepPlan, jobs: int | None = None) -> None:
+        """Rejects a sweep of more than `MAX_RUNS` runs or `MAX_SWEEP_S` seconds.
+
+        Args:
+            plan: The sweep: its scenario, axes, control laws and seeds.
+            jobs: Number of worker processes. If `None`, all cores are used.
+
+        Raises:
+            UsageError: The sweep is too large. The message states its size and duration.
+        """
+        if self.runs <= MAX_RUNS and self.seconds <= MAX_SWEEP_S:
+            return
+        sizes = " x ".join(str(count) for count in plan.shape if count > 1)
+        seeds = f", {count_nouns(len(plan.seeds), 'seed')} each" if len(plan.seeds) > 1 else ""
+        cells = count_nouns(plan.cells, "cell")
+        cores = count_nouns(jobs or count_cores(), "core")
+        raise UsageError(
+            f"{cells} ({sizes}{seeds}) would take about {format_wall_time(self.seconds)} "
+            f"on {cores}; use larger steps for fewer cells, or run the sweep anyway with --yes"
+        )
 
 
 class FinishedSweep(NamedTuple):
@@ -270,7 +344,7 @@ class FinishedSweep(NamedTuple):
         results: Results of all runs of the sweep.
         folder: Folder of the sweep.
         runs: Number of runs since the last start.
-        simulated_s: Simulated time of these runs together, in s.
+        simulated_s: Total simulated time of these runs, in s.
         wall_s: Real time that these runs took, in s.
         jobs: Number of worker processes.
         alone: Reasons why runs were not computed side by side with others, with the number of
@@ -286,7 +360,7 @@ class FinishedSweep(NamedTuple):
     alone: Mapping[str, int] = {}
 
     def describe_speed(self) -> str:
-        """Returns a sentence on how fast the runs were computed in relation to real time."""
+        """Returns a sentence about the computing speed of the runs in relation to real time."""
         processes = count_nouns(self.jobs, "process")
         wall_time = format_wall_time(self.wall_s)
         ratio = self.simulated_s / (self.wall_s * self.jobs) if self.wall_s else math.nan
@@ -297,7 +371,7 @@ class FinishedSweep(NamedTuple):
 class CellItem(NamedTuple):
     """Everything that a worker process needs to execute one run of a sweep.
 
-    The object can be pickled, and is thus sent to the process.
+    The object is pickled and sent to the process.
 
     Attributes:
         plan: The sweep: its scenario, axes, control laws and seeds.
@@ -315,7 +389,7 @@ class CellItem(NamedTuple):
     def run(self) -> CellRun:
         """Executes one run of a sweep.
 
-        The function needs nothing but its argument. Therefore any worker process can call it.
+        The function depends only on its argument, so any worker process can call it.
 
         Returns:
             The finished run with its result, ready for the journal of the sweep.
@@ -335,7 +409,7 @@ class CellItem(NamedTuple):
 
 
 def _refuse_cell(task: CellItem, error: ScenarioError) -> CellRun:
-    """Returns the result of a simulation that was refused, with the reason and no numbers.
+    """Returns the result of a simulation that was rejected, with the reason and without values.
 
     Args:
         task: The run.
@@ -378,7 +452,7 @@ def _run_cells(tasks: Sequence[CellItem]) -> Iterator[CellRun]:
     try:
         judged_cells = iter(list(sweep_cell.classify_cells(scenarios.values(), longest_s)))
     except (CodeFailed, ScenarioError):
-        # One by one, the runs before the one whose code fails are kept.
+        # One by one, so that runs before a run whose code fails are kept.
         yield from map(CellItem.run, tasks)
         return
     for index, task in enumerate(tasks):
@@ -402,12 +476,12 @@ def _build_scenario(task: CellItem) -> Scenario:
 
 
 def _complete_run(task: CellItem, scenario: Scenario, outcome: CellResult) -> CellRun:
-    """Measures what a sweep needs besides how a simulation ended, and returns all results.
+    """Measures the further metrics of a simulation, and returns all of its results.
 
     Args:
         task: The run.
         scenario: Its scenario.
-        outcome: Its class.
+        outcome: The class of its end.
     """
     plan = task.plan
     if plan.judge == "twins":
@@ -439,9 +513,9 @@ LANE_RUNS = 32
 
 
 def _uses_lanes(plan: SweepPlan, runs: int) -> bool:
-    """Returns True if a sweep is so large that simulating several runs at once pays off.
+    """Returns True if a sweep is so large that simulating several runs at once saves time.
 
-    The code for these SIMD lanes must be compiled first, which takes some ten seconds.
+    The code for these SIMD lanes must be compiled first, which takes about ten seconds.
 
     Args:
         plan: The sweep.
@@ -457,11 +531,11 @@ def _uses_lanes(plan: SweepPlan, runs: int) -> bool:
 def _prepare_lanes(plan: SweepPlan, runs: int) -> bool:
     """Decides whether a sweep simulates several runs at once, and compiles their code for it.
 
-    The code is compiled once for all workers, if the sweep is large. A small sweep uses code
-    that exists from an earlier study, but would not be worth its compilation.
+    If the sweep is large, the code is compiled once for all workers. A small sweep, for which a
+    compilation would take too long, only uses code that exists from an earlier study.
 
     Args:
-        plan: The sweep. The code is that of its first cell.
+        plan: The sweep. The code for its first cell is compiled.
         runs: Number of runs that remain.
     """
     is_large = _uses_lanes(plan, runs)
@@ -482,84 +556,6 @@ def _prepare_lanes(plan: SweepPlan, runs: int) -> bool:
     return prepare_lanes(make_run, runs, least_site_ticks=math.inf)
 
 
-def estimate_sweep(
-    plan: SweepPlan, done: Iterable[tuple[int, int]] = (), jobs: int | None = None
-) -> DurationEstimate:
-    """Estimates how long a sweep takes, by a few simulations spread over its parameters.
-
-    Args:
-        plan: The sweep: its scenario, axes, control laws and seeds.
-        done: Finished runs, as pairs of cell number and seed. They need not be run any more.
-        jobs: Number of worker processes of the sweep. None stands for all cores.
-    """
-    finished_runs = set(done)
-    refinement = EdgeRefinement(plan) if plan.refine else None
-    # A refined sweep must not run other cells than those that it chooses.
-    cells = refinement.list_coarse_cells() if refinement else range(plan.cells)
-    cell_count = refinement.count_most_cells() if refinement else plan.cells
-    last_cell = len(cells) - 1
-    # evenly spread cells, each once
-    probe_cells = dict.fromkeys(cells[n * last_cell // (_PROBES - 1)] for n in range(_PROBES))
-    seed = plan.seeds[0]
-    probes = [
-        CellItem(plan, plan.cell(number), seed)
-        for number in probe_cells
-        if (number, seed) not in finished_runs
-    ]
-    if not probes:
-        runs = max(0, cell_count * len(plan.seeds) - len(finished_runs))
-        return DurationEstimate(runs, 0.0, [])
-
-    # A short run first: it compiles the simulation kernel, once for all processes.
-    warm_up_s = min(1.0, plan.base.duration_s)
-    if plan.judge != "linear":
-        with suppress(ScenarioError):
-            warm_up = plan.scenario(*probes[0].cell.overrides, f"duration_s={warm_up_s!r}")
-            sweep_cell.classify_cell(warm_up.text, warm_up_s)
-
-    clock = SystemClock()
-    started_ns = clock.monotonic_ns()
-    entries: list[CellRun] = []
-    elapsed_s = 0.0
-    for probe in probes:
-        entries.append(probe.run())
-        elapsed_s = (clock.monotonic_ns() - started_ns) * 1e-9
-        if elapsed_s >= _PROBING_S:
-            break
-
-    # If nothing is random, a cell is run with one seed only.
-    seeds = len(plan.seeds) if any(entry.random for entry in entries) else 1
-    runs = max(len(entries), cell_count * seeds - len(finished_runs))
-    workers = min(jobs or count_cores(), runs)
-    seconds = elapsed_s / len(entries) * runs / workers
-    return DurationEstimate(runs, seconds, entries)
-
-
-def refuse_oversized_sweep(
-    plan: SweepPlan, expected: DurationEstimate, jobs: int | None = None
-) -> None:
-    """Refuses a sweep of more than `MAX_RUNS` runs or `MAX_SWEEP_S` seconds.
-
-    Args:
-        plan: The sweep: its scenario, axes, control laws and seeds.
-        expected: Estimated duration of the sweep.
-        jobs: Number of worker processes. None stands for all cores.
-
-    Raises:
-        UsageError: The sweep is too large. The message states its size and duration.
-    """
-    if expected.runs <= MAX_RUNS and expected.seconds <= MAX_SWEEP_S:
-        return
-    sizes = " x ".join(str(count) for count in plan.shape if count > 1)
-    seeds = f", {count_nouns(len(plan.seeds), 'seed')} each" if len(plan.seeds) > 1 else ""
-    cells = count_nouns(plan.cells, "cell")
-    cores = count_nouns(jobs or count_cores(), "core")
-    raise UsageError(
-        f"{cells} ({sizes}{seeds}) would take about {format_wall_time(expected.seconds)} "
-        f"on {cores}; use larger steps for fewer cells, or run the sweep anyway with --yes"
-    )
-
-
 def run_sweep(
     folder: SweepFolder,
     jobs: int | None = None,
@@ -571,16 +567,17 @@ def run_sweep(
 
     Args:
         folder: Folder of the sweep. The runs in its journal are not repeated.
-        jobs: Number of worker processes. None uses all cores.
+        jobs: Number of worker processes. If `None`, all cores are used.
         progress: Function that is called with the number of finished runs and the number of
             runs that are known to be necessary.
-        known: Finished runs, for example from an estimate. They enter the journal and are not
-            repeated.
-        on: Workers to use instead of processes of this computer.
+        known: Finished runs, for example from an estimate. They are added to the journal and
+            are not repeated.
+        on: Workers to use instead of processes on this computer.
 
     Raises:
         ScenarioError: A cell cannot run. The message names the cell. Finished runs are kept.
-        RunFailed: A cell killed its workers, or the cluster is gone. Finished runs are kept.
+        RunFailed: A cell killed its workers, or the cluster is no longer available. Finished
+            runs are kept.
     """
     plan = folder.plan
     clock = SystemClock()
@@ -620,7 +617,7 @@ class _NewRuns:
 
     Attributes:
         runs: Number of these runs.
-        simulated_s: Simulated time of these runs together, in s.
+        simulated_s: Total simulated time of these runs, in s.
     """
 
     def __init__(self) -> None:
@@ -649,7 +646,8 @@ def _write_table(folder: SweepFolder, done: Mapping[tuple[int, int], CellRun]) -
     def iterate_rows() -> Iterator[ResultRow]:
         """Yields the result rows of all parameter combinations for the CSV table.
 
-        It also counts the reasons why some simulations could not run side by side with others.
+        The function also counts the reasons why some simulations could not run side by side
+        with others.
         """
         for runs in iterate_cells(plan, done):
             reasons.update(run.alone for run in runs if run.alone)
@@ -677,13 +675,13 @@ def _write_lines(folder: SweepFolder, name: str, lines: Iterable[str]) -> None:
 
 
 class _SweepWork:
-    """Executes the runs of a sweep that its journal lacks.
+    """Executes the runs of a sweep that are not yet in its journal.
 
     Args:
         plan: The sweep: its scenario, axes, control laws and seeds.
         journal: Journal, to which the runs are added.
         pool: Workers that execute the runs.
-        progress: Function that is called as for `run_sweep`.
+        progress: Function that is called with the progress, see `run_sweep`.
         tally: Counts the runs.
     """
 
@@ -702,7 +700,7 @@ class _SweepWork:
         self._tally = tally
 
     def execute(self) -> None:
-        """Simulates all parameter combinations, or in a refined sweep those near an edge.
+        """Simulates all cells or, in a refined sweep, the cells near a stability edge.
 
         A refined sweep proceeds in rounds. The runs of a round show on which side of the
         stability edge their combinations (cells) lie, and this determines the cells of the next
@@ -751,15 +749,15 @@ class _SweepWork:
     def _execute_cells(
         self, cells: Iterable[int], count: int, runs_before: int, *, is_side_by_side: bool
     ) -> None:
-        """Executes all runs of some cells: one seed each, then other seeds of random cells.
+        """Executes all runs of some cells: one seed each, then further seeds of random cells.
 
-        Only the first run of a cell shows whether anything in the cell is random. Otherwise
-        other seeds would give the same run.
+        The first run of a cell shows whether anything in the cell is random. If nothing is,
+        other seeds would give the same run and are not executed.
 
         Args:
             cells: Numbers of the cells, which can be iterated once.
             count: Number of the cells.
-            runs_before: Number of runs of the cells before, for the progress.
+            runs_before: Number of runs of earlier cells, for the progress.
             is_side_by_side: True to compute several runs side by side.
         """
         first_seed, *other_seeds = self._plan.seeds
@@ -819,9 +817,9 @@ class _SweepWork:
 def _find_side(plan: SweepPlan, runs: Sequence[CellRun]) -> int:
     """Returns whether a parameter combination lies on the stable side of an edge.
 
-    The side is stable, unstable or undecided, by the majority of its runs. It is not known if
-    every run was refused. If the sweep measures growth exponents, a run with an exponent of at
-    most 0 is stable.
+    The side is stable, unstable or undecided, by the majority of the cell's runs. It is unknown
+    if every run was rejected. If the sweep measures growth exponents, a run with an exponent of
+    at most 0 is stable.
 
     Args:
         plan: The sweep. If it measures growth exponents, their sign decides.

@@ -11,22 +11,23 @@ arms would agree if gravity did not act on them:
   m/rad.
 - After the operators have released the arms, q* keeps its value.
 
-Here beta_i is the influence of arm i. It follows from the dominance factors alpha_ij, the
-weights with which arm i follows arm j, by beta' alpha = beta' with sum_i beta_i = 1.
+Here beta_i is the influence of arm i. The dominance factors alpha_ij, the weights with which
+arm i follows arm j, determine it by beta' alpha = beta' with sum_i beta_i = 1.
 
-A law may promise another motion than agreement at q*, see `LawSettings.target_motion`. Then the
-distance of each arm from the promised motion counts instead of the distance between the arms,
-and a run is judged by where the promised motion ends. The distance of the mean from q* stays
-part of the error, so that arms that do not move at all are no solution.
+A law may promise a motion other than agreement at q*, see `LawSettings.target_motion`. In this
+case, the error contains the distance of each arm from the promised motion instead of the
+distance between the arms, and a run is judged by the end of the promised motion. The distance
+of the mean from q* stays part of the error, so that arms that do not move at all have a large
+error.
 
-Walls, and operators who push without a target, do not determine a pose. A scenario that
+Walls, and operators who push without a target, do not determine a final pose. A scenario that
 contains them is also run without them, to find the pose at which the arms would come to rest.
 This second scenario is called the twin of the first.
 
 Invariant:
-    - A score is a function of the scenario alone. The errors of a run that does not reach its
-      end are None.
-    - Neither gains nor control laws enter q*.
+    - A score depends only on the scenario. The errors of a run that does not reach its end are
+      `None`.
+    - Neither gains nor control laws influence q*.
     - Only settled runs, which are stable and end at q* or at the pose that their law promises,
       may be part of a Pareto front.
 """
@@ -78,7 +79,7 @@ _POSE_SAMPLES_HZ = 100.0
 
 
 def check_comparable(scenario: Scenario) -> None:
-    """Refuses a scenario in which control laws cannot be compared fairly.
+    """Rejects a scenario in which control laws cannot be compared fairly.
 
     The error of a law is measured from the pose on which the arms should agree. Therefore the
     scenario must determine a pose that all arms could reach.
@@ -87,7 +88,7 @@ def check_comparable(scenario: Scenario) -> None:
         scenario: The scenario in which laws are to be compared.
 
     Raises:
-        ScenarioError: The scenario is refused. The message states the reason and a remedy.
+        ScenarioError: The scenario is rejected. The message states the reason and a remedy.
     """
     refuse_live_only(scenario)
     if any(spec.task.shared for spec in scenario.sites.values()):
@@ -98,7 +99,7 @@ def check_comparable(scenario: Scenario) -> None:
             source=scenario.name,
         )
 
-    # Sites that follow each other but nobody else never move towards the other sites.
+    # Sites that follow only each other never move towards the other sites.
     groups = find_closed_groups(scenario.alpha)
     if len(groups) > 1:
         group_names = [", ".join(scenario.names[site] for site in group) for group in groups]
@@ -132,15 +133,15 @@ def build_twin(scenario: Scenario) -> Scenario | None:
     """Derives the scenario that shows at which pose the arms would come to rest undisturbed.
 
     Walls, and operators who push without a target pose, keep the arms away from that pose. The
-    derived scenario, the twin of the candidate, lacks them. The pose at the end of its run
-    depends only on the dominance factors (the weights with which the arms follow one another)
-    and on the targets.
+    derived scenario, the twin of the candidate, does not contain them. The pose at the end of
+    its run depends only on the dominance factors (the weights with which the arms follow one
+    another) and on the targets.
 
     Args:
         scenario: Scenario of the candidate.
 
     Returns:
-        The twin. None if no twin is needed because the scenario has no such walls and
+        The twin. `None` if no twin is needed, because the scenario has no such walls and
         operators.
     """
     sites = {}
@@ -158,8 +159,8 @@ def compute_consensus_pose(scenario: Scenario, t_s: Array) -> Array:
 
     While operators pull the arms like springs towards target poses, q* is the average of the
     targets for each joint. It is weighted with the stiffness of the operators and the influence
-    of their arms. Before that, q* is the weighted average of the start poses. Afterwards, q*
-    keeps its last value.
+    of their arms. Before any operator pulls, q* is the weighted average of the start poses.
+    After the last operator has released its arm, q* keeps its value.
 
     Args:
         scenario: Scenario with the arms, their operators and the dominance factors, which are
@@ -206,7 +207,7 @@ class _SpringHistory(NamedTuple):
     Attributes:
         site: Site of the operator.
         stiffness_nm_rad: Stiffness per joint, shape (n,), in N m/rad.
-        acts: 1 at times at which the spring acts and 0 at other times, shape (K, 1).
+        acts: 1 while the spring acts and 0 at other times, shape (K, 1).
         target_rad: Target pose, shape (K, n), in rad.
     """
 
@@ -217,7 +218,7 @@ class _SpringHistory(NamedTuple):
 
 
 def _list_springs(scenario: Scenario, t_s: Array) -> Iterator[_SpringHistory]:
-    """Yields the operators that pull at an arm like a spring, for the consensus pose.
+    """Yields the operators that pull an arm like a spring, for the consensus pose.
 
     Args:
         scenario: Scenario in which the laws are compared.
@@ -241,15 +242,15 @@ def _list_springs(scenario: Scenario, t_s: Array) -> Iterator[_SpringHistory]:
 
 
 STRAYED_RAD = 0.2
-"""Distance of the arms' mean pose from q*, in rad, beyond which the arms have strayed. They
+"""Distance of the arms' mean pose from q*, in rad, beyond which the arms have strayed: they
 fell, hang down or were thrown.
 """
 TOGETHER_RAD = 0.02
-"""Largest distance of a joint from the mean of the arms, in rad, at which the arms agree."""
+"""Largest distance of a joint from the arms' mean, in rad, at which the arms still agree."""
 
 
 class CandidateClass(StrEnum):
-    """How well the arms behaved with a control law and chosen gains, from worst to best.
+    """Classes of the arms' behaviour with a control law and chosen gains, from worst to best.
 
     If several classes apply to a run, the first one counts. `CLASS_MEANINGS` explains each
     class. JSON files contain the values.
@@ -264,7 +265,7 @@ class CandidateClass(StrEnum):
 
     @property
     def word(self) -> str:
-        """Word for how a candidate of a tuning ended, in printed text, such as "stable".
+        """Word for the end of a candidate's run in printed text, such as "stable".
 
         Where possible, it is the word that the judgement of a single run uses.
         """
@@ -278,11 +279,11 @@ class CandidateClass(StrEnum):
     def classify(
         cls, ends: Sequence[RunEnd], fall_rad: float, apart_rad: float
     ) -> "CandidateClass":
-        """Classifies how well the arms behaved with a control law and chosen gains.
+        """Classifies the arms' behaviour with a control law and chosen gains.
 
-        The scenario may have walls, and operators who push without a target pose. Then a second
-        run without them shows at which pose the arms would come to rest undisturbed. The arms
-        should rest near the consensus pose q*, which follows from the targets of the other
+        If the scenario has walls or operators who push without a target pose, a second run
+        without them shows at which pose the arms would come to rest undisturbed. The arms
+        should rest near the consensus pose q*, which is computed from the targets of the other
         operators.
 
         Args:
@@ -314,7 +315,7 @@ CLASS_MEANINGS = {
     CandidateClass.OSCILLATED: "it keeps oscillating, drifts or grows",
     CandidateClass.STRAYED: (
         f"the mean pose ends more than {STRAYED_RAD} rad from the pose of a weightless "
-        "consensus, or would after as long again: the arms fell, hang, sink, or were thrown"
+        "consensus, or would after twice the time: the arms fell, hang, sink, or were thrown"
     ),
     CandidateClass.APART: f"an arm ends more than {TOGETHER_RAD} rad from the mean of all arms",
     CandidateClass.OPEN: "it hardly decays, or is undecided: a longer run may decide",
@@ -324,13 +325,13 @@ CLASS_MEANINGS = {
 
 
 _SHORT_S = 0.5
-"""Time before the planned end of a run, in s, from which on its log is reported as short."""
+"""Time before the planned end, in s. A log that ends earlier than this is reported as short."""
 _POSE_SAMPLES = 2000
 """Number of times at which q* of a log is computed."""
 
 
 def check_final_posture(log: Log) -> list[str]:
-    """Warns if the end of a run says little about its control law.
+    """Warns if the end of a run shows little about its control law.
 
     There are three warnings:
 
@@ -417,28 +418,29 @@ def _warn_fallen(log: Log, end_poses_rad: dict[str, Array]) -> list[str]:
 
 
 class CandidateScore(msgspec.Struct, frozen=True):
-    """What was measured about a control law with chosen gains: error, effort and class.
+    """Score of a control law with chosen gains: error, effort and class.
 
-    docs/reference/tuning-procedure.md has the formulas.
+    docs/reference/tuning-procedure.md contains the formulas.
 
     Attributes:
         outcome: Class of the candidate.
-        error_rad: RMS distance of the arms from the pose q*, in rad. None if the run diverged.
+        error_rad: RMS distance of the arms from the pose q*, in rad. `None` if the run
+            diverged.
         spread_rad: Part of the error that is the distance between the arms at the same time,
             without delays. For a law that promises another motion, it is the distance of the
             arms from this motion.
         pose_rad: Part of the error that is the distance of the arms' mean from q*.
         effort_nm: RMS of the torque minus the gravity torque at the arm's own pose, in N m.
         settled_s: Time from which the largest |e| stays below 0.01 rad, in s, where e is the
-            error of a site against its peers, the arms that it follows. None if |e| is larger
+            error of a site against its peers, the arms that it follows. `None` if |e| is larger
             at the end.
         saturated: Fraction of all joint torques that were at the torque limit.
-        diverged_s: Time at which the first site left its limits, in s. None if no site did.
+        diverged_s: Time at which the first site left its limits, in s. `None` if no site did.
         seeds: Number of runs over which the score is averaged. The class is the worst class
             among these runs.
-        error_half_rad: Half the width of the 95 % interval of the mean error. None for a single
-            run.
-        effort_half_nm: Half the width of the 95 % interval of the mean effort. None for a
+        error_half_rad: Half the width of the 95 % interval of the mean error. `None` for a
+            single run.
+        effort_half_nm: Half the width of the 95 % interval of the mean effort. `None` for a
             single run.
     """
 
@@ -459,7 +461,7 @@ class CandidateScore(msgspec.Struct, frozen=True):
         """Combines the scores of a candidate over runs that differ only in their seeds.
 
         The class is the worst of all runs, and each number is the mean over the runs. A number
-        that is missing for one of the runs is None.
+        that is missing for one of the runs is `None`.
 
         Args:
             scores: Score of each run, at least one.
@@ -496,7 +498,7 @@ class CandidateScore(msgspec.Struct, frozen=True):
 
         Args:
             text: Canonical text of the candidate's scenario.
-            twin_text: Canonical text of the twin's scenario. None if there is no twin. The
+            twin_text: Canonical text of the twin's scenario. `None` if there is no twin. The
                 final pose is then taken from the candidate's own run.
 
         Returns:
@@ -512,17 +514,17 @@ _AVERAGED = ("error_rad", "spread_rad", "pose_rad", "effort_nm", "settled_s", "s
 
 
 def _score_candidate(run: "_RunMeasures", twin: "_RunMeasures") -> CandidateScore:
-    """Combines what was measured in the runs of a candidate to its score.
+    """Combines the measurements from the runs of a candidate into its score.
 
     Args:
-        run: What was measured in its run.
-        twin: What was measured in the same run without walls and pushes (twin), or in the run
+        run: Measurements from its run.
+        twin: Measurements from the same run without walls and pushes (twin), or from the run
             itself if there is no twin.
     """
     ends = (run.end, twin.end)
     outcome = CandidateClass.classify(ends, twin.fall_rad, twin.apart_rad)
 
-    # The numbers of a run that ended early cannot be compared with those of other runs.
+    # The measurements of a run that ended early cannot be compared with those of other runs.
     divergence_times_s = [end.diverged_at_s for end in ends if end.diverged_at_s is not None]
     if divergence_times_s:
         return CandidateScore(
@@ -633,11 +635,11 @@ def _compute_promised_motion(
         scenario: Scenario of the run.
         t_s: Times, shape (K,), in s.
         q: Joint angles, shape (N, K, n), in rad.
-        tau_x: Recorded exogenous torques, shape (N, K, n), in N m. Their sign is opposite to
-            that of the torques from outside.
+        tau_x: Recorded exogenous torques, shape (N, K, n), in N m. They are the negative
+            external torques.
 
     Returns:
-        The promised joint angles, shape (N, K, n), in rad. None if the law promises that the
+        The promised joint angles, shape (N, K, n), in rad. `None` if the law promises that the
         arms move together.
     """
     laws = [scenario.sites[name].control for name in scenario.names]
@@ -655,7 +657,8 @@ def _predict_fall_rad(t_s: Array, from_pose_rad: Array) -> float:
     """Predicts the distance from the promised pose at the end of a run twice as long.
 
     The distance is averaged over the second before the middle of the run and over the last
-    second. If it grew in the second half, the growth is assumed to continue at the same pace.
+    second. If the distance grew between them, it is assumed to continue growing at the same
+    rate.
 
     Args:
         t_s: Times, shape (K,), in s.
@@ -686,8 +689,8 @@ def _find_settling_time(t_s: Array, e: Array) -> float | None:
         e: Errors, shape (N, K, n), in rad.
 
     Returns:
-        The time. It is 0 if |e| is always below 0.01 rad, and None if |e| is not below 0.01 rad
-        at the end.
+        The time. It is 0 if |e| is always below 0.01 rad, and `None` if |e| is not below 0.01
+        rad at the end.
     """
     largest_rad = np.abs(e).max(axis=(0, 2))
     is_settled = largest_rad[-1] < SETTLED_ERROR_RAD
@@ -729,8 +732,8 @@ def _sample_at_common_times(
 ) -> tuple[Array, Array, Array, Array]:
     """Returns the joint angles, errors and exogenous torques of all sites at common times.
 
-    Sites may have different tick rates. The times are those of the slowest site's ticks, and of
-    every other site the latest record is taken.
+    Sites may have different tick rates. The times are the ticks of the slowest site. For every
+    other site, the latest record at each time is used.
 
     Args:
         records: Records of each site.
@@ -814,7 +817,8 @@ class TuningScenario(NamedTuple):
 
         Args:
             space: The control law.
-            knowledge: What the law is told about the arm, such as its gravity parameters.
+            knowledge: Information about the arm that the law gets, such as its gravity
+                parameters.
             gains: Values of the gains, by their names.
         """
         controls = space.controls(self.scenario, knowledge, gains)
@@ -824,8 +828,8 @@ class TuningScenario(NamedTuple):
     def texts(self) -> tuple[str, str | None]:
         """Texts of the scenario, and of the same scenario without walls and some operators.
 
-        A worker process reads them. The second one leaves out operators who push the arms
-        without a target pose. It is None if the scenario has no such parts.
+        A worker process reads them. The second text leaves out walls, and operators who push
+        the arms without a target pose. It is `None` if the scenario has no such parts.
         """
         twin = build_twin(self.scenario)
         twin_text = None if twin is None else twin.text
@@ -864,7 +868,7 @@ class CandidateItem(NamedTuple):
     Attributes:
         runs: For each random seed, the text of the scenario, and the text of the same scenario
             without walls and without operators who push the arms without a target pose. The
-            second text is None if the scenario has no such parts.
+            second text is `None` if the scenario has no such parts.
         name: Name of the law and its gains in error messages.
         is_side_by_side: True to compute the runs together with others, if possible.
     """
@@ -881,24 +885,76 @@ class CandidateItem(NamedTuple):
         """Packs the simulations of one choice of control gains as work for another process.
 
         Args:
-            seeds: The scenario with the law and its gains, once for each random seed. At least
-                one.
+            seeds: The scenario with the law and its gains, once for each random seed, at least
+                once.
         """
         first = seeds[0]
         name = ", ".join(first.overrides) or first.source
         runs = tuple(seed.texts for seed in seeds)
         return cls(runs, name)
 
-    def measure(self) -> "MeasuredCandidate":
+    def measure(self) -> "_MeasuredCandidate":
         """Runs a candidate, a law with chosen gains, with all of its seeds.
 
-        Any worker process can call it, because it needs nothing but its argument.
+        The function depends only on its argument, so any worker process can call it.
         """
         scores = [CandidateScore.measure(text, twin_text) for text, twin_text in self.runs]
-        return MeasuredCandidate(CandidateScore.average(scores))
+        return _MeasuredCandidate(CandidateScore.average(scores))
+
+    @classmethod
+    def measure_together(
+        cls, tasks: "Sequence[CandidateItem]"
+    ) -> "Iterator[_MeasuredCandidate]":
+        """Runs several candidates with all of their seeds, side by side where that is possible.
+
+        Args:
+            tasks: The runs of each candidate.
+
+        Yields:
+            The scores in the order of the candidates, equal to those of
+            `CandidateItem.measure`.
+        """
+        texts = [
+            text
+            for task in tasks
+            if task.is_side_by_side
+            for texts in task.runs
+            for text in texts
+            if text
+        ]
+        scenarios = {text: parse_scenario(text) for text in dict.fromkeys(texts)}
+        measured = {}
+        obstacles = {}
+        chosen = list(scenarios)
+        try:
+            for first in range(0, len(chosen), LANE_RUNS):
+                part = chosen[first : first + LANE_RUNS]
+                runs = WholeRun.simulate_together([scenarios[text] for text in part])
+                for index, run, obstacle in runs:
+                    text = part[index]
+                    measured[text] = _measure_records(scenarios[text], run)
+                    obstacles[text] = obstacle
+        except CodeFailed:
+            # One by one, so that candidates before a candidate whose code fails are kept.
+            for task in tasks:
+                yield task.measure()
+            return
+
+        for task in tasks:
+            if not task.is_side_by_side:
+                yield task.measure()
+                continue
+            scores = [
+                _score_candidate(measured[text], measured[twin_text or text])
+                for text, twin_text in task.runs
+            ]
+            reasons = [obstacles[text] for texts in task.runs for text in texts if text]
+            yield _MeasuredCandidate(
+                CandidateScore.average(scores), tuple(filter(None, reasons))
+            )
 
 
-class MeasuredCandidate(NamedTuple):
+class _MeasuredCandidate(NamedTuple):
     """Score of a candidate, with the reasons why runs of it were computed one by one.
 
     Attributes:
@@ -912,50 +968,3 @@ class MeasuredCandidate(NamedTuple):
 
 LANE_RUNS = 16
 """Number of runs that a worker computes side by side. All their records are in memory."""
-
-
-def measure_candidate_tasks(tasks: Sequence[CandidateItem]) -> Iterator[MeasuredCandidate]:
-    """Runs several candidates with all of their seeds, side by side where that is possible.
-
-    Args:
-        tasks: The runs of each candidate.
-
-    Yields:
-        The scores in the order of the candidates, equal to those of `CandidateItem.measure`.
-    """
-    texts = [
-        text
-        for task in tasks
-        if task.is_side_by_side
-        for texts in task.runs
-        for text in texts
-        if text
-    ]
-    scenarios = {text: parse_scenario(text) for text in dict.fromkeys(texts)}
-    measured = {}
-    obstacles = {}
-    chosen = list(scenarios)
-    try:
-        for first in range(0, len(chosen), LANE_RUNS):
-            part = chosen[first : first + LANE_RUNS]
-            runs = WholeRun.simulate_together([scenarios[text] for text in part])
-            for index, run, obstacle in runs:
-                text = part[index]
-                measured[text] = _measure_records(scenarios[text], run)
-                obstacles[text] = obstacle
-    except CodeFailed:
-        # One by one, the candidates before the one whose code fails are kept.
-        for task in tasks:
-            yield task.measure()
-        return
-
-    for task in tasks:
-        if not task.is_side_by_side:
-            yield task.measure()
-            continue
-        scores = [
-            _score_candidate(measured[text], measured[twin_text or text])
-            for text, twin_text in task.runs
-        ]
-        reasons = [obstacles[text] for texts in task.runs for text in texts if text]
-        yield MeasuredCandidate(CandidateScore.average(scores), tuple(filter(None, reasons)))

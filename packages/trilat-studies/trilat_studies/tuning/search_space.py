@@ -1,9 +1,9 @@
 """Defines which gains of each control law a tuning searches, and within which ranges.
 
-For a fair comparison, a quantity has the same range in every law, whatever its name. For
-example, the stiffness is called K in some laws, and is the product of Kp and Lambda in others.
-Gains are searched uniformly in their logarithms. `SearchSpace.controls` turns chosen values
-into the table [control] of every arm in a scenario.
+For a fair comparison, a quantity has the same range in every law, whatever it is called there.
+For example, the stiffness is called K in some laws, and is the product of Kp and Lambda in
+others. Gains are searched uniformly in their logarithms. `SearchSpace.controls` turns chosen
+values into the table [control] of every arm in a scenario.
 
 Invariant:
     - A gain is a single number for both joints of an arm, and for all arms with the same role,
@@ -49,7 +49,7 @@ class ModelInformation(NamedTuple):
     fairly, all of them get the same parameters, which may be wrong by a chosen factor.
 
     Attributes:
-        gravity: Factor by which the gravity parameters that laws get differ from the true ones.
+        gravity: Ratio of the gravity parameters that the laws get to the true parameters.
     """
 
     gravity: float = 1.0
@@ -70,7 +70,7 @@ class ModelInformation(NamedTuple):
 
         The P parameters theta of an arm describe its inertia and its gravity. The parameters of
         inertia are 0, since nothing is known about them. The gravity parameters are the true
-        ones times `gravity`.
+        parameters times `gravity`.
 
         Args:
             scenario: Scenario in which the laws are compared.
@@ -109,7 +109,7 @@ class ModelInformation(NamedTuple):
 
     @property
     def text(self) -> str:
-        """Clause for reports that states what the laws are told about the arms.
+        """Clause for reports that states the laws' information about the arms.
 
         Example: "every law gets 90 % of the true gravity parameters, and no inertia".
         """
@@ -121,9 +121,9 @@ class ModelInformation(NamedTuple):
 
     @classmethod
     def of_gravity(cls, gravity_percent: float) -> "ModelInformation":
-        """Returns what all compared control laws are told about the arms.
+        """Returns the information about the arms that all compared control laws get.
 
-        The gravity parameters may be wrong on purpose, to test how robust the laws are.
+        The gravity parameters may be deliberately wrong, to test how robust the laws are.
 
         Args:
             gravity_percent: Gravity parameters that the laws get, in per cent of the true
@@ -150,7 +150,7 @@ class _TunedGain(NamedTuple):
 
     Attributes:
         name: Name of the gain.
-        unit: Unit of the gain. Empty if it has none.
+        unit: Unit of the gain. Empty if the gain has no unit.
         low: Least value.
         high: Largest value.
         where: Role of the sites that have the gain. Empty if all sites have it.
@@ -167,11 +167,11 @@ class SearchSpace(NamedTuple):
     """Gains of one control law that are tuned automatically, with their units and ranges.
 
     Attributes:
-        law: Name of the law. The name "known" stands for the law `adaptive` without adaptation,
+        law: Name of the law. The name "known" means the law `adaptive` without adaptation,
             which gets the true inertia of the arm.
         knobs: Gains that are searched, with their units and ranges.
-        known_facts: What the law is told about the arm, in words for tables.
-        kind: Class of a built-in law. None for a user's law.
+        known_facts: Information about the arm that the law gets, as text for tables.
+        kind: Class of a built-in law. `None` for a user's law.
     """
 
     law: str
@@ -190,7 +190,7 @@ class SearchSpace(NamedTuple):
 
         Args:
             scenario: Scenario in which the laws are compared.
-            knowledge: What the law is told about the arm.
+            knowledge: Information about the arm that the law gets.
             gains: Values of the gains, by their names.
 
         Returns:
@@ -299,18 +299,18 @@ def _find_longest_round_trip_ms(scenario: Scenario) -> float:
 
 
 _TORQUE_GAINS = ("rho_nm", "Kp", "Kd", "K", "d", "P_e", "b", "B")
-"""Gains that produce a torque. The joints of a chain have them in proportion to their inertia.
+"""Gains that produce a torque. For the joints of a chain, they are proportional to the inertia.
 """
 
 
 def _spread_over_joints(table: dict[str, Any], weights: Sequence[float]) -> None:
-    """Replaces each gain that produces a torque by a list with a value per joint.
+    """Replaces each gain that produces a torque with a list of values, one per joint.
 
     The joints of a chain have different inertias, and need gains in proportion to them.
 
     Args:
         table: Table [control] of a site, which is changed in place.
-        weights: Fraction of the gain that each joint has.
+        weights: For each joint, its fraction of the gain.
     """
     for key in _TORQUE_GAINS:
         if key in table:
@@ -322,22 +322,22 @@ _STABLE_SHARE = 0.9
 
 
 def weigh_joints(scenario: Scenario) -> list[float]:
-    """Returns the fraction that each joint of a chain has of a gain that produces a torque.
+    """Returns a factor for each joint of a chain that scales gains which produce a torque.
 
-    The fraction of joint i is its inertia while the other joints are free, 1 / (M^-1)_ii, in
-    relation to the largest such inertia of all joints. M is the inertia matrix. Of the start
-    poses of the sites, the one with the least inertia counts.
+    The factor of joint i is its inertia while the other joints are free, 1 / (M^-1)_ii,
+    relative to the largest such inertia of all joints. M is the inertia matrix. Among the start
+    poses of the sites, the pose with the least inertia is used.
 
-    All fractions are reduced if, at their tick rate, the arms could not take the largest
-    damping of the ranges. `validate` refuses damping gains D for which the largest eigenvalue
-    of h M^-1 D, with the period h of a tick, reaches 1 under the integration scheme
-    `second_order`, or 2 under `digital`.
+    All factors are reduced if the largest damping of the ranges would be unstable at the arms'
+    tick rate. `validate` rejects damping gains D for which the largest eigenvalue of h M^-1 D,
+    with the period h of a tick, reaches 1 under the integration scheme `second_order`, or 2
+    under `digital`.
 
     Args:
         scenario: Scenario in which the laws are compared.
 
     Returns:
-        The fractions, at most 1, with two significant digits. Empty for planar arms.
+        The factors, at most 1, with two significant digits. Empty for planar arms.
     """
     chains = [
         (scenario.sites[name], model)
@@ -392,7 +392,7 @@ def _read_range(gain: str, entry: GainRange) -> _TunedGain:
 
     Args:
         gain: Name of the gain.
-        entry: Least value, largest value, unit, and possibly the role of the sites.
+        entry: Smallest value, largest value, unit, and possibly the role of the sites.
     """
     low, high, unit = entry[:3]
     role = entry[3] if len(entry) == 4 else ""
@@ -409,11 +409,11 @@ PAPER_GAINS: GainValues = {"Lambda": 1.0, "Kp": 1.0, "Kd": 3.0, "Gamma": 1.0}
 
 
 def select_search_spaces(laws: Sequence[str], scenario: Scenario) -> list[SearchSpace]:
-    """Returns which gains of the given control laws are tuned, each law once.
+    """Returns the gains of the given control laws that are tuned, without repeated laws.
 
     Args:
-        laws: Names of built-in laws, or classes as in "mylaws:Spring". Empty stands for
-            `DEFAULT_LAWS`.
+        laws: Names of built-in laws, or classes as in "mylaws:Spring". If empty, `DEFAULT_LAWS`
+            are used.
         scenario: Scenario in which the laws are compared.
 
     Raises:
@@ -445,10 +445,10 @@ def _parse_user_range(code: str, name: Any, entry: Any) -> _TunedGain:
         entry: The range, (low, high) or (low, high, unit) with 0 < low < high.
 
     Raises:
-        UsageError: The entry is not such a range.
+        UsageError: The entry is not a range of this form.
     """
     values = list(entry) if isinstance(entry, tuple | list) else []
-    # An empty text replaces a missing value. It is accepted as a unit, but not as a limit.
+    # An empty text replaces a missing value. It is valid as a unit, but not as a limit.
     low, high, unit = (*values, "", "", "")[:3]
     in_order = is_number(low) and is_number(high) and 0.0 < low < high
     if not in_order or not isinstance(unit, str):

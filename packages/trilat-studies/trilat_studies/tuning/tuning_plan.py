@@ -2,21 +2,19 @@
 
 Two objectives are minimised: the error, and the effort of the motors. The result for a law is
 its Pareto front: the gains for which no other gains of the law are better in both. The laws can
-then be compared fairly, because each was given the same number of attempts (candidates).
+then be compared fairly, because the same number of attempts (candidates) was made for each.
 
 The first half of the candidates is a Latin hypercube, an evenly spread random sample, in the
 logarithms of the gains (McKay, Beckman and Conover, Technometrics 21, 1979). The second half
 refines the law's own front, in four rounds with shrinking steps.
 
 Invariant:
-    - The result is a function of the plan alone. It does not depend on the number of processes
-      or on their speed.
-    - The candidates are a function of the seed, the search space and the scores of earlier
-      rounds.
+    - The result depends only on the plan, and not on the number of processes or on their speed.
+    - The candidates depend only on the seed, the search space and the scores of earlier rounds.
     - Only stable runs that end at the common pose of the arms compete. Of two runs with equal
-      objectives the first one is kept.
-    - The gains that the paper prints are measured, but they are not searched and belong to no
-      front.
+      objectives, the first is kept.
+    - The gains that the paper prints are measured, but do not take part in the search and
+      belong to no front.
 """
 
 from collections import Counter
@@ -49,7 +47,6 @@ from .candidate import (
     TuningScenario,
     build_twin,
     check_comparable,
-    measure_candidate_tasks,
 )
 from .search_space import (
     PAPER_GAINS,
@@ -67,7 +64,7 @@ ObjectivePoint = tuple[float, float]
 class Objective(StrEnum):
     """Quantity that a tuning minimises besides the motor effort: error or settling time.
 
-    Both conflict with the effort in general: a smaller error needs larger torques.
+    In general, both conflict with the effort: a smaller error needs larger torques.
     """
 
     ERROR = "error"
@@ -81,13 +78,13 @@ class Objective(StrEnum):
     def point(self, score: CandidateScore) -> ObjectivePoint | None:
         """Returns the error (or time) and the motor effort of a candidate, to compare both.
 
-        The candidates that no other one beats in both form the Pareto front.
+        The candidates that no other candidate beats in both form the Pareto front.
 
         Args:
             score: Score of the candidate.
 
         Returns:
-            The objective and the effort. None if the candidate may not be part of a Pareto
+            The objective and the effort. `None` if the candidate may not be part of a Pareto
             front, because it is not stable or does not end at the common pose.
         """
         value = score.error_rad if self is Objective.ERROR else score.settled_s
@@ -101,11 +98,11 @@ class Objective(StrEnum):
 def find_pareto_front(points: Sequence[ObjectivePoint | None]) -> list[int]:
     """Returns the indices of the points of the Pareto front, in the order of rising effort.
 
-    The front contains the best compromises between both objectives: a point is part of it if no
-    other point is at least as good in both objectives.
+    The front contains the best compromises between both objectives: a point belongs to the
+    front if no other point is at least as good in both objectives.
 
     Args:
-        points: The points. None stands for a run that does not compete.
+        points: The points. `None` represents a run that does not compete.
     """
     competitors = []
     for index, point in enumerate(points):
@@ -123,7 +120,7 @@ def find_pareto_front(points: Sequence[ObjectivePoint | None]) -> list[int]:
 
 
 def compute_crowding(points: Sequence[ObjectivePoint]) -> list[float]:
-    """Computes how isolated each point of a front is, so that gaps can be refined.
+    """Computes how isolated each point of a front is, so that gaps in the front can be refined.
 
     The crowding distance of a point is half the perimeter of the box between its two
     neighbours, where each side is relative to the span of the front. It is infinite for the
@@ -207,8 +204,8 @@ class CandidateSearch:
         """Objective and effort of each tried choice of gains, in the order of the runs.
 
         The objective is the error, in rad, or the settling time, in s. The effort is the RMS
-        motor torque without gravity, in N m. None stands for gains that do not compete, because
-        the arms were not stable or did not end at the common pose.
+        motor torque without gravity, in N m. `None` represents gains that do not compete,
+        because the arms were not stable or did not end at the common pose.
         """
         return [self._objective.point(score) for score in self.scores]
 
@@ -247,7 +244,7 @@ class CandidateSearch:
         return {outcome: counts[outcome] for outcome in CandidateClass}
 
     def propose_candidates(self, round_number: int) -> list[CandidateGains]:
-        """Returns the gains that are to be tried in a round.
+        """Returns the gains to try in a round.
 
         The first round spreads its candidates evenly over the ranges of the gains by a Latin
         hypercube. The later rounds refine the best candidates so far. Therefore the scores of
@@ -273,7 +270,7 @@ class CandidateSearch:
     def record_scores(
         self, gains: Sequence[CandidateGains], scores: Sequence[CandidateScore]
     ) -> None:
-        """Stores how well some gains performed, from which the next ones are proposed.
+        """Stores the scores of some gains, from which the next gains are proposed.
 
         Args:
             gains: The candidates that were run.
@@ -299,7 +296,7 @@ class CandidateSearch:
         for parent_number in range(count):
             index = best
             if parent_number % 2 == 1:
-                # the ranking starts anew when it is used up
+                # the ranking starts again when it is used up
                 rank = parent_number // 2 % len(ranked)
                 index = ranked[rank]
             gains = self.tried[index]
@@ -354,7 +351,7 @@ class CandidateSearch:
 
 
 DEFAULT_BUDGET = 64
-"""Default number of candidates per law. Four laws on `free` take some minutes on two cores."""
+"""Default number of candidates per law. Four laws on `free` take a few minutes on two cores."""
 MAX_BUDGET = 100_000
 """Largest number of candidates per law."""
 MAX_TUNING_SEEDS = 1000
@@ -370,8 +367,8 @@ _PROBE_S = 2.0
 class _PaperGainsResult(NamedTuple):
     """Score of the published gains of the adaptive law, in the scenario of a comparison.
 
-    The gains are printed in the paper from which the law comes. The score shows what tuning
-    improves over them.
+    The gains are printed in the paper from which the law comes. The score shows how much tuning
+    improves on them.
 
     Attributes:
         name: Name of the variant, such as "as printed".
@@ -385,7 +382,7 @@ class _PaperGainsResult(NamedTuple):
 
 
 class TuningPlan(NamedTuple):
-    """A comparison of control laws by searching the best gains of each, ready to run.
+    """A comparison of control laws, each with the best gains that a search finds, ready to run.
 
     `plan_tuning` creates this object and checks it. `run` executes the searches.
 
@@ -412,8 +409,8 @@ class TuningPlan(NamedTuple):
     def runs(self) -> int:
         """Number of all simulated runs of the comparison.
 
-        It includes the runs with the published gains, and the second runs that are needed to
-        measure the final pose of the arms in some scenarios.
+        The number includes the runs with the published gains, and the second runs that measure
+        the final pose of the arms in some scenarios.
         """
         paper_candidates = len(self.build_paper_scenarios(self.base))
         candidates = len(self.spaces) * self.budget + paper_candidates
@@ -425,9 +422,9 @@ class TuningPlan(NamedTuple):
     def twin(self) -> bool:
         """True if every choice of gains needs a second run, which measures the final pose.
 
-        This is so if the scenario has walls, or operators who push the arms without a target
-        pose. They keep the arms away from the pose at which the arms would rest undisturbed, so
-        the second run leaves them out.
+        This is the case if the scenario has walls, or operators who push the arms without a
+        target pose. They keep the arms away from the pose at which the arms would rest
+        undisturbed, so the second run leaves them out.
         """
         return build_twin(self.base.scenario) is not None
 
@@ -435,8 +432,8 @@ class TuningPlan(NamedTuple):
         """Returns the scenario with the published gains of the adaptive law, in two variants.
 
         The gains are printed in the paper from which the law comes. In the first variant, the
-        law is told the same gravity parameters as all compared laws. In the second variant, the
-        law is told nothing about the arm.
+        law gets the same gravity parameters as all compared laws. In the second variant, the
+        law gets no information about the arm.
 
         Args:
             base: The scenario.
@@ -456,7 +453,7 @@ class TuningPlan(NamedTuple):
         """Estimates from a short simulation how long the tuning takes, in s of real time.
 
         Args:
-            jobs: Number of worker processes. None stands for all cores.
+            jobs: Number of worker processes. If `None`, all cores are used.
         """
         scenario = self.base.scenario
         probe_s = min(scenario.duration_s, _PROBE_S)
@@ -475,15 +472,15 @@ class TuningPlan(NamedTuple):
     def run(
         self, jobs: int | None = None, progress: Progress = ignore_progress, on: Workers = None
     ) -> "TuningResult":
-        """Searches the gains of all laws.
+        """Searches for the best gains of all laws.
 
         In each round, the candidates of all laws are run together, so that no worker waits for
         the slowest candidate of each law.
 
         Args:
-            jobs: Number of worker processes. None uses all cores.
+            jobs: Number of worker processes. If `None`, all cores are used.
             progress: Function that is called with the number of finished and of all candidates.
-            on: Workers to use instead of processes of this machine.
+            on: Workers to use instead of processes on this machine.
 
         Raises:
             RunFailed: A candidate killed its workers, or the cluster is no longer available.
@@ -528,13 +525,13 @@ class TuningPlan(NamedTuple):
                     for item in paper_items:
                         in_lanes = "adaptive" in side_by_side
                         items.append(item._replace(is_side_by_side=in_lanes))
-                # The scores come in the order of the items: those of each law, and in the first
-                # round those of the printed gains, which remain in the end.
+                # The scores come in the order of the items: first those of each law and then,
+                # in the first round, those of the printed gains, which remain at the end.
                 measured = pool.map(
                     CandidateItem.measure,
                     items,
                     report_progress,
-                    together=measure_candidate_tasks if side_by_side else None,
+                    together=CandidateItem.measure_together if side_by_side else None,
                     together_count=LANE_RUNS if side_by_side else 1,
                 )
                 scores = iter([candidate.score for candidate in measured])
@@ -582,7 +579,7 @@ class TuningPlan(NamedTuple):
 
 
 _EDGE = 1.02
-"""Factor within which a gain counts as being at an end of its range."""
+"""Largest ratio of a gain and an end of its range at which the gain counts as at this end."""
 
 
 @dataclass(frozen=True, repr=False)
@@ -640,9 +637,9 @@ class TuningResult(Result):
         }
 
     def _describe_scenario(self) -> dict[str, Any]:
-        """Returns what is needed to know in which situation the laws were tuned, for `to_dict`.
+        """Returns the conditions under which the laws were tuned, for `to_dict`.
 
-        This includes the seed, the torque limits and the number of sites.
+        They include the seed, the torque limits and the number of sites.
         """
         base = self.plan.base
         scenario = base.scenario
@@ -658,9 +655,9 @@ class TuningResult(Result):
         }
 
     def _describe_procedure(self) -> dict[str, Any]:
-        """Returns how the gains were searched, for `to_dict`: budget, seeds, steps and so on.
+        """Returns the parameters of the search, for `to_dict`: budget, seeds, steps and so on.
 
-        Whoever tunes another law for comparison needs these numbers.
+        They are needed to tune another law for comparison.
         """
         plan = self.plan
         procedure: dict[str, Any] = {
@@ -747,7 +744,7 @@ class TuningResult(Result):
             search: Search of the law.
 
         Returns:
-            A string for each such gain. Empty if there are none.
+            A string for each such gain. Empty if there is no such gain.
         """
         if not search.front:
             return []
@@ -796,7 +793,7 @@ def plan_tuning(
 ) -> TuningPlan:
     """Plans a comparison of control laws with tuned gains, and checks that it can run.
 
-    The arguments are explained at `trilat_net.tune`. Overrides are texts KEY=VALUE. With
+    The arguments are explained in `trilat_net.tune`. Overrides are texts KEY=VALUE. With
     several seeds, the first is the seed of the scenario, and each further seed is larger by 1.
 
     Returns:
@@ -840,7 +837,8 @@ def plan_tuning(
             texts = (*overrides, f"seed={other_seed}")
             others.append(TuningScenario.load(source, texts))
     for space in spaces:
-        # a law may refuse the scenario, for example its scheme: before the search, not in it
+        # A law may reject the scenario, for example its scheme. This must happen before the
+        # search.
         (gains,) = CandidateSearch(space, 1, seed, Objective(objective)).propose_candidates(0)
         base.with_gains(space, knowledge, gains)
     return TuningPlan(

@@ -6,13 +6,12 @@ other gains of the law are better in both. `write_tuning` writes the files front
 front.png and front.pdf.
 
 Invariant:
-    - The files are a function of the result alone. Repeating the same comparison gives equal
-      bytes.
+    - The files depend only on the result. Repeating the same comparison gives equal bytes.
     - The JSON contains the complete result. The other files are views of it.
     - Each run is counted in exactly one class, such as stable or diverged.
-    - The figure shows every stable run in which the arms end at the pose that the operators ask
-      for, on a front or not. Stars mark the published gains of the adaptive law, which belong
-      to no front.
+    - The figure shows every stable run in which the arms end at the operators' target pose,
+      whether or not it is on a front. Stars mark the published gains of the adaptive law, which
+      belong to no front.
 """
 
 import json
@@ -177,12 +176,12 @@ def tabulate_front(
     Args:
         tuned: Result of the comparison of control laws.
         search: Search of the law.
-        most: Largest number of rows. Of a longer front, evenly spread points are shown, with
-            the first and the last one. None for all points.
+        most: Largest number of rows. If the front is longer, evenly spread points are shown,
+            including the first and the last one. If `None`, all points are shown.
     """
     count = len(search.front)
     shown = count if most is None else min(most, count)
-    # evenly spread, with the first and the last point
+    # evenly spread, including the first and the last point
     row_indices = {round(place) for place in np.linspace(0, count - 1, shown)}
     overall_front = tuned.list_overall_front(search)
     tuned_gains = search.space.knobs
@@ -237,8 +236,8 @@ def _format_mean(mean: float | None, half: float | None) -> str:
     """Returns a mean as text, with the half-width of its confidence interval if known.
 
     Args:
-        mean: The mean, or None.
-        half: Half the width of the interval, or None.
+        mean: The mean, or `None`.
+        half: Half the width of the interval, or `None`.
     """
     if mean is None or half is None:
         return format_number(mean)
@@ -246,10 +245,10 @@ def _format_mean(mean: float | None, half: float | None) -> str:
 
 
 def describe_procedure(plan: "TuningPlan") -> list[str]:
-    """Describes what is the same for all compared laws, as one sentence each.
+    """Describes the conditions that are the same for all compared laws, in one sentence each.
 
-    They are the candidates, the scenario, the model information that laws get, the objectives,
-    and further conditions that apply only to some comparisons.
+    The sentences cover the candidates, the scenario, the model information that laws get, the
+    objectives, and conditions that apply only to some comparisons.
 
     Args:
         plan: The comparison.
@@ -261,7 +260,7 @@ def describe_procedure(plan: "TuningPlan") -> list[str]:
     limits = " to ".join(f"{limit:g}" for limit in limit_range)
     knowledge = plan.knowledge.text
     if any(space.law == "known" for space in plan.spaces):
-        knowledge += "; known gets the exact inertia as well"
+        knowledge += "; the law known also gets the exact inertia"
     lines = [
         f"{count_nouns(plan.budget, 'candidate')} per law, {sampled} of a Latin hypercube, the "
         f"others refined; seed {plan.seed}",
@@ -296,10 +295,10 @@ def describe_procedure(plan: "TuningPlan") -> list[str]:
 
 
 def list_energy_notes(tuned: "TuningResult") -> list[str]:
-    """Returns what a tuning leaves out about laws that keep accounts of energy.
+    """Returns notes on energies that a tuning does not check, for laws that declare them.
 
-    The classes follow from the motion of the arms. A run whose law had overdrawn its accounts
-    can therefore count as stable here, while its certificate is open.
+    The classes depend on the motion of the arms. A run in which a law's declared energy became
+    negative can therefore count as stable here, while its certificate is open.
 
     Args:
         tuned: Result of the comparison of control laws.
