@@ -35,11 +35,10 @@ from trilat_net.presentation.page import write_report
 from trilat_net.analysis.certificate.stability_certificate import certify_log
 from trilat_net import open_log, verify
 from trilat_net.execution.virtual_comparison import simulate_without_operators
-from trilat_net.analysis.metrics.log_metrics import compute_log_metrics
 lap("start")
 log = open_log(sys.argv[1])
 lap("opening")
-compute_log_metrics(log).to_dict()
+LogMetrics.of_log(log).to_dict()
 lap("metrics")
 certify_log(log)
 lap("certificate")

@@ -22,12 +22,9 @@ import numpy as np
 
 from trilat_net.core import (
     HandCommand,
-    HandMemory,
     MotionLimits,
     Site,
     SiteArrays,
-    advance_hand,
-    empty_hand_vector,
     tick_ns,
 )
 from trilat_net.errors import SessionError, WireError, count_nouns
@@ -115,8 +112,9 @@ class HandServer:
         self._compute_pose = lambda: (
             site.q if hand.mode == "joint" else arm.end_effector(site.q)
         )
-        self._memory = HandMemory()
-        self._free_state = empty_hand_vector(self._rules.size)  # used if nobody moves the arm
+        start = self._rules.start()
+        self._memory = start.memory
+        self._free_state = start.vector  # used if nobody moves the arm
         self._names: dict[int, str] = {}  # names of the senders, by their boots
         self.news: list[tuple[int, str]] = []
 
@@ -140,8 +138,7 @@ class HandServer:
             return self._free_state
 
         t_ns = tick_ns(tick, self._rules.rate_hz)
-        step = advance_hand(
-            rules=self._rules,
+        step = self._rules.advance(
             memory=self._memory,
             t_ns=t_ns,
             commands=commands,

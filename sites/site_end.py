@@ -14,7 +14,7 @@ import signal
 from collections.abc import Sequence
 from typing import NamedTuple
 
-from trilat_net.core import describe_divergence
+from trilat_net.core import describe_mode
 from trilat_net.errors import PeerLeft, RunFailed, count_nouns
 from trilat_net.net import EventPublisher, LinkTimingMonitor, topics
 from trilat_net.records import NS_PER_S, Mode, TickRecord
@@ -175,7 +175,7 @@ class SiteEnd:
         failure_kind = "failed"
         if output is not None and output.mode is Mode.DIVERGED:
             failure_kind = "diverged"
-            failure = RunFailed(describe_divergence(parts.name, output))
+            failure = RunFailed(describe_mode(parts.name, output, glides=False))
             self._outcome = self._outcome._replace(failure=failure)
         if self._outcome.failure is not None:
             self._publish_end_event(failure_kind, str(self._outcome.failure))

@@ -18,7 +18,6 @@ from trilat_net.core import (
     LifeReason,
     StaleAction,
     describe_mode,
-    find_life_reason,
     tick_ns,
 )
 from trilat_net.errors import count_nouns
@@ -222,7 +221,7 @@ class SiteNews:
             return
 
         second = output.t_ns // NS_PER_S
-        is_too_far = find_life_reason(output) is LifeReason.ALIGN_LIMIT
+        is_too_far = self._parts.site.life_reason is LifeReason.ALIGN_LIMIT
         if is_too_far and second > self._waiting_s:
             self._waiting_s = second
             text = describe_mode(self._parts.name, output, glides=True)

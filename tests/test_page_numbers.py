@@ -34,13 +34,13 @@ from tests.scenario.builders import make_overrides
 from tests.theory import delay_equations, energy
 from tests.theory.figures_of_runs import find_value, measure_run
 from tests.theory.loops import RODS
-from trilat_net.analysis.certificate.energy_balance import EnergyBalance, compute_energy_balance
+from trilat_net.analysis.certificate.energy_balance import EnergyBalance
 from trilat_net.analysis.theory import (
     analyse_linear_loop,
     find_equilibrium,
     iterate_linear_edges,
 )
-from trilat_net.analysis.theory.port_analysis import PortAnalysis, analyse_ports
+from trilat_net.analysis.theory.port_analysis import PortAnalysis
 from trilat_net.execution.fused import FusedRun
 from trilat_net.scenario import load_scenario
 from trilat_net.scenario.delay_models import DELAY_MODELS
@@ -137,7 +137,7 @@ def common_motion() -> tuple[float, float, float]:
 
 def analyse_shipped_ports(name: str, **changes: Any) -> PortAnalysis:
     scenario = load_scenario(name, make_overrides(**changes))
-    return analyse_ports(scenario, find_equilibrium(scenario, (-0.6, 1.8)))
+    return PortAnalysis.of_scenario(scenario, find_equilibrium(scenario, (-0.6, 1.8)))
 
 
 def find_felt_impedance(port_analysis: PortAnalysis) -> Any:
@@ -243,7 +243,7 @@ def compute_pi() -> Any:
 
 
 def compute_lyapunov_balance(ones: bool = False, **changes: Any) -> EnergyBalance:
-    return compute_energy_balance(
+    return EnergyBalance.of_energies(
         make_run("lyapunov", make_overrides(**changes)).energies, paper_weights=ones
     )
 

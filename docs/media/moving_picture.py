@@ -22,7 +22,7 @@ from xml.etree import ElementTree as ET
 import numpy as np
 
 import trilat_net as tn
-from trilat_net.analysis.dominance_history import trace_dominance
+from trilat_net.analysis.dominance_history import DominanceHistory
 from trilat_net.core.step.vectors import Array
 from trilat_net.log.log_reader import Log
 from trilat_net.presentation.appearance import (
@@ -219,7 +219,7 @@ def read_film(log: Log) -> Film:
         t_s=t_s,
         q_deg={name: np.degrees(angles) for name, angles in q_rad.items()},
         reach_m=reach_m,
-        shares=trace_dominance(log, ROBOT.site, t_s).alpha,
+        shares=DominanceHistory.of_log(log, ROBOT.site, t_s).alpha,
         delay_s=float(np.nanmedian(ages_s)),
         lags_s=measure_lags(t_s, reach_m),
         held_s={

@@ -13,12 +13,7 @@ import trilat_net
 from tests.log.builders import open_bytes, replace_fields, rewrite_log
 from tests.scenario.builders import rough_arm_text
 from trilat_net.analysis.certificate.certificate_result import Certificate
-from trilat_net.analysis.certificate.energy_balance import (
-    EnergyBalance,
-    SiteEnergy,
-    compute_energy_balance,
-    compute_site_energies,
-)
+from trilat_net.analysis.certificate.energy_balance import EnergyBalance, SiteEnergy
 from trilat_net.analysis.certificate.stability_certificate import certify_log
 from trilat_net.core.step.ticks import LinkCounts
 from trilat_net.execution import virtual
@@ -368,11 +363,11 @@ class AnalysedRun:
 
     @cached_property
     def energies(self) -> dict[str, SiteEnergy]:
-        return compute_site_energies(self.log)
+        return SiteEnergy.by_site(self.log)
 
     @cached_property
     def balance(self) -> EnergyBalance:
-        return compute_energy_balance(self.energies)
+        return EnergyBalance.of_energies(self.energies)
 
     @cached_property
     def certificate(self) -> Certificate:

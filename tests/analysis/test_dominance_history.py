@@ -10,13 +10,13 @@ from hypothesis import strategies as st
 import trilat_net
 from tests.log.builders import edit_log_bytes, make_log_bytes, open_bytes
 from trilat_net.analysis.dominance_history import (
+    DominanceHistory,
+    DominancePlan,
     compute_lyapunov_weights,
-    evaluate_ramps,
     find_closed_groups,
     find_kd_scales,
     find_lost_peers,
     left_perron_vector,
-    trace_dominance,
 )
 from trilat_net.core.links.dominance import apply_ramps
 from trilat_net.core.links.link import link_dtype
@@ -32,9 +32,8 @@ ramps = st.tuples(st.integers(0, 60), st.integers(0, 30), st.floats(0.0, 1.0))
 def test_shares_equal_the_cores(drawn: list[tuple[int, int, float]]) -> None:
     tick_ns = 10**9 // RATE_HZ
     changes = [DominanceRamp(a * tick_ns, (a + n) * tick_ns, (x, 1.0 - x)) for a, n, x in drawn]
-    shares = evaluate_ramps(
-        np.array([0.5, 0.5]), changes, np.arange(100) / RATE_HZ, 1.0 / RATE_HZ
-    )
+    plan = DominancePlan(np.array([0.5, 0.5]), changes, 1.0 / RATE_HZ)
+    shares = plan.evaluate(np.arange(100) / RATE_HZ)
     rows = [[0.0, 0.0, 0.5, 0.5], *([r.start_ns, r.end_ns, *r.alpha] for r in sorted(changes))]
     links = np.zeros(2, link_dtype(2))
     for k in range(100):
@@ -45,13 +44,12 @@ def test_shares_equal_the_cores(drawn: list[tuple[int, int, float]]) -> None:
 
 def test_shares_before_a_sudden_change_are_kept() -> None:
     step = DominanceRamp(10**9, 10**9, (1.0, 0.0))
-    shares = evaluate_ramps(
-        np.array([0.5, 0.5]), [step], np.arange(100) / RATE_HZ, 1.0 / RATE_HZ
-    )
+    plan = DominancePlan(np.array([0.5, 0.5]), [step], 1.0 / RATE_HZ)
+    shares = plan.evaluate(np.arange(100) / RATE_HZ)
     assert shares.before[49].tolist() == [0.5, 0.5]
     assert shares.alpha[50].tolist() == [1.0, 0.0]
     assert not shares.constant
-    assert evaluate_ramps(np.array([0.5, 0.5]), [], np.arange(9.0), 1.0).constant
+    assert plan._replace(ramps=[]).evaluate(np.arange(9.0)).constant
 
 
 RAMPS = {
@@ -73,7 +71,7 @@ def ramped():
 
 def test_a_ramp_begins_where_the_previous_ends(ramped):
     part = ramped["s"]
-    alpha = trace_dominance(ramped, "s", part.t_s).alpha
+    alpha = DominanceHistory.of_log(ramped, "s", part.t_s).alpha
     at = [0.5, 1.0, 1.5, 2.0, 2.75, 3.5, 4.9, 5.1]
     assert np.interp(at, part.t_s, alpha[:, 0]) == pytest.approx(
         [0.5, 0.5, 0.625, 0.75, 0.375, 0.0, 0.0, 0.5]
@@ -84,7 +82,7 @@ def test_a_ramp_begins_where_the_previous_ends(ramped):
 def test_shares_give_the_recorded_references(ramped):
     """Eq. (6) with the shares and the samples in use gives the recorded reference."""
     part = ramped["s"]
-    alpha = trace_dominance(ramped, "s", part.t_s).alpha
+    alpha = DominanceHistory.of_log(ramped, "s", part.t_s).alpha
     reference = np.zeros_like(part.q)
     for peer, factor in zip(part.peers, alpha.T, strict=True):
         used = part.used[peer]

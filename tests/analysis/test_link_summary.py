@@ -17,24 +17,24 @@ from tests.analysis.ages_in_use import compute_ordered_moments, newest_wins
 from tests.analysis.builders import drive_run, make_busy_run, make_short_log
 from tests.log.builders import replace_fields, rewrite_log
 from trilat_net.analysis.link_summary import (
+    LinkSummary,
+    ValueStatistics,
     bin_ages,
-    compute_statistics,
     predict_delivery,
-    summarise_links,
 )
+from trilat_net.core.links import link_schedule as module
 from trilat_net.core.links.channel import LOST
+from trilat_net.core.links.link_schedule import first_ticks
 from trilat_net.core.step.site_step import Site
 from trilat_net.core.step.ticks import first_tick_at
 from trilat_net.errors import LogError
 from trilat_net.scenario import load_scenario, parse_scenario
-from trilat_net.scenario import sample_uses as module
-from trilat_net.scenario.sample_uses import first_ticks
 
 PERIOD_MS = 1.0
 
 
 def summarise_by_name(log):
-    return {use.name: use for use in summarise_links(log)}
+    return {use.name: use for use in LinkSummary.list_of_log(log)}
 
 
 @cache
@@ -134,7 +134,7 @@ def test_late_samples_equal_those_of_the_core():
     hurried = log.scenario.text.replace("delay_ms = 200.0", "delay_ms = 0.0")
     assert hurried != log.scenario.text
     run = drive_run(parse_scenario(hurried))
-    for use in summarise_links(run.log):
+    for use in LinkSummary.list_of_log(run.log):
         assert use.counts.late == find_counts(run, use.name).late
 
 
@@ -170,11 +170,11 @@ def test_false_tick_numbers_cost_no_memory():
 
 
 def test_effective_delay_without_jitter_is_the_stated():
-    for use in summarise_links(make_short_log("paper")):
+    for use in LinkSummary.list_of_log(make_short_log("paper")):
         assert use.plain
         assert use.one_way_us is None
-        assert use.age_ms == compute_statistics([200.0])
-        assert use.drawn_ms == compute_statistics([200.0])
+        assert use.age_ms == ValueStatistics.of_values([200.0])
+        assert use.drawn_ms == ValueStatistics.of_values([200.0])
         assert (use.ticks_without_new, use.silence_ms, use.first_use_s) == (0.0, 5.0, 0.2)
         assert sum(use.ages.ticks) == 400 - 40
 
@@ -194,7 +194,7 @@ def test_recorded_ages_follow_from_fates_of_samples(link):
     t_ns = np.arange(len(part)) * 10**9 // part.rate_hz
     ages = [(t_ns[tick] - fate.stamp_ns[n]) / 1e6 for tick, n in enumerate(in_use) if n >= 0]
     assert tuple(summarise_busy_run()[link].age_ms) == pytest.approx(
-        tuple(compute_statistics(ages))
+        tuple(ValueStatistics.of_values(ages))
     )
 
 
@@ -291,7 +291,7 @@ def test_measured_loss_and_bursts_follow_the_model():
         "two_sites",
         {"duration_s": 30.0, "rate_hz": 100, "link.loss": 0.2, "link.loss_burst": 5.0},
     )
-    for use in summarise_links(trilat_net.simulate(scenario)):
+    for use in LinkSummary.list_of_log(trilat_net.simulate(scenario)):
         bursts = use.counts.lost / 5.0
         assert use.loss == pytest.approx(0.2, abs=4 * 0.2 * math.sqrt(2.0 / bursts))
         assert use.burst == pytest.approx(5.0, abs=4 * 5.0 / math.sqrt(bursts))
@@ -302,7 +302,7 @@ def test_playout_makes_smaller_jitter_constant():
     use = summarise_busy_run()["b->c"]
     assert use.drawn_ms.deviation == pytest.approx(20.0, rel=0.4)
     assert use.age_ms.p50 < 80.0  # a tick of 5 ms, a sample every 6.67 ms
-    assert use.stated[0].link.moments().deviation_ms < 21.0
+    assert use.stated.models[0].link.moments().deviation_ms < 21.0
 
 
 # -- spreads and histograms
@@ -323,7 +323,7 @@ def test_histogram_counts_ticks_in_few_round_bins():
 def test_one_age_gives_one_bin():
     assert bin_ages(np.full(7, 200_000_000)).ticks == [7]
     assert bin_ages(np.zeros(0, dtype=np.int64)) is None
-    assert compute_statistics([]) is None
+    assert ValueStatistics.of_values([]) is None
 
 
 # -- logs that cannot tell
@@ -331,8 +331,8 @@ def test_one_age_gives_one_bin():
 
 def test_an_empty_log_has_no_link_statistics():
     log = rewrite_log(make_short_log("paper"), keep=lambda _: False, finished=False)
-    for use in summarise_links(log):
-        assert use.stated[0].link.delay_ms == 200.0
+    for use in LinkSummary.list_of_log(log):
+        assert use.stated.models[0].link.delay_ms == 200.0
         assert use.plain
         assert (use.age_ms, use.ages, use.counts, use.loss, use.burst, use.silence_ms) == (
             None,

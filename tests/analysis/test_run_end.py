@@ -15,7 +15,6 @@ from trilat_net.analysis.run_end import (
     RunEnd,
     RunTrace,
     Stability,
-    reduce_to_buckets,
 )
 from trilat_net.core.step.ticks import BUCKETS_PER_S
 from trilat_net.core.step.vectors import Array
@@ -277,7 +276,7 @@ def make_trace(speed: Array, *, one_way: bool = False) -> RunTrace:
     qd = np.tile((speed * (1.0 if one_way else np.cos(2.0 * np.pi * T_S)))[:, None], 2)
     q = np.cumsum(qd, axis=0) / RATE_HZ
     bucket = np.arange(len(T_S)) * BUCKETS_PER_S // RATE_HZ
-    buckets = reduce_to_buckets(bucket, np.zeros_like(q), qd, q, NO_BUCKETS)
+    buckets = RunTrace.reduce_records(bucket, np.zeros_like(q), qd, q, NO_BUCKETS)
     return RunTrace([buckets] * 3, [np.zeros(2)] * 3)
 
 

@@ -1,17 +1,14 @@
 """Changes and modes over time."""
 
+from itertools import pairwise
+
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from tests.analysis.builders import make_busy_run, make_short_log, make_site_log
 from tests.log.builders import replace_fields, rewrite_log
-from trilat_net.analysis.timeline import (
-    find_mode_intervals,
-    list_changes,
-    list_stated_models,
-    recorded_end_s,
-)
+from trilat_net.analysis.timeline import Timeline
 from trilat_net.errors import LogError
 from trilat_net.net.messages import MODES
 
@@ -20,15 +17,14 @@ from trilat_net.net.messages import MODES
 def test_spans_are_ticks_of_not_following(modes):
     part = make_site_log(modes)
     spans = [(mode, k) for k, mode in enumerate(modes) if not MODES[mode].follows]
+    found = Timeline({"m1": part}).find_mode_intervals("m1")
     intervals = [
         (span.mode, k)
-        for span in find_mode_intervals(part)
+        for span in found
         for k in range(round(span.from_s * part.rate_hz), round(span.to_s * part.rate_hz))
     ]
     assert intervals == spans
-    for before, after in zip(
-        find_mode_intervals(part), find_mode_intervals(part)[1:], strict=False
-    ):
+    for before, after in pairwise(found):
         # one span, not two in a row
         assert (before.mode, before.to_s) != (
             after.mode,
@@ -38,16 +34,14 @@ def test_spans_are_ticks_of_not_following(modes):
 
 
 def test_stated_link_settings_follow_changes():
-    log = make_busy_run().log
-    assert [
-        (s.from_s, s.link.describe())
-        for s in list_stated_models(log, "a->c", list_changes(log))
-    ] == [
+    timeline = Timeline(make_busy_run().log)
+    links = timeline.stated_links
+    assert [(model.from_s, model.link.describe()) for model in links["a->c"].models] == [
         (0.0, "50 ms"),
         (1.0, "90 ms, loss 10 %"),
     ]
-    assert [s.from_s for s in list_stated_models(log, "b->a", list_changes(log))] == [0.0]
-    assert recorded_end_s(log) == 6.0
+    assert [model.from_s for model in links["b->a"].models] == [0.0]
+    assert timeline.end_s == 6.0
 
 
 @pytest.mark.parametrize(
@@ -60,10 +54,11 @@ def test_a_record_naming_a_foreign_change_is_refused(text):
         )
 
     with pytest.raises(LogError):
-        list_changes(rewrite_log(make_busy_run().log, change=spoiled))
+        _ = Timeline(rewrite_log(make_busy_run().log, change=spoiled)).changes
 
 
 def test_a_log_without_records_ends_as_planned():
     empty = rewrite_log(make_short_log("paper"), keep=lambda _: False, finished=False)
-    assert recorded_end_s(empty) == 2.0
-    assert find_mode_intervals(empty["m1"]) == []
+    timeline = Timeline(empty)
+    assert timeline.end_s == 2.0
+    assert timeline.find_mode_intervals("m1") == []

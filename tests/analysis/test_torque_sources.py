@@ -6,12 +6,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tests.analysis.builders import make_run
-from trilat_net.analysis.aligned import align_records
+from trilat_net.analysis.aligned import AlignedRecords
 from trilat_net.analysis.arm_rows import PlanarArmRows
 from trilat_net.analysis.torque_sources import (
-    attribute_torque,
-    compute_operator_script,
-    compute_source_torque,
+    SourceRows,
+    TorqueSplit,
 )
 from trilat_net.core.arms import exogenous
 from trilat_net.core.arms.exogenous import TorqueKind, TorqueSource, torque_source_rows
@@ -60,16 +59,16 @@ def test_every_torque_equals_the_cores(
         expected[n] = exogenous.source_torque(
             float(t_s[n]), q[n], qd[n], lengths, rows[0], table
         )[:2]
-    torque = compute_source_torque(
-        actor, t_s, q, qd, PlanarArmRows(np.zeros(5), 0.0, lengths).place_end_effector(q, qd)
+    torque = SourceRows(actor).compute_torque(
+        t_s, q, qd, PlanarArmRows(np.zeros(5), 0.0, lengths).place_end_effector(q, qd)
     )
     np.testing.assert_allclose(torque, expected, rtol=1e-9, atol=1e-9)
 
 
 def test_hand_and_environment_torques_sum_to_the_record() -> None:
     log = make_run("rich").log
-    for site, track in align_records(log).items():
-        by = attribute_torque(track, log.scenario)
+    for site, track in AlignedRecords.by_site(log).items():
+        by = TorqueSplit.with_script(track, log.scenario)
         np.testing.assert_allclose(by.operator + by.environment, -track.tau_x, atol=1e-9)
         assert (site == "s") == by.environment_now.any() == by.environment.any()
         assert (site == "m1") == (np.abs(by.operator_held).max() > 1e-9)
@@ -79,9 +78,9 @@ def test_hand_and_environment_torques_sum_to_the_record() -> None:
 
 def test_an_unscripted_hand_has_no_script() -> None:
     log = make_run("rich").log
-    track = align_records(log)["m2"]
+    track = AlignedRecords.by_site(log)["m2"]
     other = track._replace(tau_x=track.tau_x + 0.1)
-    assert attribute_torque(other, log.scenario).script is None
+    assert TorqueSplit.with_script(other, log.scenario).script is None
 
 
 @pytest.mark.parametrize("acts", [TorqueKind.HAND, TorqueKind.TASK_HAND])
@@ -92,6 +91,7 @@ def test_scripts_are_torques_at_a_fixed_pose(acts: TorqueKind) -> None:
     t_s = np.linspace(0.0, 4.0, 41)
     still = np.tile([0.3, 1.1], (len(t_s), 1))
     tip = PlanarArmRows(np.zeros(5), 0.0, (1.0, 1.0)).place_end_effector(still, 0.0 * still)
-    torque = compute_source_torque(actor, t_s, still, 0.0 * still, tip)
-    script = compute_operator_script(actor, t_s, tip.J[0])
+    rows = SourceRows(actor)
+    torque = rows.compute_torque(t_s, still, 0.0 * still, tip)
+    script = rows.compute_script(t_s, tip.J[0])
     np.testing.assert_allclose(script - script[0], torque - torque[0], atol=1e-12)

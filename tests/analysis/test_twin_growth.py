@@ -13,7 +13,6 @@ from trilat_net.analysis.twins.twin_growth import (
     PushedTwins,
     PushGrowth,
     TwinGrowth,
-    judge_twins,
 )
 from trilat_net.execution.twins import Push, TwinPath, Twins
 from trilat_net.scenario import load_scenario
@@ -35,7 +34,7 @@ def make_twins(rate_per_s: float, omega_rad_s: float = 7.0, seconds: float = 20.
 
 
 def judge_difference(rate_per_s: float) -> TwinGrowth:
-    return judge_twins(TWO, make_twins(rate_per_s), 0.0, math.inf)
+    return TwinGrowth.of_twins(TWO, make_twins(rate_per_s), 0.0, math.inf)
 
 
 @pytest.mark.parametrize("rate_per_s", [-0.55, -0.02, 0.0, 0.02, 0.55])
@@ -86,7 +85,9 @@ def of_joints(*rates_per_s: float, sizes: tuple[float, ...] = (1.0, 1.0, 1.0, 1.
 def test_slow_growth_shows_beside_faster_decay() -> None:
     """m joint 1 grows by 0.02 /s from a thousandth of the size of the others, which decay."""
     sizes = (1e-3, 1.0, 1.0, 1.0)
-    growth = judge_twins(TWO, of_joints(0.02, -0.3, -0.3, -0.3, sizes=sizes), 0.0, math.inf)
+    growth = TwinGrowth.of_twins(
+        TWO, of_joints(0.02, -0.3, -0.3, -0.3, sizes=sizes), 0.0, math.inf
+    )
     assert growth.trend is EnvelopeTrend.GROWS
     assert growth.worst is not None
     assert growth.worst.joint == "m joint 1"
@@ -95,9 +96,9 @@ def test_slow_growth_shows_beside_faster_decay() -> None:
 
 
 def test_one_growing_joint_makes_pushes_grow() -> None:
-    growth = judge_twins(TWO, of_joints(0.02, -2.0, -2.0, -2.0), 0.0, math.inf)
+    growth = TwinGrowth.of_twins(TWO, of_joints(0.02, -2.0, -2.0, -2.0), 0.0, math.inf)
     assert growth.grows
-    still = judge_twins(TWO, of_joints(-0.3, -2.0, -2.0, -2.0), 0.0, math.inf)
+    still = TwinGrowth.of_twins(TWO, of_joints(-0.3, -2.0, -2.0, -2.0), 0.0, math.inf)
     assert still.trend is EnvelopeTrend.DECAYS
     assert not still.grows
 
@@ -118,7 +119,9 @@ def test_part_of_a_period_has_no_trend() -> None:
             "period_s": 1.21,
         },
     }
-    growth = judge_twins(load_scenario("two_sites", sines), make_twins(-0.5), 0.0, math.inf)
+    growth = TwinGrowth.of_twins(
+        load_scenario("two_sites", sines), make_twins(-0.5), 0.0, math.inf
+    )
     assert growth.delay_period_s == pytest.approx(145.2)
     assert growth.hides_period
 

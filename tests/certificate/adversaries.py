@@ -30,7 +30,7 @@ import trilat_net
 from tests.certificate.drawn_loops import make_experiment, make_swinging_hand
 from tests.execution.builders import run_fused
 from tests.scenario.builders import make_overrides
-from trilat_net.analysis.certificate.premises import find_missing_functionals
+from trilat_net.analysis.certificate.premise_quantities import MissingFunctional
 from trilat_net.analysis.judge import judge_virtual_run
 from trilat_net.analysis.theory.equilibrium import extend_scenario, follow_equilibrium
 from trilat_net.analysis.theory.linear_edge import find_contact_growth, find_rightmost_root
@@ -778,7 +778,7 @@ def say_of_run(scenario: Scenario) -> str:
 
     V, if the law has one, takes all records.
     """
-    if not find_missing_functionals(scenario):
+    if not MissingFunctional.list_of_scenario(scenario):
         return say_of(trilat_net.simulate(scenario))
     run = run_fused(scenario)
     return str(judge_virtual_run(scenario, run).decision.stability)

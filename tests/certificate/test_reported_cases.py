@@ -25,7 +25,7 @@ from tests.certificate.sampled_loops import (
 from tests.execution.builders import make_log_with_commands, run_fused
 from trilat_net.analysis.certificate.certificate_result import Certificate
 from trilat_net.analysis.run_end import Stability
-from trilat_net.analysis.timeline import list_effective_commands
+from trilat_net.analysis.timeline import Timeline
 from trilat_net.own_code.code_consent import allow_own_code
 from trilat_net.scenario import Scenario
 
@@ -370,7 +370,7 @@ def test_command_without_effect_leaves_the_roots(case: CommandedCase) -> None:
     scenario = case.loop.write_scenario(case.duration_s, case.apart_rad, case.law)
     log = make_log_with_commands(scenario, "b", *case.commands)
     assert len(log.changes("b")) == len(case.commands)
-    assert list_effective_commands(log) == []
+    assert Timeline(log).effective_commands == []
     certificate = tn.certify(log)
     assert_roots_decide(certificate, case.rate_per_s)
     planned = tn.certify(tn.simulate(scenario)).decision

@@ -12,13 +12,9 @@ from scipy.optimize import minimize_scalar
 
 import trilat_net
 from tests.scenario.builders import rough_arm_text
-from trilat_net.analysis.certificate.energy_balance import (
-    compute_energy_balance,
-    compute_site_energies,
-)
-from trilat_net.analysis.certificate.energy_terms import compute_dissipation, compute_work
+from trilat_net.analysis.certificate.energy_balance import EnergyBalance, SiteEnergy
 from trilat_net.analysis.theory.equilibrium import find_equilibrium
-from trilat_net.analysis.theory.linear_loop import linearise_loop
+from trilat_net.analysis.theory.linear_loop import LinearLoop
 from trilat_net.analysis.theory.operating_point import OperatingConditions
 from trilat_net.core.step.control import ROBUST_RESIDUE, robust_torque
 from trilat_net.log.log_reader import Log
@@ -61,13 +57,13 @@ def mean_dissipation(log: Log, without: float) -> float:
     """Returns the mean over time of sum beta (r'Kp r + disagreement), and V at the start
     divided by the time, W.
     """
-    energies = compute_site_energies(log)
-    beta = compute_energy_balance(energies).beta[0]
+    energies = SiteEnergy.by_site(log)
+    beta = EnergyBalance.of_energies(energies).beta[0]
     total = 0.0
     for weight, energy in zip(beta, energies.values(), strict=True):
         motion = energy.motion
         dissipation = {
-            name: power.total.sum() for name, power in compute_dissipation(motion).items()
+            name: power.total.sum() for name, power in motion.compute_dissipation().items()
         }
         opposed = (
             motion.r * motion.constants.robust_torque(motion.r)
@@ -91,7 +87,7 @@ def test_residue_is_the_maximum_of_its_function() -> None:
 @pytest.mark.long
 def test_robust_dissipation_stays_bounded_unlike_the_box() -> None:
     def bound(log: Log) -> float:
-        balance = compute_energy_balance(compute_site_energies(log))
+        balance = EnergyBalance.of_energies(SiteEnergy.by_site(log))
         robust_w = ROBUST_RESIDUE * float(balance.beta[0].sum()) * 2 * RHO_NM * WIDTH_RAD_S
         return robust_w + float(balance.V[0] - balance.V[-1]) / log.scenario.duration_s
 
@@ -105,10 +101,11 @@ def test_energy_closes_with_unknown_friction() -> None:
     robust = 'law = "adaptive_robust"\nrho_nm = 1.5\nwidth_rad_s = 0.1\nfriction = 0.25'
     text = rough_arm_text().replace('law = "adaptive"', robust)
     log = trilat_net.simulate(parse_scenario(text))
-    energies = compute_site_energies(log)
-    balance = compute_energy_balance(energies)
+    energies = SiteEnergy.by_site(log)
+    balance = EnergyBalance.of_energies(energies)
     friction = sum(
-        power.total for power in (compute_work(e.motion)["friction"] for e in energies.values())
+        power.total
+        for power in (e.motion.compute_work()["friction"] for e in energies.values())
     )
     assert np.abs(np.cumsum(friction)).max() >= 0.01 * balance.V.max()
     assert np.abs(balance.unexplained).max() <= 2e-4 * balance.V.max()
@@ -119,7 +116,7 @@ def test_small_motions_see_a_larger_kp() -> None:
 
     def static(law: str, more: str) -> np.ndarray:
         scenario = parse_scenario(SHAKEN.format(law=law, more=more))
-        return linearise_loop(
+        return LinearLoop.of_conditions(
             OperatingConditions.derive(scenario), find_equilibrium(scenario, (0.3, 0.2))
         ).A
 

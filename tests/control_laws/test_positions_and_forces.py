@@ -24,7 +24,7 @@ from tests.unit_arm import (
     make_unit_scenario,
     read_last_rows,
 )
-from trilat_net.analysis.metrics.log_metrics import compute_log_metrics
+from trilat_net.analysis.metrics.log_metrics import LogMetrics
 from trilat_net.analysis.theory.delay_margin import set_common_delay
 from trilat_net.analysis.theory.linear_analysis import analyse_linear_loop
 from trilat_net.errors import ScenarioError
@@ -231,7 +231,7 @@ def test_metrics_measure_the_felt_impedance_of_the_loop() -> None:
     log = open_bytes(
         simulate_bytes(make_four_channel_pair("without qdd", 0.001, duration_s=26.0))
     )
-    responses = compute_log_metrics(log).responses
+    responses = LogMetrics.of_log(log).responses
     felt = next(
         response
         for response in responses

@@ -24,7 +24,6 @@ from trilat_net.core.life.live_hand import (
     HandReach,
     HandRules,
     HandStep,
-    advance_hand,
     empty_hand_vector,
     find_stopping_speed,
 )
@@ -40,9 +39,8 @@ def advance_ticks(
     memory = HandMemory()
     steps = []
     for k in range(ticks):
-        step = advance_hand(
-            rules, memory, k * 10**9 // rules.rate_hz, messages.get(k, ()), lambda: ARM
-        )
+        t_ns = k * 10**9 // rules.rate_hz
+        step = rules.advance(memory, t_ns, messages.get(k, ()), lambda: ARM)
         memory = step.memory
         steps.append(step)
     return steps

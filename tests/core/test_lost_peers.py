@@ -9,11 +9,8 @@ import pytest
 import trilat_net
 from tests.core.guarded_runs import list_reasons
 from tests.execution.builders import make_trajectories, sample_records
-from trilat_net.analysis.certificate.energy_balance import (
-    compute_energy_balance,
-    compute_site_energies,
-)
-from trilat_net.analysis.dominance_history import list_losses, trace_dominance
+from trilat_net.analysis.certificate.energy_balance import EnergyBalance, SiteEnergy
+from trilat_net.analysis.dominance_history import DominanceHistory, PeerLoss
 from trilat_net.core.links.lost_peers import BACK_NS
 from trilat_net.core.step.ticks import LifeReason
 from trilat_net.errors import ScenarioError
@@ -60,7 +57,7 @@ def test_lost_masters_shares_go_over_and_return() -> None:
     starts = np.flatnonzero((part.mode[1:] == "return") & (part.mode[:-1] == "run")) + 1
     assert starts.tolist() == [3120, 4100 + BACK_NS // 1_000_000]
     assert (part.q_des[3500:4350] == other.q[3400:4250]).all()  # m2 alone
-    shares = trace_dominance(log, "s", part.t_s).alpha
+    shares = DominanceHistory.of_log(log, "s", part.t_s).alpha
     assert np.abs(shares.sum(axis=1) - 1.0).max() == 0.0
     assert (shares[3500] == [0.0, 1.0]).all()
     assert (shares[-1] == shares[0]).all()
@@ -92,9 +89,11 @@ def test_degraded_runs_verify_and_close_their_energies() -> None:
             (getattr(site, name)[-1] == row[columns[name]]).all()
             for name in ("q", "tau", "q_des")
         )
-    balance = compute_energy_balance(compute_site_energies(log))
+    balance = EnergyBalance.of_energies(SiteEnergy.by_site(log))
     assert np.abs(balance.residual).max() <= 1e-4 * np.abs(balance.V).max()
-    losses = [(site, peer, round(a, 2), round(b, 2)) for site, peer, a, b in list_losses(log)]
+    losses = [
+        (site, peer, round(a, 2), round(b, 2)) for site, peer, a, b in PeerLoss.list_of_log(log)
+    ]
     assert losses == [("m2", "m1", 3.12, 4.35), ("s", "m1", 3.12, 4.35)]
     (premise,) = (
         premise_found
@@ -111,7 +110,7 @@ def test_the_last_master_and_slave_are_awaited() -> None:
             held = log[site].mode == "hold"
             assert held[3120:4100].all()
             assert log[site].mode[-1] == "run"
-        assert list_losses(log) == []
+        assert PeerLoss.list_of_log(log) == []
 
 
 def test_indispensable_peers_are_never_dropped() -> None:
@@ -119,7 +118,7 @@ def test_indispensable_peers_are_never_dropped() -> None:
     chain = {"dominance.m2": {"m1": 1.0}, "dominance.m1": {"m2": 0.5, "s": 0.5}}
     log = trilat_net.simulate(make_cut_scenario("m1->s", duration_s=5.0, **chain))
     assert (log["s"].mode[3120:4100] == "hold").all()
-    assert list_losses(log) == []
+    assert PeerLoss.list_of_log(log) == []
 
 
 @pytest.mark.parametrize(

@@ -10,11 +10,7 @@ import trilat_net
 from tests.core.builders import POSE, make_task_arrays
 from tests.core.guarded_runs import find_largest_step, make_ordered_log
 from tests.scenario.builders import posed_task_text
-from trilat_net.analysis.certificate.energy_balance import (
-    compute_energy_balance,
-    compute_site_energies,
-)
-from trilat_net.analysis.certificate.energy_terms import measure_torque_error
+from trilat_net.analysis.certificate.energy_balance import EnergyBalance, SiteEnergy
 from trilat_net.core.life.resting import rests
 from trilat_net.core.life.session_life import update_session_life
 from trilat_net.core.step.site_setup import StaleAction
@@ -253,14 +249,14 @@ def test_energies_close_over_a_task_space_hold() -> None:
             "sites.s.task.posture_rad": [0.4, -0.5, 0.3, -1.4, 0.3, 1.1, 0.4],
         },
     )
-    energies = compute_site_energies(log)
-    balance = compute_energy_balance(energies)
+    energies = SiteEnergy.by_site(log)
+    balance = EnergyBalance.of_energies(energies)
     assert np.abs(balance.residual).max() <= 1e-4 * np.abs(balance.V).max()
     energy = energies["s"]
     modes = log["s"].mode
     first = int(np.flatnonzero(modes == "hold")[0])
     assert set(modes[first : first + 1400]) == {"hold"}
-    assert measure_torque_error(energy.motion).max() <= 1e-9
+    assert energy.motion.measure_torque_error().max() <= 1e-9
     assert verify_log(log).differing == 0
 
 

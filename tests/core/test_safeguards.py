@@ -18,10 +18,7 @@ from tests.core.guarded_runs import (
     make_stopped_log,
 )
 from tests.core.rests import compute_rest_torque, gravity_of
-from trilat_net.analysis.certificate.energy_balance import (
-    compute_energy_balance,
-    compute_site_energies,
-)
+from trilat_net.analysis.certificate.energy_balance import EnergyBalance, SiteEnergy
 from trilat_net.core.life.safeguards import BLEND_S
 from trilat_net.core.plug.user_law import LawContext, LawInput
 from trilat_net.core.step.ticks import LifeReason
@@ -176,7 +173,7 @@ def test_stops_and_returns_add_no_steps() -> None:
     )
     assert (log["s"].tau[jump + 1] == log["s"].tau[jump]).all()
     assert verify_log(log).identical == 16_000
-    balance = compute_energy_balance(compute_site_energies(log))
+    balance = EnergyBalance.of_energies(SiteEnergy.by_site(log))
     assert np.abs(balance.residual).max() <= 1e-3 * balance.scale
 
 

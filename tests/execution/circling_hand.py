@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from trilat_net.core.life.live_hand import HandCommand, HandMemory, advance_hand
+from trilat_net.core.life.live_hand import HandCommand
 from trilat_net.core.step.site_step import Site
 from trilat_net.scenario import Scenario
 
@@ -17,7 +17,7 @@ class CirclingHand:
         assert live is not None
         self._mode = live.mode
         self._rules = live.make_rules(spec.rate_hz, self._arm)
-        self._memory = HandMemory()
+        self._memory = self._rules.start().memory
 
     def __call__(self, site: Site, k: int) -> list[float]:
         def place() -> list[float]:
@@ -31,6 +31,6 @@ class CirclingHand:
             start = (0.0, 0.0) if self._mode == "force" else place()
             target = tuple(float(a + b) for a, b in zip(start, goal, strict=True))
             commands = [HandCommand(7, k, True, target, k * 1_000_000)]
-        step = advance_hand(self._rules, self._memory, k * 1_000_000, commands, place)
+        step = self._rules.advance(self._memory, k * 1_000_000, commands, place)
         self._memory = step.memory
         return step.vector

@@ -5,12 +5,9 @@ import pytest
 
 from tests.execution.circling_hand import CirclingHand
 from tests.log.builders import Record, edit_log_bytes, open_bytes, simulate_bytes
-from trilat_net.analysis.aligned import align_records
-from trilat_net.analysis.certificate.energy_balance import (
-    compute_energy_balance,
-    compute_site_energies,
-)
-from trilat_net.analysis.torque_sources import TorqueSplit, compute_live_torque
+from trilat_net.analysis.aligned import AlignedRecords
+from trilat_net.analysis.certificate.energy_balance import EnergyBalance, SiteEnergy
+from trilat_net.analysis.torque_sources import SourceRows, TorqueSplit
 from trilat_net.errors import ScenarioError
 from trilat_net.execution.verification import verify_log
 from trilat_net.execution.virtual import simulate_scenario
@@ -48,11 +45,11 @@ def test_the_force_is_zero_at_both_ends(held_log: Log) -> None:
     torque = np.abs(part.tau_x).max(axis=1)
     assert not torque[grip == 0.0].any()
     assert part.t_s[grip > 0.0].max() == pytest.approx(0.7 + 0.2 + 0.1, abs=0.03)
-    records = align_records(held_log)["m1"]
+    records = AlignedRecords.by_site(held_log)["m1"]
     split = TorqueSplit.of_records(records, held_log.scenario)
     source = held_log.scenario.sites["m1"].hands[0].actor
-    expected = compute_live_torque(
-        source, records.hand, records.q, records.qd, split.end_effector
+    expected = SourceRows(source).compute_live_torque(
+        records.hand, records.q, records.qd, split.end_effector
     )
     assert expected == pytest.approx(-records.tau_x, abs=1e-9)
     assert split.operator == pytest.approx(expected, abs=1e-9)
@@ -115,6 +112,6 @@ def test_an_invalid_live_hand_is_refused(changes: dict[str, object], problem: st
 
 def test_certificates_book_peoples_work_like_scripts(held_log: Log) -> None:
     """V changes by its booked terms, to 2e-5 of its largest value: `paper` itself closes to 1e-5."""
-    balance = compute_energy_balance(compute_site_energies(held_log))
+    balance = EnergyBalance.of_energies(SiteEnergy.by_site(held_log))
     assert np.abs(balance.external_work).max() > 0.1
     assert np.abs(balance.residual).max() < 2e-5 * balance.V.max()

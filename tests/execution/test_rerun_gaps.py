@@ -103,7 +103,7 @@ def test_torn_logs_are_executed_until_their_tear(share: float) -> None:
     log = open_bytes(data[: int(share * len(data))])
     again = rerun(log, ["s"])
     assert all_identical(again)
-    assert any("not finished" in note for note in again.notes)
+    assert any("is incomplete" in note for note in again.notes)
     assert 0 < rerun(log, [], {"control.Kd": 5.0}, closed_loop=True).sites["s"].executed < TICKS
 
 

@@ -6,7 +6,7 @@ import pytest
 import trilat_net
 from tests.execution.builders import run_fused
 from tests.scenario.builders import planar_task_text
-from trilat_net.analysis.metrics.log_metrics import compute_log_metrics
+from trilat_net.analysis.metrics.log_metrics import LogMetrics
 from trilat_net.analysis.run_end import RunEnd
 from trilat_net.log.log_reader import Log
 from trilat_net.presentation.figures.registry import list_drawable_figures
@@ -40,7 +40,7 @@ def test_task_errors_are_those_of_place(log: Log) -> None:
 
 
 def test_errors_are_measured_and_drawn_in_metres(log: Log) -> None:
-    metrics = compute_log_metrics(log)
+    metrics = LogMetrics.of_log(log)
     for site in log.sites:
         site_metrics = metrics.sites[site]
         part = log[site]
@@ -80,7 +80,7 @@ def test_wall_forces_follow_the_shares() -> None:
     log = trilat_net.simulate(
         parse_scenario(text.replace("[dominance]", TOUCH + "[dominance]"))
     )
-    metrics = compute_log_metrics(log)
+    metrics = LogMetrics.of_log(log)
     pair = next(
         sharing_ratio for sharing_ratio in metrics.sharing_ratios if sharing_ratio.by_wall
     )

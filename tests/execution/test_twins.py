@@ -8,7 +8,7 @@ import pytest
 
 import trilat_net as tn
 from tests.certificate.adversaries import p_d, two_pairs
-from trilat_net.analysis.twins.twin_growth import judge_twins
+from trilat_net.analysis.twins.twin_growth import TwinGrowth
 from trilat_net.errors import NotRepeatable, UsageError
 from trilat_net.execution.twins import (
     LARGEST,
@@ -27,7 +27,7 @@ def make_rest_scenario(d: float) -> Scenario:
 
 
 def rate_per_s(scenario: Scenario, twins: Twins) -> float:
-    return judge_twins(scenario, twins, 0.0, math.inf).pushes[0].rate_per_s
+    return TwinGrowth.of_twins(scenario, twins, 0.0, math.inf).pushes[0].rate_per_s
 
 
 @pytest.mark.parametrize(("d", "seconds"), [(0.5, 40.0), (2.0, 40.0), (3.0, 40.0)])

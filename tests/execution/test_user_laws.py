@@ -101,7 +101,7 @@ def test_reports_explain_hidden_memory() -> None:
         "100",
     ]
     command = join_arguments(verify_command)
-    assert find_text().endswith(f"but by: {command}")
+    assert find_text().endswith(f"to find it: {command}")
     assert "--resume-every" not in find_text(resume_every=1000)
     built_in = LogCheckReport.of_log(open_bytes(make_log_bytes("paper")), virtual=False)
     assert not [finding for finding in built_in.findings if "--resume-every" in finding.text]

@@ -3,8 +3,8 @@
 from dataclasses import replace
 
 from tests.analysis.builders import make_run, make_short_log
-from trilat_net.analysis.metrics.log_metrics import LogMetrics, compute_log_metrics
-from trilat_net.analysis.metrics.measures import Metric, quantities
+from trilat_net.analysis.metrics.log_metrics import LogMetrics
+from trilat_net.analysis.metrics.measures import Metric
 from trilat_net.presentation import brief_text
 from trilat_net.presentation.certificate_text import CertificateLine, describe_certificate
 from trilat_net.presentation.result_text import TextTable, compose
@@ -20,7 +20,7 @@ def key_rows(metrics: LogMetrics) -> dict[str, list[str]]:
 
 
 def test_key_metrics_name_the_worst_subject() -> None:
-    metrics = compute_log_metrics(make_short_log("paper"))
+    metrics = LogMetrics.of_log(make_short_log("paper"))
     rows = key_rows(metrics)
     errors = {site: values["max_error_rad"].value for site, values in metrics.sites.items()}
     worst = max(errors, key=lambda site: errors[site] or 0.0)
@@ -32,7 +32,7 @@ def test_key_metrics_name_the_worst_subject() -> None:
 
 
 def test_missing_key_metric_has_its_reason() -> None:
-    metrics = compute_log_metrics(make_short_log("paper"))
+    metrics = LogMetrics.of_log(make_short_log("paper"))
     assert metrics.sites["m1"]["settle_s"].value is None
     number, _, reason = key_rows(metrics)["settling time"]
     assert number == "–"
@@ -40,12 +40,12 @@ def test_missing_key_metric_has_its_reason() -> None:
 
 
 def test_every_key_metric_exists() -> None:
-    known = {quantity.key for quantity in quantities()}
+    known = {quantity.key for quantity in LogMetrics.list_quantities()}
     assert set(brief_text._KEY_METRICS) <= known
 
 
 def test_short_table_never_exceeds_ten_lines() -> None:
-    metrics = compute_log_metrics(make_short_log("paper"))
+    metrics = LogMetrics.of_log(make_short_log("paper"))
     filled = {key: Metric(1.0) for key in metrics.sites["m1"]}
     table, _ = compose(replace(metrics, sites={"m1": filled}), brief=True)
     assert isinstance(table, TextTable)

@@ -16,7 +16,8 @@ from trilat_net.log.log_reader import Log
 from trilat_net.log.ros2.ros2_messages import Ros2SiteChannels
 from trilat_net.presentation import charts
 from trilat_net.presentation.appearance import REPORT_SIZE, FigureSize
-from trilat_net.presentation.figures import arm_poses, joint_motion
+from trilat_net.presentation.figures import arm_poses
+from trilat_net.presentation.figures.registry import FIGURES
 from trilat_net.presentation.style import arrange_joints
 from trilat_net.scenario import parse_scenario
 
@@ -68,31 +69,31 @@ def test_panels_of_joints_fill_their_rows():
     ],
 )
 @pytest.mark.parametrize(
-    ("draw", "panels"),
+    ("name", "panels"),
     [
-        (joint_motion.draw_positions, 18),
-        (joint_motion.draw_tracking_errors, 7),
-        (joint_motion.draw_control_torques, 6),
-        pytest.param(joint_motion.draw_parameter_estimates, 60, marks=pytest.mark.long),
-        (joint_motion.draw_phase_portrait, 6),
-        (joint_motion.draw_end_effector_paths, 3),
-        (arm_poses.draw_arms, None),
+        ("positions", 18),
+        ("tracking_errors", 7),
+        ("control_torques", 6),
+        pytest.param("parameter_estimates", 60, marks=pytest.mark.long),
+        ("phase", 6),
+        ("paths", 3),
+        ("arms", None),
     ],
 )
-def test_every_joint_has_its_panel(form, draw, panels):
-    figure = draw(simulate_six_joints(), form)
+def test_every_joint_has_its_panel(form, name, panels):
+    figure = FIGURES[name].draw(simulate_six_joints(), form)
     assert panels in (None, len(figure.axes))
     assert list_misplaced(figure) == []
     text = " ".join(
         axes.get_title() + axes.get_ylabel().replace("\n", "") for axes in figure.axes
     )
     if panels in (6, 7):
-        assert all(f"{n}: {name}" in text for n, name in enumerate(JOINTS, 1))
+        assert all(f"{n}: {joint}" in text for n, joint in enumerate(JOINTS, 1))
 
 
 def test_tip_paths_appear_in_three_planes():
     log = simulate_six_joints()
-    panels = joint_motion.draw_end_effector_paths(log, REPORT_SIZE).axes
+    panels = FIGURES["paths"].draw(log, REPORT_SIZE).axes
     names = [(axes.get_xlabel()[0], axes.get_ylabel()[0]) for axes in panels]
     assert names == [("x", "y"), ("x", "z"), ("y", "z")]
     for site, line in (("m1", 0), ("s", 6)):  # a path, its ring and its disc
@@ -120,7 +121,7 @@ def test_wall_forces_equal_the_recorded_torques():
     push = {"sites.s.environment": [{**wall, "stiffness_n_m": 800.0, "damping_n_s_m": 5.0}]}
     log = simulate_scenario(parse_scenario(SIX, overrides={"rate_hz": 200, **push}))
     part = log["s"]
-    force_panel, depth_panel = joint_motion.draw_contact(log).axes
+    force_panel, depth_panel = FIGURES["contact"].draw(log).axes
     t_s, force = force_panel.lines[0].get_data()
     rows = np.rint(t_s * part.rate_hz).astype(int)
     assert force.max() > 5.0

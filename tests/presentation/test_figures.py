@@ -17,7 +17,7 @@ from tests.presentation.figure_content import list_curves
 from tests.scenario.builders import planar_task_text
 from trilat_net.analysis import site_signals
 from trilat_net.analysis.link_summary import DelayDistribution
-from trilat_net.analysis.timeline import find_mode_intervals
+from trilat_net.analysis.timeline import Timeline
 from trilat_net.errors import UsageError
 from trilat_net.presentation import style
 from trilat_net.presentation.appearance import SITE_COLOURS, list_site_colours
@@ -29,6 +29,7 @@ from trilat_net.presentation.figures import (
     registry,
     run_overview,
 )
+from trilat_net.presentation.figures.registry import FIGURES
 from trilat_net.scenario import load_scenario, parse_scenario
 
 BACKGROUND = 0.6
@@ -47,13 +48,13 @@ def list_marks(figure):
 def test_a_site_has_one_colour_in_every_figure():
     log = make_short_log("paper")
     for figure in (
-        joint_motion.draw_tracking_errors(log),
-        joint_motion.draw_parameter_estimates(log),
+        FIGURES["tracking_errors"].draw(log),
+        FIGURES["parameter_estimates"].draw(log),
         joint_motion.draw_operator_displacement(log, twin=log),
     ):
         drawn = [to_hex(line.get_color()) for line in list_curves(figure.axes[0])]
         assert drawn[: len(log.sites)] == [style.site_colour(log, site) for site in log.sites]
-    for site, axes in zip(log.sites, joint_motion.draw_positions(log).axes[::2], strict=True):
+    for site, axes in zip(log.sites, FIGURES["positions"].draw(log).axes[::2], strict=True):
         assert to_hex(list_curves(axes)[0].get_color()) == style.site_colour(log, site)
 
 
@@ -86,7 +87,8 @@ def test_a_log_without_events_has_no_markers():
 
 def test_every_panel_of_a_site_shows_its_changes(monkeypatch):
     log = make_busy_run().log
-    figure = joint_motion.draw_positions(log)
+    timeline = Timeline(log)
+    figure = FIGURES["positions"].draw(log)
     for site, row in zip(log.sites, np.reshape(figure.axes, (3, 2)), strict=True):
         for axes in row:
             at_s = [
@@ -97,20 +99,20 @@ def test_every_panel_of_a_site_shows_its_changes(monkeypatch):
                 edge for p in axes.patches for edge in (p.get_x(), p.get_x() + p.get_width())
             ]
             assert drawn == pytest.approx(
-                [edge for span in find_mode_intervals(log[site]) for edge in span[1:]]
+                [edge for span in timeline.find_mode_intervals(site) for edge in span[1:]]
             )
-    shades, changes = list_marks(joint_motion.draw_tracking_errors(log))
+    shades, changes = list_marks(FIGURES["tracking_errors"].draw(log))
     assert len(changes) == 3 * 3
-    assert len(shades) == 3 * sum(len(find_mode_intervals(log[site])) for site in log.sites)
+    assert len(shades) == 3 * sum(len(timeline.find_mode_intervals(site)) for site in log.sites)
     assert "1: a → c 90 ms, loss 10 %" in figure.get_supxlabel()
     assert "holds" in figure.get_supxlabel()
     monkeypatch.setattr(style, "MOST_EXPLAINED_CHANGES", 1)
-    assert "and 2 more" in joint_motion.draw_operation(log).get_supxlabel()
+    assert "and 2 more" in FIGURES["operation"].draw(log).get_supxlabel()
 
 
 def test_the_stated_mean_is_drawn_while_valid():
     log = make_busy_run().log
-    figure = age_and_lateness.draw_sample_age(log)
+    figure = FIGURES["sample_age"].draw(log)
     panel = next(axes for axes in figure.axes if axes.get_title(loc="left") == "a → c")
     t_s, mean_ms = list_curves(panel)[-1].get_data()
     assert list(t_s) == pytest.approx([0.0, 1.0, 1.0, 1.0, 6.0, 6.0])
@@ -118,7 +120,7 @@ def test_the_stated_mean_is_drawn_while_valid():
     measured = trilat_net.simulate(
         "two_sites", {"duration_s": 0.5, "rate_hz": 200, "link.model": "measured"}
     )
-    figure = age_and_lateness.draw_sample_age(measured)
+    figure = FIGURES["sample_age"].draw(measured)
     assert all(np.isnan(list_curves(axes)[-1].get_ydata()).all() for axes in figure.axes)
     assert "mean delay as stated" not in [
         text.get_text() for text in figure.legends[0].get_texts()
@@ -126,7 +128,7 @@ def test_the_stated_mean_is_drawn_while_valid():
 
 
 def test_each_site_has_estimates_beside_the_truth():
-    figure = joint_motion.draw_parameter_estimates(make_short_log("paper"))
+    figure = FIGURES["parameter_estimates"].draw(make_short_log("paper"))
     assert [len(list_curves(axes)) for axes in figure.axes] == [3] * 5
     truths = [line for line in figure.axes[3].lines if line not in list_curves(figure.axes[3])]
     # m1 lc1 + m2 l1 of the paper's arm
@@ -185,7 +187,7 @@ def test_arms_stand_in_panels_with_equal_axes():
     )[0]
     assert [*base, *elbow, *end_effector] == pytest.approx([0.0, 0.0, 0.0, 0.6, 1.0, 0.6])
     instants = arm_poses.choose_instants_s(log)
-    figure = arm_poses.draw_arms(log)
+    figure = FIGURES["arms"].draw(log)
     assert len(figure.axes) == 4 * len(instants)
     for axes in figure.axes:
         assert axes.get_aspect() == 1.0
@@ -212,7 +214,7 @@ def test_long_paths_are_thinned_between_ends():
 
 def test_a_triangle_stands_where_a_site_settles():
     log = make_short_log("two_sites")
-    (axes,) = joint_motion.draw_settling(log).axes
+    (axes,) = FIGURES["settling"].draw(log).axes
     marks = [line.get_data() for line in axes.lines if line.get_marker() == "v"]
     settled = [site_signals.settling_time_s(log[site]) for site in log.sites]
     assert [float(t) for (t,), _ in marks] == pytest.approx(
@@ -223,7 +225,7 @@ def test_a_triangle_stands_where_a_site_settles():
 
 def test_phase_portraits_show_e_and_its_rate():
     log = make_short_log("paper")
-    line = joint_motion.draw_phase_portrait(log).axes[1].lines[0]
+    line = FIGURES["phase"].draw(log).axes[1].lines[0]
     part = log["m1"]
     both = np.stack([part.e[:, 1], (part.qd - part.qd_des)[:, 1]], axis=1)
     assert {tuple(row) for row in np.transpose(line.get_data()).tolist()} <= {
@@ -232,12 +234,12 @@ def test_phase_portraits_show_e_and_its_rate():
 
 
 def test_torque_limits_are_drawn_where_reached():
-    free = joint_motion.draw_control_torques(make_short_log("paper"))
+    free = FIGURES["control_torques"].draw(make_short_log("paper"))
     assert [text.get_text() for text in free.legends[0].get_texts()][-1] != "limit"
     log = trilat_net.simulate(
         "paper", {"duration_s": 1, "rate_hz": 200, "limits.tau_limit_nm": 20}
     )
-    figure = joint_motion.draw_control_torques(log)
+    figure = FIGURES["control_torques"].draw(log)
     assert [text.get_text() for text in figure.legends[0].get_texts()][-1] == "limit"
     axes = figure.axes[0]
     assert {line.get_ydata()[0] for line in axes.lines if line not in list_curves(axes)} == {
@@ -256,7 +258,7 @@ RAMPS = [
 def test_shares_are_drawn_as_they_change():
     log = trilat_net.simulate("paper", {"duration_s": 2.0, "rate_hz": 100, "timeline": RAMPS})
     assert joint_motion.list_sites_with_changing_dominance(log) == ["s"]
-    figure = joint_motion.draw_authority(log)
+    figure = FIGURES["authority"].draw(log)
     assert len(figure.axes) == 3
     m1, m2 = (line.get_data() for line in list_curves(figure.axes[0])[:2])
     assert np.interp([0.4, 0.75, 1.0, 1.25, 1.6], *m1) == pytest.approx(

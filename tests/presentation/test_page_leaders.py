@@ -13,7 +13,7 @@ from tests.analysis.builders import make_busy_run, make_run, make_short_log
 from tests.live.browsers import needs_browser
 from tests.page.whole_pages import watched_page
 from trilat_net.analysis.certificate.stability_certificate import certify_log
-from trilat_net.analysis.dominance_history import trace_dominance
+from trilat_net.analysis.dominance_history import DominanceHistory
 from trilat_net.log.log_reader import Log
 from trilat_net.presentation.charts import ChartBuilder
 from trilat_net.presentation.page import write_report
@@ -36,7 +36,7 @@ def test_the_bar_is_the_dominance_at_every_tick() -> None:
     log = simulate_training()
     (lead,) = trace_leads(log)
     t_s = log["s"].t_s
-    alpha = trace_dominance(log, "s", t_s).alpha
+    alpha = DominanceHistory.of_log(log, "s", t_s).alpha
     for column, peer in enumerate(lead.peers):
         drawn = np.interp(t_s, lead.t_s, lead.shares[:, column])
         recorded = alpha[:, log.scenario.peers("s").index(peer)]

@@ -25,7 +25,7 @@ from trilat_net.analysis.judge import certify_run
 from trilat_net.analysis.metrics.motion_metrics import measure_undelayed_error
 from trilat_net.analysis.run_end import EndBehaviour, Stability
 from trilat_net.analysis.run_view import RunView
-from trilat_net.analysis.site_signals import SETTLED_ERROR_RAD, find_last_error
+from trilat_net.analysis.site_signals import SETTLED_ERROR_RAD, JointError
 from trilat_net.log.findings import Finding
 from trilat_net.log.log_reader import Log, open_log
 from trilat_net.presentation.certificate_text import describe_certificate
@@ -176,7 +176,7 @@ def test_all_texts_have_the_same_last_error(name: str) -> None:
     """The page, the table of `report` and `certify` name one number and its joint."""
     log = make_short_log(name)
     certificate = certify_log(log)
-    error = find_last_error(log)
+    error = JointError.find_last_of_all(log)
     assert error is not None
     facts = summarise_run(log)
     assert facts["max_error_end_rad"] == certificate.end.end_error_rad == error.value

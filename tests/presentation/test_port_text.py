@@ -5,7 +5,6 @@ import numpy as np
 import pytest
 
 from tests.theory.analysed_ports import section_of
-from trilat_net.analysis.theory.port_analysis import ports_to_json
 from trilat_net.presentation.appearance import REPORT_SIZE, FigureSize
 from trilat_net.presentation.figures.linear_figures import (
     draw_port_impedance,
@@ -52,7 +51,7 @@ def test_destabilising_clamps_leave_nothing_to_feel() -> None:
 def test_facts_have_the_numbers_of_the_lines() -> None:
     for name in ("p_d_margin_two", "two_sites"):
         section = section_of(name)
-        facts = json.loads(json.dumps(ports_to_json(section), allow_nan=False))
+        facts = json.loads(json.dumps(section.to_json(), allow_nan=False))
         assert facts["passive_qd"]["holds"] is section.velocity.passive
         assert facts["passive_qd"]["least"] == section.velocity.minima.least
         assert facts["felt"][0]["ratio_db"] == section.transparency[0].ratio_db

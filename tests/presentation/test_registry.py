@@ -143,7 +143,7 @@ def test_wall_force_equals_the_recorded_torque():
     log = simulate_walled()
     part = log["s"]
     wall = log.scenario.sites["s"].environment[0]
-    above = joint_motion.draw_contact(log).axes[0]
+    above = FIGURES["contact"].draw(log).axes[0]
     t_s, force = above.lines[0].get_data()
     rows = np.rint(t_s * part.rate_hz).astype(int)
     q = part.q[rows]

@@ -13,7 +13,7 @@ import trilat_net
 from tests.analysis.builders import make_busy_run, make_short_log
 from tests.core.guarded_runs import make_stopped_log
 from tests.log.builders import rewrite_log
-from trilat_net.analysis.link_summary import summarise_clock
+from trilat_net.analysis.link_summary import ClockSummary
 from trilat_net.core.step.site_setup import Layout
 from trilat_net.core.step.ticks import LifeAlarm, LifeReason
 from trilat_net.net.messages import Event, LinkStats
@@ -149,7 +149,7 @@ def make_clock_statistics():
 
 
 def test_clocks_are_reported_as_at_the_end():
-    use = summarise_clock(make_clock_statistics(), "m1", "m2")
+    use = ClockSummary.of_link(make_clock_statistics(), "m1", "m2")
     assert (use.offset_first_us, use.offset_us) == (3_000_000, 3_000_100)
     assert (use.bound_p50_us, use.bound_max_us, use.rtt_min_us, use.faults) == (
         130.0,
@@ -166,10 +166,10 @@ def test_clocks_are_reported_as_at_the_end():
 
 
 def test_shared_clocks_get_no_line():
-    shared = summarise_clock(make_clock_statistics(), "s", "m2")
+    shared = ClockSummary.of_link(make_clock_statistics(), "s", "m2")
     assert shared is not None
     assert shared.shared
-    assert summarise_clock(make_clock_statistics(), "m2", "m1") is None
+    assert ClockSummary.of_link(make_clock_statistics(), "m2", "m1") is None
     assert format_clock_lines(make_short_log("paper")) == []
 
 

@@ -29,7 +29,7 @@ from tests.net.waiting import sleep_for_ns
 from tests.scenario.builders import make_six_joint_scenario
 from tests.sites.sessions import reach_session
 from trilat_net.analysis.file_overview import info, summarise_run
-from trilat_net.analysis.link_summary import summarise_links
+from trilat_net.analysis.link_summary import LinkSummary
 from trilat_net.core.step.site_step import Site
 from trilat_net.core.step.ticks import LifeReason, Mode, TickInput
 from trilat_net.errors import ScenarioError, SessionError
@@ -276,7 +276,7 @@ def test_skipped_ticks_count_as_missing_nowhere(tmp_path: Path) -> None:
     assert not any(channel["missing"] for channel in facts["channels"].values())
     for site in summarise_run(log)["sites"].values():
         assert site["missing"] == 0
-    counts = {link.peer: link.counts for link in summarise_links(log)}
+    counts = {link.peer: link.counts for link in LinkSummary.list_of_log(log)}
     assert counts["s"] is not None
     assert counts["s"].sent == len(log["s"])
     assert counts["s"].missing == 0

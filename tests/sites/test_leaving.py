@@ -10,7 +10,7 @@ import pytest
 from tests.sites.sessions import make_gliding_scenario
 from trilat_net.analysis.certificate.stability_certificate import certify_log
 from trilat_net.analysis.certificate.verdict_facts import StabilityFinding
-from trilat_net.analysis.link_summary import summarise_links
+from trilat_net.analysis.link_summary import LinkSummary
 from trilat_net.errors import PeerLeft, SessionError
 from trilat_net.execution.log_checks import LogCheckReport
 from trilat_net.execution.verification import verify_log
@@ -284,7 +284,7 @@ def test_certificates_of_left_sessions_judge_the_rest(tmp_path: Path) -> None:
     assert certificate.verdict.finding is StabilityFinding.DID_NOT_RISE
     link = next(
         link_of_log
-        for link_of_log in summarise_links(log)
+        for link_of_log in LinkSummary.list_of_log(log)
         if (link_of_log.peer, link_of_log.site) == ("m1", "s")
     )
     assert link.loss == 0.0

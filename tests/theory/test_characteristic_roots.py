@@ -11,10 +11,10 @@ from scipy.special import lambertw
 from tests.theory.loops import compute_residual, make_loop, roots_within
 from trilat_net.analysis.theory import characteristic_roots
 from trilat_net.analysis.theory.characteristic_roots import (
+    Spectrum,
     chebyshev_differentiation,
     chebyshev_interpolation,
     chebyshev_nodes,
-    compute_delay_spectrum,
 )
 
 
@@ -25,9 +25,7 @@ def test_guesses_beyond_exps_range_are_dropped(E: np.ndarray | None) -> None:
     late = np.array([[[0.0, 0.0], [1e-3, 0.0]]])
     pencil = characteristic_roots.Pencil(A, np.array([0.5]), late, E)
     with np.errstate(all="ignore"):
-        roots, dropped = characteristic_roots.refine_roots(
-            pencil, np.array([-1.1 + 0j, -1e4 + 0j]), "ab", 4
-        )
+        roots, dropped = pencil.refine_roots(np.array([-1.1 + 0j, -1e4 + 0j]), "ab", 4)
     assert dropped == 1
     assert roots[0].s == pytest.approx(-1.0, abs=1e-6)
 
@@ -35,7 +33,7 @@ def test_guesses_beyond_exps_range_are_dropped(E: np.ndarray | None) -> None:
 @given(a=st.floats(-3, 3).filter(lambda a: abs(a) > 0.05), T=st.floats(0.02, 3))
 def test_one_delay_gives_lamberts_function(a: float, T: float) -> None:
     """x' = -a x(t - T) has the roots W_k(-a T) / T."""
-    roots = compute_delay_spectrum(make_loop(0.0, (T, -a)), 3).roots
+    roots = Spectrum.of_loop(make_loop(0.0, (T, -a)), 3).roots
     exact = np.array([lambertw(-a * T, k) / T for k in range(-6, 7)])
     exact = exact[exact.imag >= -1e-9]
     exact = exact[np.argsort(-exact.real)]
@@ -49,16 +47,14 @@ def test_one_delay_gives_lamberts_function(a: float, T: float) -> None:
 
 def test_the_textbook_case() -> None:
     """x' = -x(t - 1): the omega constant's neighbour, -0.3181 + 1.3372 j."""
-    (root,) = compute_delay_spectrum(make_loop(0.0, (1.0, -1.0)), 1).roots
+    (root,) = Spectrum.of_loop(make_loop(0.0, (1.0, -1.0)), 1).roots
     assert root.s == pytest.approx(-0.31813150520476 + 1.33723570143069j, abs=1e-12)
 
 
 @given(a=st.floats(0.1, 0.9))
 def test_two_delays_with_a_root_on_the_axis(a: float) -> None:
     """x' = -a x(t - pi/2) - (1 - a) x(t - 5 pi/2) has the root j, since both terms turn by a quarter."""
-    spectrum = compute_delay_spectrum(
-        make_loop(0.0, (math.pi / 2, -a), (5 * math.pi / 2, a - 1)), 8
-    )
+    spectrum = Spectrum.of_loop(make_loop(0.0, (math.pi / 2, -a), (5 * math.pi / 2, a - 1)), 8)
     assert min(abs(root.s - 1j) for root in spectrum.roots) <= 1e-9
 
 
@@ -72,7 +68,7 @@ def test_no_root_is_missed(seed: int) -> None:
     system = make_loop(
         rng.normal(size=(n, n)), *((float(T), rng.normal(size=(n, n))) for T in delays)
     )
-    spectrum = compute_delay_spectrum(system, 5)
+    spectrum = Spectrum.of_loop(system, 5)
     assert all(compute_residual(system, root.s) <= 1e-12 for root in spectrum.roots)
     reals = [root.s.real for root in spectrum.roots]
     assert reals == sorted(reals, reverse=True)
@@ -94,7 +90,7 @@ def test_no_root_is_missed(seed: int) -> None:
 
 def test_several_modes_sharing_a_root_count_once() -> None:
     system = make_loop(-np.eye(3), (0.5, -2.0 * np.eye(3)))
-    (root,) = compute_delay_spectrum(system, 1).roots
+    (root,) = Spectrum.of_loop(system, 1).roots
     assert root.multiplicity == 3
 
 
@@ -105,7 +101,7 @@ def test_roots_at_zero_are_never_the_rightmost() -> None:
     A[3, 0] = 1.0
     late = np.zeros((4, 4))
     late[0, 1] = late[1, 0] = 1.0
-    spectrum = compute_delay_spectrum(make_loop(A, (0.3, late)), 3)
+    spectrum = Spectrum.of_loop(make_loop(A, (0.3, late)), 3)
     assert (spectrum.zeros, spectrum.drifting) == (3, 0)
     assert spectrum.rightmost is not None
     assert spectrum.rightmost.s.real < -0.1
@@ -113,7 +109,7 @@ def test_roots_at_zero_are_never_the_rightmost() -> None:
 
 
 def test_an_unheld_mass_drifts() -> None:
-    spectrum = compute_delay_spectrum(make_loop([[0.0, 1.0], [0.0, 0.0]]), 1)
+    spectrum = Spectrum.of_loop(make_loop([[0.0, 1.0], [0.0, 0.0]]), 1)
     assert (spectrum.zeros, spectrum.roots) == (2, ())
     chain = np.zeros((3, 3))
     chain[0, 1] = chain[2, 0] = 1.0
@@ -121,7 +117,7 @@ def test_an_unheld_mass_drifts() -> None:
     chain[1, 1] = -1.0
     late = np.zeros((3, 3))
     late[1, 1] = 1.0
-    held = compute_delay_spectrum(make_loop(chain, (0.2, late)), 1)
+    held = Spectrum.of_loop(make_loop(chain, (0.2, late)), 1)
     assert (held.zeros, held.drifting, held.verdict) == (2, 1, "at the edge")
 
 

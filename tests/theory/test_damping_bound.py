@@ -12,7 +12,7 @@ from tests.theory.networks import Network, Wire
 from tests.theory.position_networks import compute_rod_inertia, count_growing, position_network
 from trilat_net.analysis.judge import list_law_proofs
 from trilat_net.analysis.theory import analyse_linear_loop
-from trilat_net.analysis.theory.characteristic_roots import compute_delay_spectrum
+from trilat_net.analysis.theory.characteristic_roots import Spectrum
 from trilat_net.core.links.dominance import find_balancing_weights
 from trilat_net.laws.conditions import (
     COMMON_MOTION_SHARE,
@@ -166,9 +166,7 @@ def test_few_ticks_give_the_computed_edge(ticks: int) -> None:
 def pair_with_error_damping(d: Any, Kd: Any, masses: Any, K: Any = (10.0, 10.0)) -> Any:
     """Returns the rightmost root of two sites under PD+d, 200 ms apart."""
     wires = (Wire(0, 1, K[0], Kd[0], 0.2), Wire(1, 0, K[1], Kd[1], 0.2))
-    spectrum = compute_delay_spectrum(
-        Network(tuple(masses), tuple(d), (0.0, 0.0), wires).loop, 1
-    )
+    spectrum = Spectrum.of_loop(Network(tuple(masses), tuple(d), (0.0, 0.0), wires).loop, 1)
     return spectrum.rightmost
 
 
@@ -361,12 +359,12 @@ def test_slopes_up_to_k_do_not_suffice() -> None:
     assert least == pytest.approx(-0.7071 * K, abs=1e-3)
     assert np.linalg.eigvalsh(chain).min() < -0.4 * K  # so no tanh has these slopes
     assert (
-        compute_delay_spectrum(make_sloped_network(chain, 0.6 * K * 0.1).loop, 1).verdict
+        Spectrum.of_loop(make_sloped_network(chain, 0.6 * K * 0.1).loop, 1).verdict
         == "unstable"
     )
     for poses in ([0.0, 0.0, 0.0], [0.0, 0.3, 0.6], [0.0, 0.1, 1.0]):
         slopes = slopes_of_tanh(np.array(poses), K, 5.0)
-        spectrum = compute_delay_spectrum(make_sloped_network(slopes, 0.6 * K * 0.1).loop, 2)
+        spectrum = Spectrum.of_loop(make_sloped_network(slopes, 0.6 * K * 0.1).loop, 2)
         assert spectrum.verdict != "unstable"
 
 

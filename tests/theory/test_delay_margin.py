@@ -9,13 +9,13 @@ from hypothesis import strategies as st
 
 from tests.theory.loops import make_loop
 from trilat_net.analysis.theory import find_equilibrium
-from trilat_net.analysis.theory.characteristic_roots import compute_delay_spectrum
+from trilat_net.analysis.theory.characteristic_roots import Spectrum
 from trilat_net.analysis.theory.delay_margin import (
     MAX_COMMON_DELAY_S,
-    find_delay_margin,
+    DelayMargin,
     set_common_delay,
 )
-from trilat_net.analysis.theory.linear_loop import linearise_loop
+from trilat_net.analysis.theory.linear_loop import LinearLoop
 from trilat_net.analysis.theory.operating_point import OperatingConditions
 from trilat_net.scenario import load_scenario
 
@@ -24,7 +24,7 @@ from trilat_net.scenario import load_scenario
 @settings(max_examples=25)
 def test_a_delayed_integrator_tolerates_a_quarter_turn(a: float) -> None:
     """x' = -a x(t - T): stable up to a T = pi/2, crossing at a."""
-    (span,) = find_delay_margin(make_loop(0.0, (1.0, -a))).intervals
+    (span,) = DelayMargin.of_loop(make_loop(0.0, (1.0, -a))).intervals
     assert (span.low_s, span.low) == (0.0, None)
     assert span.high is not None
     assert span.high_s == pytest.approx(math.pi / 2 / a, rel=1e-9)
@@ -33,10 +33,10 @@ def test_a_delayed_integrator_tolerates_a_quarter_turn(a: float) -> None:
 
 def test_sufficient_damping_is_stable_for_every_delay() -> None:
     """x' = -2 x + x(t - T)."""
-    margin = find_delay_margin(make_loop(-2.0, (1.0, 1.0)))
+    margin = DelayMargin.of_loop(make_loop(-2.0, (1.0, 1.0)))
     assert margin.description == "stable for every common delay up to 10 s"
     assert (
-        find_delay_margin(make_loop(1.0, (1.0, 0.5))).description
+        DelayMargin.of_loop(make_loop(1.0, (1.0, 0.5))).description
         == "unstable for every common delay up to 10 s"
     )
 
@@ -44,24 +44,24 @@ def test_sufficient_damping_is_stable_for_every_delay() -> None:
 def test_oscillators_have_several_stable_delay_windows() -> None:
     """x'' + 0.1 x' + x = -0.4 x(t - T) with its windows; each end is a root on the axis."""
     system = make_loop([[0.0, 1.0], [-4.0, -0.1]], (1.0, [[0.0, 0.0], [-1.0, 0.0]]))
-    margin = find_delay_margin(system)
+    margin = DelayMargin.of_loop(system)
     assert len(margin.intervals) > 1
     assert margin.intervals[0].low is None
     for span in margin.intervals:
         inside = 0.5 * (span.low_s + span.high_s)
-        assert compute_delay_spectrum(set_common_delay(system, inside), 1).verdict == "stable"
+        assert Spectrum.of_loop(set_common_delay(system, inside), 1).verdict == "stable"
         if span.high is not None:
-            root = compute_delay_spectrum(set_common_delay(system, span.high_s), 1).roots[0]
+            root = Spectrum.of_loop(set_common_delay(system, span.high_s), 1).roots[0]
             assert abs(root.s - 1j * span.high.omega_rad_s) < 1e-8
             assert (
-                compute_delay_spectrum(set_common_delay(system, 1.001 * span.high_s), 1).verdict
+                Spectrum.of_loop(set_common_delay(system, 1.001 * span.high_s), 1).verdict
                 == "unstable"
             )
 
 
 def test_undamped_modes_leave_the_margin_finite() -> None:
     """x'' + 9 x = 2 x(t - T): the response is infinite at 3 rad/s, and roots cross at sqrt(11)."""
-    span = find_delay_margin(
+    span = DelayMargin.of_loop(
         make_loop([[0.0, 1.0], [-9.0, 0.0]], (1.0, [[0.0, 0.0], [2.0, 0.0]]))
     ).intervals[0]
     assert span.high is not None
@@ -76,20 +76,20 @@ def test_verdicts_over_delay_are_the_roots(seed: int) -> None:
     system = make_loop(
         rng.normal(size=(3, 3)) - np.eye(3), (1.0, 0.7 * rng.normal(size=(3, 3)))
     )
-    margin = find_delay_margin(system)
+    margin = DelayMargin.of_loop(system)
     ends = [end for span in margin.intervals for end in (span.low_s, span.high_s)]
     for T in (0.0, 0.1, 0.4, 1.0, 2.5):
         if all(abs(T - end) > 0.01 for end in ends if 0 < end < MAX_COMMON_DELAY_S):
             inside = any(span.low_s <= T <= span.high_s for span in margin.intervals)
             assert (
-                compute_delay_spectrum(set_common_delay(system, T), 1).verdict == "stable"
+                Spectrum.of_loop(set_common_delay(system, T), 1).verdict == "stable"
             ) == inside
 
 
 def test_roots_at_zero_cross_nothing() -> None:
     scenario = load_scenario("free")
-    margin = find_delay_margin(
-        linearise_loop(
+    margin = DelayMargin.of_loop(
+        LinearLoop.of_conditions(
             OperatingConditions.derive(scenario), find_equilibrium(scenario, (-0.1236, 0.3373))
         )
     )
@@ -99,8 +99,10 @@ def test_roots_at_zero_cross_nothing() -> None:
 def test_force_reflection_in_contact_has_a_margin() -> None:
     """20 ms settles, 200 ms hammers."""
     scenario = load_scenario("contact", {"rate_hz": 500, "link.delay_ms": 20.0})
-    margin = find_delay_margin(
-        linearise_loop(OperatingConditions.derive(scenario), find_equilibrium(scenario))
+    margin = DelayMargin.of_loop(
+        LinearLoop.of_conditions(
+            OperatingConditions.derive(scenario), find_equilibrium(scenario)
+        )
     )
     (span,) = margin.intervals
     assert 0.02 < span.high_s < 0.2

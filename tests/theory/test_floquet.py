@@ -15,8 +15,8 @@ from trilat_net.analysis.theory import find_equilibrium, floquet
 from trilat_net.analysis.theory.characteristic_roots import Spectrum
 from trilat_net.analysis.theory.floquet import (
     CoupledTicks,
+    SamplesInUse,
     compute_sampled_spectrum,
-    find_samples_in_use,
 )
 from trilat_net.analysis.theory.operating_point import OperatingConditions
 from trilat_net.scenario import Scenario, load_scenario
@@ -256,7 +256,7 @@ def test_the_period_is_that_of_the_draws(period_s: float) -> None:
         "link": {**SINE, "period_s": period_s},
     }
     conditions = OperatingConditions.derive(load_scenario("two_sites", changes))
-    uses = find_samples_in_use(conditions)
+    uses = SamplesInUse.predict(conditions)
     assert uses.period_s is not None
     for (i, j), (link, key) in conditions.links.items():
         own_hz, peer_hz = (conditions.sites[n].rate_hz for n in (i, j))
@@ -300,7 +300,7 @@ def test_drifting_motions_differ_from_staying_ones(
     hand_made = CoupledTicks(
         S, {(1, 0): effect}, ("m.q1", "m.qd1", "s.q1", "s.qd1"), np.array([0, 0, 1, 1]), 0
     )
-    monkeypatch.setattr(floquet, "couple_ticks", lambda *_, **__: hand_made)
+    monkeypatch.setattr(floquet.CoupledTicks, "of_conditions", lambda *_, **__: hand_made)
     roots = make_loop_at_rest(
         "two_sites", {"rate_hz": 100, "control.law": "p_d", "link": SINE}
     ).spectrum

@@ -5,9 +5,9 @@ from hypothesis import strategies as st
 
 from tests.theory.networks import Array, Network, make_pair
 from trilat_net.analysis.theory.frequency_search import (
+    Minima,
     build_frequency_grid,
     cache_response,
-    find_minima,
     find_resolved_hz,
     refine_frequencies,
 )
@@ -36,7 +36,7 @@ def test_dips_between_grid_points_are_found(at_hz: float, width: float) -> None:
     def curve(w: Array) -> Array:
         return np.asarray(0.1 - 1.0 / (1.0 + (np.log(w / (HZ * at_hz)) / width) ** 2))
 
-    minima = find_minima(curve, build_frequency_grid(1e-3, 100.0, 0.0))
+    minima = Minima.find(curve, build_frequency_grid(1e-3, 100.0, 0.0))
     assert minima.least == pytest.approx(-0.9, rel=0.02)
     assert minima.least_hz == pytest.approx(at_hz, rel=0.2 * width)
     (span,) = minima.below
@@ -45,12 +45,12 @@ def test_dips_between_grid_points_are_found(at_hz: float, width: float) -> None:
 
 
 def test_ranges_below_levels_have_exact_edges() -> None:
-    curve_minima = find_minima(np.cos, HZ * np.linspace(0.01, 2.0, 200), level=0.5)
+    curve_minima = Minima.find(np.cos, HZ * np.linspace(0.01, 2.0, 200), level=0.5)
     expected = [(1 / 6, 5 / 6), (7 / 6, 11 / 6)]
     np.testing.assert_allclose(curve_minima.below, np.array(expected), rtol=1e-6)
-    minima = find_minima(np.sin, HZ * np.linspace(0.6, 1.3, 200), level=0.0)
+    minima = Minima.find(np.sin, HZ * np.linspace(0.6, 1.3, 200), level=0.0)
     np.testing.assert_allclose(minima.below, [(0.6, 1.0)], rtol=1e-6)
-    ended = find_minima(np.sin, HZ * np.linspace(0.1, 0.9, 200), level=0.0)
+    ended = Minima.find(np.sin, HZ * np.linspace(0.1, 0.9, 200), level=0.0)
     np.testing.assert_allclose(ended.below, [(0.5, 0.9)], rtol=1e-6)
 
 
@@ -59,8 +59,8 @@ def test_deviations_within_tolerance_are_not_below() -> None:
         return np.full(len(w), -1e-9)
 
     w = build_frequency_grid(0.1, 1.0, 0.0)
-    assert not find_minima(shallow, w, tolerance=lambda at: np.full(len(at), 1e-8)).below
-    assert find_minima(shallow, w).below
+    assert not Minima.find(shallow, w, tolerance=lambda at: np.full(len(at), 1e-8)).below
+    assert Minima.find(shallow, w).below
 
 
 def test_bands_too_wide_are_followed_partly() -> None:
@@ -71,8 +71,8 @@ def test_bands_too_wide_are_followed_partly() -> None:
 
 def test_flat_and_rising_curves_have_no_dip() -> None:
     w = build_frequency_grid(0.1, 1.0, 0.0)
-    assert find_minima(lambda at: np.asarray(at), w).least == w[0]
-    assert not find_minima(lambda at: np.asarray(at), w).below
+    assert Minima.find(lambda at: np.asarray(at), w).least == w[0]
+    assert not Minima.find(lambda at: np.asarray(at), w).below
 
 
 def test_a_sharp_resonance_is_resolved() -> None:

@@ -22,11 +22,11 @@ from tests.transmission import (
     find_transmission,
 )
 from tests.unit_arm import CLAMP, make_four_channel_pair, make_spring_hand, make_unit_scenario
-from trilat_net.analysis.theory.characteristic_roots import compute_delay_spectrum
+from trilat_net.analysis.theory.characteristic_roots import Spectrum
 from trilat_net.analysis.theory.delay_margin import set_common_delay
 from trilat_net.analysis.theory.equilibrium import find_equilibrium
 from trilat_net.analysis.theory.linear_analysis import analyse_linear_loop
-from trilat_net.analysis.theory.linear_loop import LinearLoop, linearise_loop
+from trilat_net.analysis.theory.linear_loop import LinearLoop
 from trilat_net.analysis.theory.operating_point import OperatingConditions
 from trilat_net.analysis.theory.port_response import clamp_site, evaluate_transfer
 from trilat_net.errors import ScenarioError
@@ -41,7 +41,7 @@ HELD = {**CLAMP, "stiffness_nm_rad": 50.0, "damping_nm_s_rad": 10.0}
 
 
 def loop_of(scenario: Scenario) -> LinearLoop:
-    return linearise_loop(
+    return LinearLoop.of_conditions(
         OperatingConditions.derive(scenario), find_equilibrium(scenario, (0.0, 0.0))
     )
 
@@ -92,7 +92,7 @@ def wave_pair(wall: float = 0.0, held: bool = True) -> Scenario:
 @pytest.mark.parametrize("wall", [pytest.param(0.0, marks=pytest.mark.long), 1000.0])
 def test_wave_line_roots_follow_their_delays(wall: float) -> None:
     """All of them below 30 rad/s as far left as requested, counted by the turns of the argument."""
-    spectrum = compute_delay_spectrum(loop_of(wave_pair(wall)), 24)
+    spectrum = Spectrum.of_loop(loop_of(wave_pair(wall)), 24)
     for mass in (1.0, 1.0 / 6.0):
         ours = []
         for root in spectrum.roots:
@@ -153,7 +153,7 @@ def test_delayed_four_channel_roots_solve_equations(acceleration: float) -> None
             np.linalg.det(build_balance(s, PAIR, delay_s=0.02, loads=loads, **law)[0])
         )
 
-    roots = [root.s for root in compute_delay_spectrum(loop_of(scenario), 12).roots]
+    roots = [root.s for root in Spectrum.of_loop(loop_of(scenario), 12).roots]
     on_line = [
         s
         for s in roots
@@ -203,8 +203,7 @@ def test_true_models_predict_roots_without_delay() -> None:
     law = {"law": "smith", "K": 100.0, "d": 5.0, "inertia": 1.0}
     sites = {"m": {"control": {**law, "predicts": True}}, "s": {}}
     roots = [
-        root.s
-        for root in compute_delay_spectrum(loop_of(make_unit_scenario(sites, law)), 16).roots
+        root.s for root in Spectrum.of_loop(loop_of(make_unit_scenario(sites, law)), 16).roots
     ]
     for stiffness in (100.0, 200.0):
         wanted = np.roots([1.0, 5.0, stiffness]).astype(complex)[0]
@@ -225,7 +224,7 @@ def test_shared_authority_has_its_springs_roots() -> None:
     sites = {"u1": {}, "u2": {}, "s": {"control": {**law, "leads": False}}}
     roots = [
         root.s
-        for root in compute_delay_spectrum(
+        for root in Spectrum.of_loop(
             loop_of(make_unit_scenario(sites, law, dominance=shares)), 12
         ).roots
     ]
@@ -248,8 +247,7 @@ def test_impedances_have_the_roots_of_their_masses() -> None:
     law = {"law": "impedance", "M": 2.0, "B": 10.0, "K": 50.0}
     sites = {"m": {}, "s": {"control": {**law, "follows": True}}}
     roots = [
-        root.s
-        for root in compute_delay_spectrum(loop_of(make_unit_scenario(sites, law)), 4).roots
+        root.s for root in Spectrum.of_loop(loop_of(make_unit_scenario(sites, law)), 4).roots
     ]
     wanted = np.roots([2.0, 10.0, 50.0])[0]
     assert roots
@@ -261,7 +259,7 @@ def test_synchronised_outputs_have_consensus_roots() -> None:
     """Without gravity and with the true parameters, s = -Lambda, and m s = -K (1 -+ exp(-s T))."""
     law = {"law": "sync", "Lambda": 1.0, "K": 3.0}
     loop = loop_of(make_unit_scenario({"m": {}, "s": {}}, law))
-    roots = [root.s for root in compute_delay_spectrum(loop, 10).roots]
+    roots = [root.s for root in Spectrum.of_loop(loop, 10).roots]
     assert min(abs(root + 1.0) for root in roots) < 1e-5
 
     def consensus(s: complex) -> complex:
@@ -297,10 +295,10 @@ def test_lines_hold_arms_at_rest_against_hands() -> None:
     scenario = load_scenario(
         "two_sites", {"control.law": "wave", "scheme": "digital", **follows}
     )
-    loop = linearise_loop(
+    loop = LinearLoop.of_conditions(
         OperatingConditions.derive(scenario), find_equilibrium(scenario, (0.4, 1.2))
     )
-    assert compute_delay_spectrum(loop, 4).roots[0].s.real < -0.1
+    assert Spectrum.of_loop(loop, 4).roots[0].s.real < -0.1
 
 
 def test_saturating_pulls_are_linearised_below_saturation() -> None:

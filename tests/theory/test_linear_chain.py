@@ -14,19 +14,15 @@ from tests.core.chain_references import ARMS
 from tests.scenario.builders import two_arm_text
 from tests.theory.loops import Array, compute_residual, roots_within
 from trilat_net.analysis.theory import find_equilibrium, iterate_linear_edges
-from trilat_net.analysis.theory.characteristic_roots import compute_delay_spectrum
+from trilat_net.analysis.theory.characteristic_roots import Spectrum
 from trilat_net.analysis.theory.delay_margin import set_common_delay
 from trilat_net.analysis.theory.equilibrium import predict_equilibrium
 from trilat_net.analysis.theory.floquet import compute_sampled_spectrum
-from trilat_net.analysis.theory.linear_loop import LinearLoop, linearise_loop
+from trilat_net.analysis.theory.linear_loop import LinearLoop
 from trilat_net.analysis.theory.operating_point import Equilibrium, OperatingConditions
-from trilat_net.analysis.theory.port_analysis import analyse_ports, linearise_teleoperator
+from trilat_net.analysis.theory.port_analysis import PortAnalysis, linearise_teleoperator
 from trilat_net.analysis.theory.port_response import build_admittance
-from trilat_net.analysis.theory.site_dynamics import (
-    ArgumentLayout,
-    differentiate_site_rates,
-    evaluate_site_rates,
-)
+from trilat_net.analysis.theory.site_dynamics import ArgumentLayout, SiteRates
 from trilat_net.core.arms.chain import (
     MAX_JOINTS,
     build_chain,
@@ -78,7 +74,7 @@ class Linear(NamedTuple):
     rest: Equilibrium
 
     def loop(self, **options: bool) -> LinearLoop:
-        return linearise_loop(self.conditions, self.rest, **options)
+        return LinearLoop.of_conditions(self.conditions, self.rest, **options)
 
 
 def make_six_joint_loop(law: str, off: Array | None = None, **overrides: Any) -> Linear:
@@ -159,8 +155,8 @@ def test_rates_and_derivatives_equal_compiled_leaves() -> None:
     at = ArgumentLayout(6, 60)
     for _ in range(3):
         x = rng.uniform(-1.0, 1.0, at.arguments)
-        rates = evaluate_site_rates(site, x)
-        exact = differentiate_site_rates(site, x)
+        rates = SiteRates.evaluate(site, x)
+        exact = SiteRates.differentiate(site, x)
         derivatives = np.concatenate([rates.qdd, rates.estimate])
         wanted = by_leaves(site, x, at)
         assert np.abs(derivatives - wanted).max() <= 1e-12 * (1.0 + np.abs(wanted).max())
@@ -196,7 +192,7 @@ def test_no_root_at_zero_hides_the_rightmost_one() -> None:
     """Each omitted state counts as a root at zero; the shared pose gives the others."""
     case = make_six_joint_loop("adaptive")
     loop = case.loop()
-    spectrum = compute_delay_spectrum(loop, 3)
+    spectrum = Spectrum.of_loop(loop, 3)
     assert (spectrum.zeros, spectrum.drifting) == (loop.omitted_states + 6, 0)
     assert all(
         compute_residual(case.loop(all_estimates=True), root.s) <= 1e-12
@@ -301,7 +297,7 @@ def test_joints_answer_sinusoids_by_their_admittance() -> None:
 def test_six_joint_laws_are_passive_in_r() -> None:
     """This holds also with learnt gravity, which is not passive in qd at the joints that gravity loads."""
     case = make_six_joint_loop("adaptive")
-    ports = analyse_ports(case.scenario, case.rest, band_hz=(0.01, 20.0))
+    ports = PortAnalysis.of_scenario(case.scenario, case.rest, band_hz=(0.01, 20.0))
     assert ports.estimates_true
     assert ports.proof is not None
     assert ports.proof.passive
@@ -328,7 +324,7 @@ def test_the_p_d_bound_holds_for_chains() -> None:
     criterion = StabilityCriterion.evaluate(damped(1.05).scenario)
     assert criterion is not None
     assert criterion.excess == pytest.approx(0.1)
-    assert compute_delay_spectrum(damped(1.05).loop(), 1).verdict == "stable"
+    assert Spectrum.of_loop(damped(1.05).loop(), 1).verdict == "stable"
     edge = next(
         iterate_linear_edges(
             damped(1.0).scenario, "control.d", 0.3, 1.2, damped(1.0).rest, points=4

@@ -9,10 +9,10 @@ import pytest
 from tests.execution.builders import make_trajectories, run_fused
 from tests.theory.loops import RODS
 from trilat_net.analysis.theory import analyse_linear_loop, find_equilibrium
-from trilat_net.analysis.theory.characteristic_roots import compute_delay_spectrum
+from trilat_net.analysis.theory.characteristic_roots import Spectrum
 from trilat_net.analysis.theory.delay_margin import set_common_delay
 from trilat_net.analysis.theory.equilibrium import follow_equilibrium
-from trilat_net.analysis.theory.linear_loop import linearise_loop
+from trilat_net.analysis.theory.linear_loop import LinearLoop
 from trilat_net.analysis.theory.operating_point import OperatingConditions
 from trilat_net.core.step.ticks import BUCKETS_PER_S
 from trilat_net.scenario import load_scenario
@@ -23,8 +23,11 @@ POSE = (-0.1236, 0.3373)
 def find_rightmost(overrides: dict[str, float]) -> complex:
     """Returns the rightmost root of `free`."""
     scenario = load_scenario("free", overrides)
-    root = compute_delay_spectrum(
-        linearise_loop(OperatingConditions.derive(scenario), find_equilibrium(scenario)), 1
+    root = Spectrum.of_loop(
+        LinearLoop.of_conditions(
+            OperatingConditions.derive(scenario), find_equilibrium(scenario)
+        ),
+        1,
     ).rightmost
     assert root is not None
     return root.s
@@ -32,7 +35,7 @@ def find_rightmost(overrides: dict[str, float]) -> complex:
 
 def test_states_and_inputs_follow_the_scenarios_order() -> None:
     scenario = load_scenario("contact")
-    linear_loop = linearise_loop(
+    linear_loop = LinearLoop.of_conditions(
         OperatingConditions.derive(scenario), find_equilibrium(scenario, (-0.6, 1.8))
     )
     assert linear_loop.names == (
@@ -57,7 +60,7 @@ def test_states_and_inputs_follow_the_scenarios_order() -> None:
 
 def test_adaptive_sites_have_estimates_as_states() -> None:
     scenario = load_scenario("two_sites")
-    names = linearise_loop(
+    names = LinearLoop.of_conditions(
         OperatingConditions.derive(scenario), find_equilibrium(scenario, (0.1, 0.2))
     ).names
     assert names[:9] == (
@@ -71,12 +74,12 @@ def test_adaptive_sites_have_estimates_as_states() -> None:
 
 def test_links_of_different_delays_have_an_entry_each() -> None:
     scenario = load_scenario("free", {"links.m1->s.delay_ms": 50.0})
-    linear_loop = linearise_loop(
+    linear_loop = LinearLoop.of_conditions(
         OperatingConditions.derive(scenario), find_equilibrium(scenario, POSE)
     )
     assert [delayed.delay_s for delayed in linear_loop.delayed] == [0.05, 0.2]
     both = linear_loop.delayed[0].A + linear_loop.delayed[1].A
-    alike = linearise_loop(
+    alike = LinearLoop.of_conditions(
         OperatingConditions.derive(load_scenario("free")),
         find_equilibrium(load_scenario("free"), POSE),
     )
@@ -99,14 +102,13 @@ def test_the_rightmost_root_of_rods(delay_ms: float, re: float) -> None:
 
 def test_zero_delay_is_the_one_tick_limit() -> None:
     scenario = load_scenario("free", {"link.delay_ms": 0.0})
-    linear_loop = linearise_loop(
+    linear_loop = LinearLoop.of_conditions(
         OperatingConditions.derive(scenario), find_equilibrium(scenario, POSE)
     )
     tick, none = (
-        compute_delay_spectrum(set_common_delay(linear_loop, T), 1).roots[0].s
-        for T in (1e-3, 0.0)
+        Spectrum.of_loop(set_common_delay(linear_loop, T), 1).roots[0].s for T in (1e-3, 0.0)
     )
-    tenth = compute_delay_spectrum(set_common_delay(linear_loop, 1e-4), 1).roots[0].s
+    tenth = Spectrum.of_loop(set_common_delay(linear_loop, 1e-4), 1).roots[0].s
     assert abs(tick - none) < 0.05
     assert abs(tenth - none) == pytest.approx(0.1 * abs(tick - none), rel=0.1)
 
@@ -147,8 +149,11 @@ def test_unstable_rests_are_left_for_others() -> None:
         begun[f"sites.{name}.control.theta_hat0"] = rest.theta_hat[i].tolist()
     late = load_scenario("paper", begun)
     root = (
-        compute_delay_spectrum(
-            linearise_loop(OperatingConditions.derive(late), follow_equilibrium(late, rest)), 1
+        Spectrum.of_loop(
+            LinearLoop.of_conditions(
+                OperatingConditions.derive(late), follow_equilibrium(late, rest)
+            ),
+            1,
         )
         .roots[0]
         .s

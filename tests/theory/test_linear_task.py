@@ -14,16 +14,13 @@ from trilat_net.analysis.theory import (
     find_equilibrium,
     iterate_linear_edges,
 )
-from trilat_net.analysis.theory.characteristic_roots import (
-    compute_delay_spectrum,
-    find_moving_part,
-)
+from trilat_net.analysis.theory.characteristic_roots import Spectrum, find_moving_part
 from trilat_net.analysis.theory.delay_margin import set_common_delay
 from trilat_net.analysis.theory.equilibrium import find_mean_pose
 from trilat_net.analysis.theory.floquet import compute_sampled_spectrum
-from trilat_net.analysis.theory.linear_loop import linearise_loop
+from trilat_net.analysis.theory.linear_loop import LinearLoop
 from trilat_net.analysis.theory.operating_point import Equilibrium, OperatingConditions
-from trilat_net.analysis.theory.port_analysis import analyse_ports, linearise_teleoperator
+from trilat_net.analysis.theory.port_analysis import PortAnalysis, linearise_teleoperator
 from trilat_net.analysis.theory.port_response import build_admittance
 from trilat_net.errors import ScenarioError, UsageError
 from trilat_net.execution.fused import FusedRun
@@ -103,8 +100,8 @@ def test_sliders_have_equal_joint_and_task_loops(law: str) -> None:
         scenario = make_cartesian_scenario(law, space)
         rest = find_equilibrium(scenario, (0.2, -0.1, 0.3))
         conditions = OperatingConditions.derive(scenario)
-        loop = linearise_loop(conditions, rest)
-        spectrum = compute_delay_spectrum(loop, 12)
+        loop = LinearLoop.of_conditions(conditions, rest)
+        spectrum = Spectrum.of_loop(loop, 12)
         sampled = compute_sampled_spectrum(conditions, rest, 12)
         Y = build_admittance(linearise_teleoperator(conditions, rest))(
             np.array([0.1, 3.0, 40.0])
@@ -224,13 +221,13 @@ def test_runs_decay_and_swing_at_their_roots(name: str) -> None:
     """Started along the vector of each of the three rightmost roots that swing."""
     scenario, rest = make_settled_scenario(name)
     conditions = OperatingConditions.derive(scenario)
-    near = compute_delay_spectrum(linearise_loop(conditions, rest), 14)
+    near = Spectrum.of_loop(LinearLoop.of_conditions(conditions, rest), 14)
     spectrum = compute_sampled_spectrum(conditions, rest, 14)
     assert spectrum is not None
     assert spectrum.verdict == near.verdict == "stable"
     swings = [root.s for root in spectrum.roots if root.s.imag > 0.7 * abs(root.s)][:3]
     assert swings
-    loop = linearise_loop(conditions, rest, all_estimates=True)
+    loop = LinearLoop.of_conditions(conditions, rest, all_estimates=True)
     pencil, names, _ = find_moving_part(loop)
     for s in swings:
         vector = np.linalg.svd(pencil.evaluate(s)[0])[2][-1].conj()
@@ -247,7 +244,7 @@ def test_runs_decay_and_swing_at_their_roots(name: str) -> None:
 def test_the_law_is_passive_at_end_effectors(name: str) -> None:
     """The proof holds for places, also with open axes and redundant joints; for poses there is none."""
     scenario, rest = make_settled_scenario(name)
-    ports = analyse_ports(scenario, rest, band_hz=(0.01, 20.0))
+    ports = PortAnalysis.of_scenario(scenario, rest, band_hz=(0.01, 20.0))
     assert ports.estimates_true
     assert (ports.proof is None) == (name == "posed")
     assert ports.proof is None or ports.proof.passive
@@ -268,9 +265,7 @@ def test_edges_margins_and_verdict_share_one_loop() -> None:
     analysis = analyse_linear_loop(scenario, pose=pose)
     end = analysis.margin.intervals[0].high
     assert end is not None
-    rightmost = compute_delay_spectrum(
-        set_common_delay(analysis.loop, end.delay_s), 1
-    ).rightmost
+    rightmost = Spectrum.of_loop(set_common_delay(analysis.loop, end.delay_s), 1).rightmost
     assert rightmost is not None
     assert rightmost.s == pytest.approx(1j * end.omega_rad_s, abs=1e-6 * end.omega_rad_s)
     edge = next(

@@ -19,7 +19,7 @@ from trilat_net.analysis.theory.loop_roots import (
     find_run_roots,
     resolve_final_scenario,
 )
-from trilat_net.analysis.timeline import list_effective_commands
+from trilat_net.analysis.timeline import Timeline
 from trilat_net.scenario import Scenario, load_scenario
 
 PAIR = {
@@ -222,7 +222,7 @@ def test_command_that_changes_nothing_changes_nothing() -> None:
     log = make_log_with_commands(scenario, "s", (9.0, SAME), (9.5, same_shares))
     plain = tn.simulate(scenario)
     assert log.changes("s")
-    assert list_effective_commands(log) == []
+    assert Timeline(log).effective_commands == []
     assert RunEnd.of_log(log) == RunEnd.of_log(plain)
     assert find_log_roots(log) == find_log_roots(plain)
     commanded = certify_run(log).decision
@@ -242,7 +242,7 @@ def test_roots_follow_the_last_command() -> None:
     expected = find_log_roots(tn.simulate(slower)).rate_per_s
     assert find_log_roots(log).rate_per_s == pytest.approx(expected, abs=1e-5)
     back = make_log_with_commands(scenario, "s", (3.0, SLOWER), (5.0, SAME))
-    assert len(list_effective_commands(back)) == 2
+    assert len(Timeline(back).effective_commands) == 2
     unchanged = find_log_roots(tn.simulate(scenario)).rate_per_s
     assert find_log_roots(back).rate_per_s == pytest.approx(unchanged, abs=1e-5)
 

@@ -5,7 +5,7 @@ import pytest
 
 from tests.theory.analysed_ports import POSE, section_of
 from trilat_net.analysis.theory.equilibrium import find_equilibrium
-from trilat_net.analysis.theory.port_analysis import analyse_ports
+from trilat_net.analysis.theory.port_analysis import PortAnalysis
 from trilat_net.errors import ScenarioError, UsageError
 from trilat_net.scenario import load_scenario
 
@@ -102,7 +102,7 @@ def test_wrong_estimates_return_stored_energy() -> None:
     scenario = load_scenario("free")
     rest = find_equilibrium(scenario, POSE)
     learnt = np.tile([0.5, 0.45, -0.29, 2.0, 1.0], (3, 1))  # as a run of it ends
-    section = analyse_ports(
+    section = PortAnalysis.of_scenario(
         scenario, rest._replace(q=np.tile([-0.124, 0.337], (3, 1)), theta_hat=learnt)
     )
     assert not section.estimates_true
@@ -132,10 +132,10 @@ def test_impossible_questions_are_refused() -> None:
     scenario = load_scenario("p_d_margin_two")
     rest = find_equilibrium(scenario, POSE)
     with pytest.raises(UsageError, match="no site 'x' among the ports; the sites are m, s"):
-        analyse_ports(scenario, rest, "x")
+        PortAnalysis.of_scenario(scenario, rest, "x")
     for band_hz in ((1.0, 1.0), (1.0, 0.1), (0.0, 0.1)):
         with pytest.raises(UsageError, match="from a frequency above 0 Hz to a higher one"):
-            analyse_ports(scenario, rest, band_hz=band_hz)
+            PortAnalysis.of_scenario(scenario, rest, band_hz=band_hz)
     measured = load_scenario("p_d_margin_two", {"link": {"model": "measured"}})
     with pytest.raises(ScenarioError, match="is not known beforehand"):
-        analyse_ports(measured, rest)
+        PortAnalysis.of_scenario(measured, rest)

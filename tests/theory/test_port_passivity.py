@@ -10,7 +10,6 @@ from trilat_net.analysis.theory.port_passivity import (
     HandMatrices,
     Passivity,
     check_against_hands,
-    check_passivity,
     clamp_ports,
     find_least_eigenvalue,
     weight_response,
@@ -31,7 +30,7 @@ def judge_passivity(network: Network, weights: tuple[float, ...] | None = None) 
     w = refine_frequencies(
         Y, build_frequency_grid(1e-3, 10.0, find_longest_delay_s(network.loop))
     )
-    return check_passivity(Y, w, None if weights is None else np.array(weights))
+    return Passivity.check(Y, w, None if weights is None else np.array(weights))
 
 
 @settings(max_examples=30, deadline=None)
@@ -121,7 +120,7 @@ def test_winding_laws_lack_more_than_any_damper() -> None:
         A=A, B=loop.B[:, :1], C=loop.C[:1], inputs=("a.tau1",), outputs=("a.qd1",)
     )
     Y = build_admittance(wound)
-    passivity = check_passivity(Y, build_frequency_grid(1e-3, 100.0, 0.0))
+    passivity = Passivity.check(Y, build_frequency_grid(1e-3, 100.0, 0.0))
     assert not passivity.passive
     assert passivity.lacking_nm_s_rad == np.inf
 

@@ -6,15 +6,14 @@ from hypothesis import strategies as st
 from tests.theory.networks import Network, Wire, hold_by_spring, make_pair
 from trilat_net.analysis.theory.port_response import (
     LoopOutput,
+    PoleAtZero,
     Transparency,
     build_admittance,
     evaluate_transfer,
     find_longest_delay_s,
-    find_pole_at_zero,
     find_site_ports,
     group_ports_by_joint,
     list_port_sites,
-    measure_transparency,
     select_ports,
     to_imaginary_axis,
 )
@@ -83,12 +82,12 @@ def test_no_frequencies_no_answers() -> None:
 
 def test_floating_networks_have_passive_poles_at_zero() -> None:
     floating = Network((1.0, 3.0), (0.0, 0.0), (0.0, 0.0), (Wire(0, 1, 7.0), Wire(1, 0, 7.0)))
-    pole = find_pole_at_zero(floating.loop)
+    pole = PoleAtZero.of_loop(floating.loop)
     assert pole.order == 1
     assert pole.passive
     np.testing.assert_allclose(pole.residue, np.full((2, 2), 1.0 / 4.0), rtol=1e-9)
     for tied in (floating._replace(k=(1.0, 0.0)), floating._replace(d=(1.0, 0.0)), make_pair()):
-        none = find_pole_at_zero(tied.loop)
+        none = PoleAtZero.of_loop(tied.loop)
         assert none.order == 0
         assert none.passive
         assert not none.residue.any()
@@ -96,7 +95,7 @@ def test_floating_networks_have_passive_poles_at_zero() -> None:
 
 def test_uneven_floating_masses_have_an_active_pole() -> None:
     """7 N m/rad one way and 3 the other: the residue is no longer symmetric."""
-    pole = find_pole_at_zero(
+    pole = PoleAtZero.of_loop(
         Network((1.0, 3.0), (0.0, 0.0), (0.0, 0.0), (Wire(0, 1, 7.0), Wire(1, 0, 3.0))).loop
     )
     assert pole.order == 1
@@ -111,7 +110,7 @@ def test_following_floating_angles_gives_third_order_poles() -> None:
     loop = Network((1.0, 1.0), (0.0, 0.0), (0.0, 0.0)).loop
     A = loop.A.copy()
     A[1, 2] = 5.0
-    pole = find_pole_at_zero(loop._replace(A=A))
+    pole = PoleAtZero.of_loop(loop._replace(A=A))
     assert pole.order == 3
     assert not pole.passive
 
@@ -147,7 +146,7 @@ def test_felt_p_d_impedance_is_as_on_paper(
     Free: that less K^2 e^{-s (T1 + T2)} / s^2 over the other's own impedance.
     """
     network = make_pair((K, K), d, T)
-    (transparency,) = measure_transparency(network.loop, "a", "b")
+    (transparency,) = Transparency.measure(network.loop, "a", "b")
     S = 1j * transparency.w_rad_s
     own_impedance, other = (
         m * S + damping + K / S for m, damping in zip(network.m, d, strict=True)
@@ -168,8 +167,8 @@ def test_felt_p_d_impedance_is_as_on_paper(
 def test_the_third_sites_holder_counts() -> None:
     wires = tuple(Wire(i, j, 5.0, 0.0, 0.1) for i in range(3) for j in range(3) if i != j)
     loop = Network((1.0,) * 3, (1.0,) * 3, (0.0,) * 3, wires).loop
-    (alone,) = measure_transparency(loop, "a", "c")
-    (held,) = measure_transparency(hold_by_spring(loop, "b", 1e3, 10.0), "a", "c")
+    (alone,) = Transparency.measure(loop, "a", "c")
+    (held,) = Transparency.measure(hold_by_spring(loop, "b", 1e3, 10.0), "a", "c")
     # a tenth of a hertz: springs count
     assert held.interpolate_magnitudes(0.1)[0] > 1.5 * alone.interpolate_magnitudes(0.1)[0]
     assert held.interpolate_magnitudes(0.1)[1] == pytest.approx(10.0 / (0.2 * np.pi), rel=0.05)
@@ -196,7 +195,7 @@ def test_the_width_is_a_ratio_in_db(
 
 def test_the_width_grows_with_coupling_stiffness() -> None:
     widths = [
-        measure_transparency(make_pair((K, K), (0.5, 0.5), (0.0, 0.0)).loop, "a", "b")[
+        Transparency.measure(make_pair((K, K), (0.5, 0.5), (0.0, 0.0)).loop, "a", "b")[
             0
         ].ratio_db
         for K in (1.0, 10.0, 100.0)
@@ -206,7 +205,7 @@ def test_the_width_grows_with_coupling_stiffness() -> None:
 
 
 def test_two_sites_that_do_not_couple_feel_nothing() -> None:
-    (transparency,) = measure_transparency(
+    (transparency,) = Transparency.measure(
         Network((1.0, 1.0), (1.0, 1.0), (0.0, 0.0)).loop, "a", "b"
     )
     assert transparency.ratio_db == pytest.approx(0.0, abs=1e-12)
@@ -222,4 +221,4 @@ def test_two_sites_that_do_not_couple_feel_nothing() -> None:
 )
 def test_unfelt_pairs_are_refused(at: str, of: str, said: str) -> None:
     with pytest.raises(UsageError, match=said):
-        measure_transparency(make_pair().loop, at, of)
+        Transparency.measure(make_pair().loop, at, of)

@@ -8,9 +8,8 @@ from hypothesis import strategies as st
 from tests.theory.loops import Array, draw_actors, draw_site
 from trilat_net.analysis.theory.site_dynamics import (
     ArgumentLayout,
+    SiteRates,
     describe_switching_points,
-    differentiate_site_rates,
-    evaluate_site_rates,
 )
 from trilat_net.core.arms.exogenous import (
     TorqueKind,
@@ -76,14 +75,14 @@ def test_the_field_equals_a_tick(seed: int, law: str) -> None:
     rng = np.random.default_rng(seed)
     random_site = draw_site(rng, law, draw_actors(rng))
     x = rng.uniform(-2, 2, AT.arguments)
-    site_rates = evaluate_site_rates(random_site, x)
+    site_rates = SiteRates.evaluate(random_site, x)
     wanted = by_leaves(random_site, x)
     for name, value in wanted.items():
         scale = 1.0 + max(
             np.abs(value).max(), np.abs(wanted["external"]).max(), np.abs(wanted["tau"]).max()
         )
         inverse = (
-            np.abs(differentiate_site_rates(random_site, x).qdd[:, AT.external_torque]).max()
+            np.abs(SiteRates.differentiate(random_site, x).qdd[:, AT.external_torque]).max()
             if name == "qdd"
             else 1.0
         )
@@ -102,10 +101,10 @@ def test_the_jacobian_is_the_limit_of_differences(seed: int, law: str) -> None:
     )
     x = rng.uniform(-1, 1, AT.arguments)
     step = 1e-5
-    derivatives = differentiate_site_rates(random_site, x)
+    derivatives = SiteRates.differentiate(random_site, x)
     for k in range(AT.arguments):
         ahead, behind = (
-            evaluate_site_rates(random_site, x + sign * step * np.eye(AT.arguments)[k])
+            SiteRates.evaluate(random_site, x + sign * step * np.eye(AT.arguments)[k])
             for sign in (1, -1)
         )
         for name in derivatives._fields:
@@ -123,22 +122,22 @@ def test_walls_push_on_one_side_only() -> None:
     )
     wall_site = draw_site(rng, "known", [wall])
     x = np.zeros(AT.arguments)
-    assert not evaluate_site_rates(
+    assert not SiteRates.evaluate(
         wall_site, x
     ).external.any()  # the stretched arm is on the free side
     x[AT.q] = np.pi, 0.0
-    assert evaluate_site_rates(wall_site, x).external[0] == pytest.approx(
+    assert SiteRates.evaluate(wall_site, x).external[0] == pytest.approx(
         0.0, abs=1e-12
     )  # no lever
     x[AT.q] = 2.5, 0.1
-    assert np.abs(evaluate_site_rates(wall_site, x).external).max() > 1.0
+    assert np.abs(SiteRates.evaluate(wall_site, x).external).max() > 1.0
     outward = np.sign(
-        evaluate_site_rates(
+        SiteRates.evaluate(
             wall_site, x * np.where(np.arange(AT.arguments) == AT.qd.start, 0.0, 1.0)
         ).external[0]
     )
     x[AT.qd] = outward * 1e3, 0.0
-    assert not evaluate_site_rates(
+    assert not SiteRates.evaluate(
         wall_site, x
     ).external.any()  # faster outward than the spring would push
 
@@ -147,7 +146,7 @@ def test_estimates_never_leave_their_box_and_return() -> None:
     rng = np.random.default_rng(2)
     adaptive_site = draw_site(rng, "adaptive")
     x = rng.uniform(-1, 1, AT.arguments)
-    free = evaluate_site_rates(adaptive_site, x).estimate
+    free = SiteRates.evaluate(adaptive_site, x).estimate
     ends = (
         np.where(free > 0, x[AT.estimate], np.inf),
         np.where(free > 0, -np.inf, x[AT.estimate]),
@@ -155,14 +154,14 @@ def test_estimates_never_leave_their_box_and_return() -> None:
     held = adaptive_site._replace(
         gains=adaptive_site.gains._replace(high=tuple(ends[0]), low=tuple(ends[1]))
     )
-    assert not evaluate_site_rates(held, x).estimate.any()
-    assert not differentiate_site_rates(held, x).estimate.any()
+    assert not SiteRates.evaluate(held, x).estimate.any()
+    assert not SiteRates.differentiate(held, x).estimate.any()
     back = adaptive_site._replace(
         gains=adaptive_site.gains._replace(
             low=tuple(np.where(free > 0, x[AT.estimate], -np.inf))
         )
     )
-    assert (evaluate_site_rates(back, x).estimate == free).all()
+    assert (SiteRates.evaluate(back, x).estimate == free).all()
 
 
 def test_states_exactly_on_edges_are_reported() -> None:

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from tests.theory.analysed_ports import find_failing_frequencies
 from tests.theory.networks import Network, Wire
-from trilat_net.analysis.theory.characteristic_roots import compute_delay_spectrum
+from trilat_net.analysis.theory.characteristic_roots import Spectrum
 from trilat_net.analysis.theory.frequency_search import build_frequency_grid
 from trilat_net.analysis.theory.port_passivity import EIGENVALUE_ROUNDING, find_best_weights
 from trilat_net.analysis.theory.port_response import build_admittance
@@ -102,7 +102,7 @@ def test_added_mass_makes_irreversible_shares_unstable(d: float) -> None:
     heavy = 1e5 / w
     springs = tuple(20.0 * w.max() / w - 10.0)  # w (K + k) is one number
     network = position_exchange(alpha, d, heavy, 0.0)._replace(k=springs)
-    assert compute_delay_spectrum(network.loop, 1).verdict == "unstable"
+    assert Spectrum.of_loop(network.loop, 1).verdict == "unstable"
 
 
 def test_scenarios_of_irreversible_shares_say_so() -> None:
@@ -234,7 +234,7 @@ def test_coupled_hands_differ_from_independent_ones() -> None:
         Wire(1, 0, -50.0),
     )
     heavy = Network((1e4, 1e4 * 51.0 / 150.0), (d, d), (100.0, 100.0), mirrored)
-    assert compute_delay_spectrum(heavy.loop, 1).verdict == "unstable"
+    assert Spectrum.of_loop(heavy.loop, 1).verdict == "unstable"
 
 
 @given(st.tuples(*[st.floats(-10.0, 10.0)] * 4))

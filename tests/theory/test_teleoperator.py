@@ -7,7 +7,7 @@ import pytest
 from tests.theory.networks import hold_by_spring
 from trilat_net.analysis.theory.equilibrium import find_equilibrium
 from trilat_net.analysis.theory.frequency_search import build_frequency_grid, refine_frequencies
-from trilat_net.analysis.theory.linear_loop import LinearLoop, linearise_loop
+from trilat_net.analysis.theory.linear_loop import LinearLoop
 from trilat_net.analysis.theory.operating_point import Equilibrium, OperatingConditions
 from trilat_net.analysis.theory.port_analysis import (
     build_proof_output,
@@ -15,7 +15,7 @@ from trilat_net.analysis.theory.port_analysis import (
     freeze_external_torques,
     linearise_teleoperator,
 )
-from trilat_net.analysis.theory.port_passivity import Passivity, check_passivity
+from trilat_net.analysis.theory.port_passivity import Passivity
 from trilat_net.analysis.theory.port_response import (
     build_admittance,
     clamp_site,
@@ -60,7 +60,7 @@ def in_r(now: OperatingConditions, loop: LinearLoop, *, ones: bool = False) -> P
     beta = np.repeat(
         np.ones(len(list_port_sites(loop))) if ones else compute_proof_weights(now), 2
     )
-    return check_passivity(
+    return Passivity.check(
         lambda at: evaluate_transfer(loop, to_imaginary_axis(at), output),
         build_grid(loop),
         beta,
@@ -82,7 +82,7 @@ def test_hands_at_ports_restore_their_loop() -> None:
     rest = find_equilibrium(scenario)
     bare = linearise_teleoperator(OperatingConditions.derive(scenario), rest)
     again = hold_by_spring(hold_by_spring(bare, "m1", 20.0, 3.0), "s", 0.0, 0.7)
-    whole = linearise_loop(OperatingConditions.derive(scenario), rest)
+    whole = LinearLoop.of_conditions(OperatingConditions.derive(scenario), rest)
     np.testing.assert_allclose(again.A, whole.A, rtol=1e-9, atol=1e-9)
     np.testing.assert_allclose(again.B, whole.B)
     for a, b in zip(again.delayed, whole.delayed, strict=True):
@@ -97,7 +97,7 @@ def test_reflected_force_includes_that_of_loads() -> None:
     rest = find_equilibrium(scenario, POSE)
     bare = linearise_teleoperator(OperatingConditions.derive(scenario), rest)
     again = hold_by_spring(bare, "s", 50.0, 4.0)
-    whole = linearise_loop(OperatingConditions.derive(scenario), rest)
+    whole = LinearLoop.of_conditions(OperatingConditions.derive(scenario), rest)
     for a, b in zip(again.delayed, whole.delayed, strict=True):
         np.testing.assert_allclose(a.A, b.A, rtol=1e-9, atol=1e-9)
         np.testing.assert_allclose(a.B, b.B)
@@ -121,7 +121,7 @@ def test_the_papers_law_is_passive_in_r(name: str, delay_ms: float) -> None:
     """The theorem of the nonlinear loop with hands, docs/theory/errata-proof.md."""
     _, now, _, loop = linearise_at_pose(name, {"link.delay_ms": delay_ms, **ALONE[name]})
     assert in_r(now, loop).passive
-    assert not check_passivity(build_admittance(loop), build_grid(loop)).passive
+    assert not Passivity.check(build_admittance(loop), build_grid(loop)).passive
 
 
 def test_circle_free_dominance_needs_the_proofs_weights() -> None:

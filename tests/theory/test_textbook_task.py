@@ -12,10 +12,8 @@ from tests.core.chain_references import ARMS
 from tests.scenario.builders import planar_task_text, posed_task_text
 from trilat_net.analysis.theory.site_dynamics import (
     COMPLEX_STEP,
+    ArgumentLayout,
     SiteRates,
-    differentiate_site_rates,
-    evaluate_site_rates,
-    lay_out_arguments,
     place_arm,
 )
 from trilat_net.analysis.theory.textbook_arm import (
@@ -77,12 +75,12 @@ def draw_state(site: SiteSetup, seed: int, distance: float) -> tuple[Array, list
     about `apart` away.
     """
     rng = np.random.default_rng(seed)
-    at = lay_out_arguments(site)
+    at = ArgumentLayout.of_site(site)
     state = np.zeros(at.states)
     state[at.q] = np.array(site.q0) + rng.normal(0.0, 0.1, at.joints)
     state[at.qd] = rng.normal(0.0, 0.3, at.joints)
     state[at.estimate] = rng.normal(0.0, 1.0, at.parameters)
-    own_rates = evaluate_site_rates(
+    own_rates = SiteRates.evaluate(
         site, np.concatenate([state, np.zeros(at.arguments - at.states)])
     ).x
     peers = []
@@ -108,11 +106,11 @@ def draw_state(site: SiteSetup, seed: int, distance: float) -> tuple[Array, list
 
 
 def by_theory(site: SiteSetup, state: Array, peers: list[Array]) -> SiteRates:
-    at = lay_out_arguments(site)
+    at = ArgumentLayout.of_site(site)
     alpha = np.array([0.0, *(link.alpha for link in site.links)])
     m = at.coordinates
     x = np.concatenate([state, np.zeros(at.arguments - at.states)])
-    derivative = evaluate_site_rates(site, x).x
+    derivative = SiteRates.evaluate(site, x).x
     x[at.q_des] = evaluate_reference(
         alpha, derivative, [derivative, *(peer[:m] for peer in peers)]
     )
@@ -120,14 +118,14 @@ def by_theory(site: SiteSetup, state: Array, peers: list[Array]) -> SiteRates:
     x[at.peer_torque] = sum(
         -a * peer[2 * m :] for a, peer in zip(alpha[1:], peers, strict=True)
     )
-    return evaluate_site_rates(site, x)
+    return SiteRates.evaluate(site, x)
 
 
 def by_tick(site: SiteSetup, state: Array, peers: list[Array]) -> dict[str, Array]:
     """Returns torque, estimates and accelerations of one compiled tick, the accelerations as h
     goes to 0.
     """
-    at = lay_out_arguments(site)
+    at = ArgumentLayout.of_site(site)
     accelerations = []
     records = []
     for rate_hz in (10_000, 20_000):
@@ -176,14 +174,14 @@ def test_a_site_equals_a_compiled_tick(text: str, name: str, law: str, distance:
 def test_task_jacobian_is_the_difference_of_ticks(text: str, name: str, law: str) -> None:
     site = make_task_setup(text, name, law)
     step = 1e-6
-    at = lay_out_arguments(site)
+    at = ArgumentLayout.of_site(site)
     state, peers = draw_state(site, 4, 0.0)
     x = np.concatenate([state, np.zeros(at.arguments - at.states)])
-    derivative = evaluate_site_rates(site, x).x
+    derivative = SiteRates.evaluate(site, x).x
     x[at.q_des] = derivative + 0.05
     x[at.qd_des] = 0.1
     x[at.peer_torque] = 0.3
-    exact = differentiate_site_rates(site, x)
+    exact = SiteRates.differentiate(site, x)
     places = [*range(2 * at.joints), *range(at.states, at.inputs.stop)]
 
     def tau(place: int, by: float) -> Array:

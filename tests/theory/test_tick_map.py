@@ -11,12 +11,12 @@ from tests.execution.builders import make_trajectories
 from tests.theory.loops import Array
 from tests.theory.tick_recursion import build_recursion
 from trilat_net.analysis.theory import find_equilibrium
-from trilat_net.analysis.theory.characteristic_roots import Spectrum, compute_delay_spectrum
+from trilat_net.analysis.theory.characteristic_roots import Spectrum
 from trilat_net.analysis.theory.floquet import (
     compute_sampled_spectrum,
     discretise_zero_order_hold,
 )
-from trilat_net.analysis.theory.linear_loop import linearise_loop
+from trilat_net.analysis.theory.linear_loop import LinearLoop
 from trilat_net.analysis.theory.operating_point import OperatingConditions
 from trilat_net.scenario import Scenario, load_scenario
 
@@ -27,7 +27,7 @@ def compute_spectra(scenario: Scenario, wanted: int = 4) -> tuple[Spectrum, Spec
     """Returns the continuous and the sampled spectrum, about one pose."""
     now = OperatingConditions.derive(scenario)
     rest = find_equilibrium(scenario, POSE)
-    continuous = compute_delay_spectrum(linearise_loop(now, rest), wanted)
+    continuous = Spectrum.of_loop(LinearLoop.of_conditions(now, rest), wanted)
     spectrum = compute_sampled_spectrum(now, rest, wanted)
     assert spectrum is not None
     return continuous, spectrum

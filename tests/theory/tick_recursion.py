@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tests.theory.loops import Array
-from trilat_net.analysis.theory.floquet import couple_ticks
+from trilat_net.analysis.theory.floquet import CoupledTicks
 from trilat_net.analysis.theory.operating_point import Equilibrium, OperatingConditions
 
 
@@ -33,7 +33,7 @@ def build_recursion(conditions: OperatingConditions, rest: Equilibrium) -> TickR
     ceil(T / h)) ticks later.
     """
     (rate_hz,) = {site.rate_hz for site in conditions.sites}
-    loop = couple_ticks(conditions, rest)
+    loop = CoupledTicks.of_conditions(conditions, rest)
     n = len(loop.S)
     late = np.flatnonzero(np.abs(list(loop.effects.values())).sum(axis=(0, 1)))
     ages = {at: max(1, round(float(conditions.age_s[at]) * rate_hz)) for at in loop.effects}

@@ -3,8 +3,8 @@
 A controller uses the state that another arm sent some time ago. Sums of energies therefore need
 the motion of that arm at the time of sending, which usually lies between two of its records.
 They also need every period of the control loop (tick), although a log may lack some records.
-`align_records` gives one row of numbers per tick of an arm. `PeerTrajectory` gives the motion
-of an arm at any time, and `DelayedPeer` the motion that another arm used.
+`AlignedRecords.by_site` gives one row of numbers per tick of an arm. `PeerTrajectory` gives the
+motion of an arm at any time, and `DelayedPeer` the motion that another arm used.
 
 Invariant:
     - A missing record is interpolated, so that sums have all their terms. Such a row is not
@@ -197,6 +197,105 @@ class AlignedRecords(NamedTuple):
         rows: Bools = self.known & (t_s > start_s)
         return rows
 
+    @classmethod
+    def by_site(cls, log: Log, *, common: bool = False) -> "dict[str, AlignedRecords]":
+        """Arranges the records of all sites with one row per tick, so that they are comparable.
+
+        A site is the process that runs one arm. Ticks without a record are interpolated. A last
+        record with the mode "diverged" is left out, because it may contain zeros in place of
+        numbers that are not finite.
+
+        Args:
+            log: The log of the run.
+            common: True to end all sites where the first site ends, as sums over all sites
+                require.
+
+        Returns:
+            The records by name of the site, in scenario order. Sites without records are
+            missing. With `common` the result is empty if any site has fewer than two ticks.
+        """
+        rows_by_site: dict[str, Ints] = {}
+        for site in log.sites:
+            site_log = log[site]
+            _, first_of_tick = np.unique(site_log.tick, return_index=True)
+            modes = site_log.mode[first_of_tick]
+            rows_by_site[site] = first_of_tick[modes != "diverged"]
+
+        aligned = {}
+        if not common:
+            for site, rows in rows_by_site.items():
+                if len(rows):
+                    aligned[site] = _fill_tick_grid(log.scenario, log[site], rows)
+            return aligned
+        row_counts = [len(rows) for rows in rows_by_site.values()]
+        if min(row_counts) < 2:
+            return {}
+
+        first_times_s = []
+        last_times_s = []
+        for site, rows in rows_by_site.items():
+            site_log = log[site]
+            first_times_s.append(site_log.tick[rows[0]] / site_log.rate_hz)
+            last_times_s.append(site_log.tick[rows[-1]] / site_log.rate_hz)
+        end_s = min(last_times_s)
+        if end_s <= max(first_times_s):
+            return {}
+        for site, rows in rows_by_site.items():
+            site_log = log[site]
+            end_tick = end_s * site_log.rate_hz
+            last_tick = int(np.floor(end_tick + 1e-6))
+            records = _fill_tick_grid(log.scenario, site_log, rows, last_tick)
+            if len(records.known) < 2:
+                return {}
+            aligned[site] = records
+        return aligned
+
+    def view_delayed_peer(self, past: "PeerTrajectory") -> "DelayedPeer":
+        """Returns the motion of another arm as this arm received it, with the network delay.
+
+        The records of this arm say which message was used in each tick (control period), and
+        the motion of the other arm says which state this message contained.
+
+        Args:
+            past: Motion of the peer over time.
+        """
+        used = self.used[past.records.site]
+        has_sample = used >= 0
+        sample_s = used / past.records.rate_hz
+        stamp_s = np.where(has_sample, sample_s, _BEFORE_EPOCH_S)
+        # the stamp moves at rate one over the period after a tick
+        moved_stamp_s = stamp_s + self.h_s
+        next_stamp_s = np.where(has_sample, moved_stamp_s, _BEFORE_EPOCH_S)
+        return DelayedPeer(
+            now=past.evaluate(self.t_s),
+            delayed=past.evaluate(stamp_s),
+            delayed_end=past.evaluate(next_stamp_s[:-1]),
+            stamp_s=np.where(has_sample, stamp_s, np.nan),
+        )
+
+    def find_latest_rows(self, t_s: Array) -> tuple[Ints, Bools]:
+        """Finds the last record of an arm at or before each of several times.
+
+        It relates arms whose control loops have different rates: a time of one arm is looked up
+        in the records of another arm.
+
+        Args:
+            t_s: Times since the start of the session, shape (K,), in s.
+
+        Returns:
+            For each time, the row of that tick, shape (K,). If the time is outside
+            the records, it is the nearest row. For each time, True if that tick was recorded,
+            and False if its row is interpolated or outside the records, shape (K,).
+        """
+        position = t_s * self.rate_hz
+        tick = np.floor(position + 1e-6).astype(np.int64)
+        row = tick - self.first
+        row_count = len(self.known)
+        is_inside = (row >= 0) & (row < row_count)
+        nearest_row = np.clip(row, 0, row_count - 1)
+        recorded: Bools = is_inside & self.known[nearest_row]
+        return nearest_row, recorded
+
 
 def hold_torque(tau: Array, limit_nm: Array | float, *, digital: bool) -> Array:
     """Returns the torque that acts during every tick period, computed from recorded torques.
@@ -219,58 +318,6 @@ def hold_torque(tau: Array, limit_nm: Array | float, *, digital: bool) -> Array:
         extrapolated = 1.5 * tau[1:] - 0.5 * previous_tau
         held[1:] = np.clip(extrapolated, -limit_nm, limit_nm)
     return held
-
-
-def align_records(log: Log, *, common: bool = False) -> dict[str, AlignedRecords]:
-    """Arranges the records of all sites with one row per tick, so that they can be compared.
-
-    A site is the process that runs one arm. Ticks without a record are interpolated. A last
-    record with the mode "diverged" is left out, because it may contain zeros in place of
-    numbers that are not finite.
-
-    Args:
-        log: The log of the run.
-        common: True to end all sites where the first site ends, as sums over all sites require.
-
-    Returns:
-        The records by name of the site, in scenario order. Sites without records are missing.
-        With `common` the result is empty if any site has fewer than two ticks.
-    """
-    rows_by_site: dict[str, Ints] = {}
-    for site in log.sites:
-        site_log = log[site]
-        _, first_of_tick = np.unique(site_log.tick, return_index=True)
-        modes = site_log.mode[first_of_tick]
-        rows_by_site[site] = first_of_tick[modes != "diverged"]
-
-    aligned = {}
-    if not common:
-        for site, rows in rows_by_site.items():
-            if len(rows):
-                aligned[site] = _fill_tick_grid(log.scenario, log[site], rows)
-        return aligned
-    row_counts = [len(rows) for rows in rows_by_site.values()]
-    if min(row_counts) < 2:
-        return {}
-
-    first_times_s = []
-    last_times_s = []
-    for site, rows in rows_by_site.items():
-        site_log = log[site]
-        first_times_s.append(site_log.tick[rows[0]] / site_log.rate_hz)
-        last_times_s.append(site_log.tick[rows[-1]] / site_log.rate_hz)
-    end_s = min(last_times_s)
-    if end_s <= max(first_times_s):
-        return {}
-    for site, rows in rows_by_site.items():
-        site_log = log[site]
-        end_tick = end_s * site_log.rate_hz
-        last_tick = int(np.floor(end_tick + 1e-6))
-        records = _fill_tick_grid(log.scenario, site_log, rows, last_tick)
-        if len(records.known) < 2:
-            return {}
-        aligned[site] = records
-    return aligned
 
 
 def _find_resting_rows(modes: NDArray[Any], tick: Ints, rate_hz: int) -> Bools:
@@ -527,57 +574,6 @@ _BEFORE_EPOCH_S = -1.0
 """A time before the start of the session, at which a peer rests in its start pose (L7)."""
 
 
-def view_delayed_peer(records: AlignedRecords, past: PeerTrajectory) -> DelayedPeer:
-    """Returns the motion of another arm as this arm received it, with the network delay.
-
-    The records of this arm say which message was used in each tick (control period), and the
-    motion of the other arm says which state this message contained.
-
-    Args:
-        records: Records of the site, which name the sample in use at every tick.
-        past: Motion of the peer over time.
-    """
-    used = records.used[past.records.site]
-    has_sample = used >= 0
-    sample_s = used / past.records.rate_hz
-    stamp_s = np.where(has_sample, sample_s, _BEFORE_EPOCH_S)
-    # the stamp moves at rate one over the period after a tick
-    moved_stamp_s = stamp_s + records.h_s
-    next_stamp_s = np.where(has_sample, moved_stamp_s, _BEFORE_EPOCH_S)
-    return DelayedPeer(
-        now=past.evaluate(records.t_s),
-        delayed=past.evaluate(stamp_s),
-        delayed_end=past.evaluate(next_stamp_s[:-1]),
-        stamp_s=np.where(has_sample, stamp_s, np.nan),
-    )
-
-
-def find_latest_rows(records: AlignedRecords, t_s: Array) -> tuple[Ints, Bools]:
-    """Finds the last record of an arm at or before each of several times.
-
-    It relates arms whose control loops have different rates: a time of one arm is looked up in
-    the records of another arm.
-
-    Args:
-        records: Records of the site, with one row per tick.
-        t_s: Times since the start of the session, shape (K,), in s.
-
-    Returns:
-        For each time, the row of that tick in `records`, shape (K,). If the time is outside the
-        records, it is the nearest row.
-        For each time, True if that tick was recorded, and False if its row is interpolated or
-        outside the records, shape (K,).
-    """
-    position = t_s * records.rate_hz
-    tick = np.floor(position + 1e-6).astype(np.int64)
-    row = tick - records.first
-    row_count = len(records.known)
-    is_inside = (row >= 0) & (row < row_count)
-    nearest_row = np.clip(row, 0, row_count - 1)
-    recorded: Bools = is_inside & records.known[nearest_row]
-    return nearest_row, recorded
-
-
 def find_common_rows(sites: Sequence[AlignedRecords]) -> tuple[list[Ints], Bools]:
     """Finds the records at which several arms can be compared at the same time.
 
@@ -594,7 +590,7 @@ def find_common_rows(sites: Sequence[AlignedRecords]) -> tuple[list[Ints], Bools
     rows = []
     recorded_by_site = []
     for records in sites:
-        row, recorded = find_latest_rows(records, sites[0].t_s)
+        row, recorded = records.find_latest_rows(sites[0].t_s)
         rows.append(row)
         recorded_by_site.append(recorded)
     return rows, np.logical_and.reduce(recorded_by_site)

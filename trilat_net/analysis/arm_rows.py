@@ -31,23 +31,12 @@ from ..core import (
     COULOMB_SPEED,
     LINK_PARAMETERS,
     Array,
+    ChainDynamics,
     ChainSetup,
-    Row,
-    RowArray,
     TaskSetup,
-    build_chain,
-    dot,
     forward_kinematics,
-    inverse_dynamics,
-    leaf,
-    parameter_gradient,
-    place_end_effector,
-    place_joints,
-    propagate_motion,
-    rotate,
-    three,
 )
-from ..records import JOINTS, MAX_JOINTS
+from ..records import JOINTS
 from ..scenario import ArmModel, Scenario
 
 HANGING_RAD = 0.3
@@ -534,120 +523,6 @@ class PlanarArmRows(NamedTuple):
         return max(angles_to_down)
 
 
-@leaf
-def _put_torques(
-    chain: RowArray,
-    theta: Array,
-    gravity: Array,
-    q: Array,
-    qd: Array,
-    v: Array,
-    a: Array,
-    torque: Array,
-) -> None:
-    """Writes the joint torques that a motion requires in each of K poses into `torque`.
-
-    The torque is M a + C(q, qd) v + G + armature a + friction(v), with the inertia matrix M,
-    the Coriolis matrix C, the gravity torque G and the inertia of the drives (armature). Joint
-    arrays have the shape (K, n). theta has the shape (K, 10 n), or (1, 10 n) if all poses share
-    it.
-    """
-    last = theta.shape[0] - 1
-    for k in range(q.shape[0]):
-        place_joints(chain, q[k])
-        propagate_motion(
-            chain=chain,
-            gravity=gravity,
-            qd=qd[k],
-            v=v[k],
-            a=a[k],
-        )
-        parameters = theta[min(k, last)]
-        inverse_dynamics(
-            chain=chain,
-            theta=parameters,
-            v=v[k],
-            a=a[k],
-            torque=torque[k],
-        )
-
-
-@leaf
-def _put_gradients(
-    chain: RowArray,
-    gravity: Array,
-    q: Array,
-    qd: Array,
-    v: Array,
-    a: Array,
-    gradient: Array,
-) -> None:
-    """Writes Y'r for each of K poses into `gradient`, shape (K, 10 n).
-
-    Y'r is the direction in which the adaptive law changes the parameter estimates, with the
-    regressor Y and the velocity error r = qd - v. The motion has the shape (K, n).
-    """
-    for k in range(q.shape[0]):
-        place_joints(chain, q[k])
-        propagate_motion(
-            chain=chain,
-            gravity=gravity,
-            qd=qd[k],
-            v=v[k],
-            a=a[k],
-        )
-        parameter_gradient(chain, gradient[k])
-
-
-@leaf
-def _put_end_effectors(
-    chain: RowArray,
-    theta: Array,
-    gravity: Array,
-    tip: Array,
-    q: Array,
-    position: Array,
-    J: Array,
-    energy: Array,
-) -> None:
-    """Writes the end effector's position and Jacobian, and the potential energy, in K poses.
-
-    The results go into `position`, shape (K, 3), `J`, shape (K, 6, n), and `energy`, shape
-    (K,). The potential energy of a link is -g'(m p + R mc), with its mass m and its first
-    moment mc, and its position p and orientation R in the base's frame.
-    """
-    n = chain.shape[0]
-    g = three(gravity)
-    for k in range(q.shape[0]):
-        place_joints(chain, q[k])
-        x, y, z = place_end_effector(chain, tip)
-        position[k, 0] = x
-        position[k, 1] = y
-        position[k, 2] = z
-        link_x = 0.0
-        link_y = 0.0
-        link_z = 0.0
-        energy[k] = 0.0
-        for i in range(n):
-            row: Row = chain[i]
-            step = three(row.p)
-            if i > 0:
-                step = rotate(chain[i - 1].R_base, step)
-            link_x = link_x + step[0]
-            link_y = link_y + step[1]
-            link_z = link_z + step[2]
-            first = LINK_PARAMETERS * i
-            mass = theta[first]
-            moment = (theta[first + 1], theta[first + 2], theta[first + 3])
-            moment_in_base = rotate(row.R_base, moment)
-            mass_term = mass * dot(g, (link_x, link_y, link_z))
-            moment_term = dot(g, moment_in_base)
-            energy[k] -= mass_term + moment_term
-            for j in range(3):
-                J[k, j, i] = row.J_lin[j]
-                J[k, 3 + j, i] = row.J_ang[j]
-
-
 class ChainArmRows(NamedTuple):
     """A serial arm with n joints, for computations over K poses at once.
 
@@ -686,9 +561,9 @@ class ChainArmRows(NamedTuple):
         return index_in_link < 4
 
     @property
-    def _rows(self) -> RowArray:
-        """The joints in the memory layout that the functions of the simulation kernel read."""
-        return build_chain(self.chain.joints, MAX_JOINTS)
+    def _dynamics(self) -> ChainDynamics:
+        """Dynamics of the chain, by the functions of the simulation kernel."""
+        return ChainDynamics(self.chain, self.theta)
 
     def _column(self, name: str) -> Array:
         """Returns one attribute of every joint, such as "viscous", as an array (n,)."""
@@ -767,18 +642,7 @@ class ChainArmRows(NamedTuple):
         Returns:
             Torque, shape (K, n), in N m.
         """
-        torque = np.zeros_like(q)
-        _put_torques(
-            chain=self._rows,
-            theta=np.ascontiguousarray(theta_hat),
-            gravity=np.array(self.chain.gravity_m_s2),
-            q=np.ascontiguousarray(q),
-            qd=np.ascontiguousarray(qd),
-            v=np.ascontiguousarray(v),
-            a=np.ascontiguousarray(a),
-            torque=torque,
-        )
-        return torque
+        return self._dynamics.compute_torque(q, qd, v, a, theta=theta_hat)
 
     def gradient(
         self,
@@ -803,18 +667,7 @@ class ChainArmRows(NamedTuple):
         Returns:
             Gradient Y'r with respect to the 10 n parameters, shape (K, 10 n).
         """
-        poses = len(q)
-        gradient = np.zeros((poses, len(self.theta)))
-        _put_gradients(
-            chain=self._rows,
-            gravity=np.array(self.chain.gravity_m_s2),
-            q=np.ascontiguousarray(q),
-            qd=np.ascontiguousarray(qd),
-            v=np.ascontiguousarray(v),
-            a=np.ascontiguousarray(a),
-            gradient=gradient,
-        )
-        return gradient
+        return self._dynamics.compute_gradient(q, qd, v, a)
 
     def gravity_torque(self, q: Array) -> Array:
         """Returns the torque G(q) with which motors hold the arm still against gravity, in N m.
@@ -836,44 +689,13 @@ class ChainArmRows(NamedTuple):
             a=still,
         )
 
-    def _place(self, q: Array) -> tuple[Array, Array, Array]:
-        """Computes the end effector's position and Jacobian, and an arm's potential energy.
-
-        The Jacobian is the matrix from joint velocities to the velocity of the end effector. K
-        poses are evaluated at once.
-
-        Args:
-            q: Joint angles of n joints, shape (K, n), in rad.
-
-        Returns:
-            Position of the end effector, shape (K, 3), in m.
-            Its Jacobian, with three rows for the velocity and three for the angular velocity,
-            shape (K, 6, n).
-            Potential energy due to gravity, shape (K,), in J.
-        """
-        poses, joints = q.shape
-        position = np.zeros((poses, 3))
-        J = np.zeros((poses, 6, joints))
-        energy = np.zeros(poses)
-        _put_end_effectors(
-            chain=self._rows,
-            theta=self.theta,
-            gravity=np.array(self.chain.gravity_m_s2),
-            tip=np.array(self.chain.tip_m),
-            q=np.ascontiguousarray(q),
-            position=position,
-            J=J,
-            energy=energy,
-        )
-        return position, J, energy
-
     def potential_energy(self, q: Array) -> Array:
         """Returns the energy of the links in the field of gravity, at joint angles `q`.
 
         Its zero is at the height of the base. `q` has the shape (K, n), and the result the
         shape (K,), in J.
         """
-        _, _, energy = self._place(q)
+        _, _, energy = self._dynamics.place(q)
         return energy
 
     def friction(self, speed: Array) -> Array:
@@ -932,7 +754,7 @@ class ChainArmRows(NamedTuple):
             q: Joint angles, shape (K, n), in rad.
             qd: Joint velocities, shape (K, n), in rad/s.
         """
-        position, full_J, _ = self._place(q)
+        position, full_J, _ = self._dynamics.place(q)
         J = np.ascontiguousarray(full_J[:, :3])
         speed = np.einsum("kij,kj->ki", J, qd)
         return EndEffectorRows(position, speed, J)
@@ -951,7 +773,7 @@ class ChainArmRows(NamedTuple):
         Returns:
             Derivative, shape (K, 3, n).
         """
-        _, J, _ = self._place(q)
+        _, J, _ = self._dynamics.place(q)
         columns = J.transpose(0, 2, 1)
         linear = columns[:, :, :3]
         axis = columns[:, :, 3:]
@@ -1062,33 +884,11 @@ def joint_positions_m(arm: ArmModel, q: Array) -> Array:
         chains.
     """
     if arm.chain is not None:
-        return _chain_positions_m(arm.chain, q)
+        return ChainDynamics(arm.chain, arm.theta).place_points(q)
     points_per_pose = 1 + JOINTS
     points = np.zeros((len(q), points_per_pose, 2))
     for pose, angles in zip(points, q, strict=True):
         pose[1:] = forward_kinematics(arm.lengths_m, angles)
-    return points
-
-
-def _chain_positions_m(chain: ChainSetup, q: Array) -> Array:
-    """Returns the positions of base, joints and end effector of an arm, for drawing, in m.
-
-    Their shape is (K, n + 2, 3) for K poses of n joints.
-    """
-    joints = build_chain(chain.joints)
-    tip_m = np.array(chain.tip_m)
-    # base, joints and end effector
-    points_per_pose = len(joints) + 2
-    points = np.zeros((len(q), points_per_pose, 3))
-    for pose, angles in zip(points, q, strict=True):
-        place_joints(joints, np.ascontiguousarray(angles))
-        pose[-1] = place_end_effector(joints, tip_m)
-        position = np.zeros(3)
-        orientation = np.eye(3)
-        for point, joint in enumerate(joints, 1):
-            position = position + orientation @ joint.p
-            pose[point] = position
-            orientation = joint.R_base.copy()
     return points
 
 

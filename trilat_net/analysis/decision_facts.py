@@ -86,17 +86,21 @@ class LoopRoots(NamedTuple):
             the roots may cast doubt on a run, but prove nothing.
         distance_rad: Largest difference between the last angle of a joint and its angle at the
             pose at rest to which the roots belong, in rad.
-        leaves_out: Phrase that names the part of the loop that the linearisation leaves out,
-            for example "how the program at m2 reacts to the arms". Empty if the linearisation
-            is complete.
+        programs: Sites whose arms a program of the user moves. The linearised loop leaves out
+            how these programs react to the arms.
         is_numerical: True if the code of a user's law was differentiated numerically. Such
             roots can refute a run, but not prove it stable.
         swing_rate_per_s: Largest real part of the computed roots that oscillate, in 1/s. `None`
             if no computed root oscillates.
         omega_rad_s: Angular frequency of the root with the largest real part, in rad/s.
         drifting: Number of motions that keep their speed, because of the structure of the loop.
-        span: Phrase for the ticks and delays over which the roots were computed, such as ", in
-            continuous time". Empty if every tick has the same delays.
+        span_s: Time over which the roots of a sampled loop were computed, in s. None if every
+            tick has the same delays.
+        repeats: True if the delays of a sampled loop repeat after this time.
+        deviation_per_s: Uncertainty of the rate due to delays that do not repeat, in 1/s. None
+            if they nearly repeat.
+        is_continuous: True if the roots are those of the loop in continuous time.
+        has_mean_ages: True if ages that vary were replaced by their means.
         reason: The reason why there are no roots. Empty if the loop was linearised.
     """
 
@@ -104,12 +108,16 @@ class LoopRoots(NamedTuple):
     rate_per_s: float | None
     exact: bool
     distance_rad: float = 0.0
-    leaves_out: str = ""
+    programs: tuple[str, ...] = ()
     is_numerical: bool = False
     swing_rate_per_s: float | None = None
     omega_rad_s: float = 0.0
     drifting: int = 0
-    span: str = ""
+    span_s: float | None = None
+    repeats: bool = False
+    deviation_per_s: float | None = None
+    is_continuous: bool = False
+    has_mean_ages: bool = False
     reason: str = ""
 
     @property
@@ -119,6 +127,14 @@ class LoopRoots(NamedTuple):
         The package `presentation` writes it.
         """
         return str(find_hook("describe a finding")(self))
+
+    @property
+    def leaves_out(self) -> str:
+        """A phrase on what the linearised loop leaves out. Empty if it contains everything.
+
+        The package `presentation` writes it.
+        """
+        return str(find_hook("describe what roots leave out")(self))
 
     def to_json(self) -> JsonObject:
         """Converts the roots to plain values for JSON, with the sentence about them."""

@@ -18,16 +18,14 @@ Invariant:
     - A ramp starts from the value that the preceding ramp has reached at that time.
 """
 
-from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core import TAKEN, Array, DominanceRamp, find_reach, perron_vector
-from ..errors import UsageError
-from ..log import Ints, Log
-from ..scenario import POLICY, Scenario
+from ..core import Array, DominanceRamp, find_reach, perron_vector
+from ..log import Log
+from ..scenario import Scenario
 
 RAMP_TIME_TOLERANCE_S = 5e-10
 """Tolerance for the starts and ends of ramps, in s: half of the nanosecond to which they are
@@ -62,192 +60,152 @@ class DominanceHistory(NamedTuple):
         has_ramps = bool(self.rate.any())
         return not has_steps and not has_ramps
 
+    @classmethod
+    def of_log(cls, log: Log, site: str, t_s: Array) -> "DominanceHistory":
+        """Returns the dominance factors of a site at successive ticks.
 
-def trace_dominance(log: Log, site: str, t_s: Array) -> DominanceHistory:
-    """Returns the dominance factors of a site at successive ticks.
+        The factors change according to the timeline of the scenario and the commands during the
+        run. If the site lost a peer and continues without it, the factors of the others are
+        scaled so that their sum is 1.
 
-    The factors change according to the timeline of the scenario and the commands during the
-    run. If the site lost a peer and continues without it, the factors of the others are scaled
-    so that their sum is 1.
+        Args:
+            log: The log of the run.
+            site: Name of the site.
+            t_s: Times of the ticks, shape (K,), in s.
 
-    Args:
-        log: The log of the run.
-        site: Name of the site.
-        t_s: Times of the ticks, shape (K,), in s.
+        Raises:
+            LogError: A record names a change that is not valid.
+        """
+        history = DominancePlan.of_log(log, site).evaluate(t_s)
+        is_present = ~find_lost_peers(log, site, t_s)
+        if is_present.all():
+            return history
 
-    Raises:
-        LogError: A record names a change that is not valid.
-    """
-    start, ramps = list_ramps(log, site)
-    h_s = 1.0 / log.scenario.sites[site].rate_hz
-    history = evaluate_ramps(start, ramps, t_s, h_s)
-    is_present = ~find_lost_peers(log, site, t_s)
-    if is_present.all():
-        return history
-
-    # the factors of the remaining peers are divided by their sum
-    alpha = history.alpha * is_present
-    rate = history.rate * is_present
-    before = history.before * is_present[:-1]
-    total = alpha.sum(axis=1, keepdims=True)
-    total_rate = rate.sum(axis=1, keepdims=True)
-    total_before = before.sum(axis=1, keepdims=True)
-    # derivative of alpha / total by the quotient rule
-    numerator = rate * total - alpha * total_rate
-    return DominanceHistory(
-        alpha=alpha / total,
-        rate=numerator / total**2,
-        before=before / total_before,
-    )
-
-
-def list_ramps(log: Log, site: str) -> tuple[Array, list[DominanceRamp]]:
-    """Lists the planned and commanded changes of the weights with which a site follows others.
-
-    A site is the process that runs one arm. A site follows each of its P peers with a weight,
-    the dominance factor. Every change is a ramp from the old to the new factors. A sudden
-    change is a ramp without length.
-
-    Args:
-        log: The log of the run.
-        site: Name of the site.
-
-    Returns:
-        The factors at the start, shape (P,). The ramps.
-
-    Raises:
-        LogError: A recorded change is not valid.
-    """
-    start, ramps = list_scripted_ramps(log.scenario, site)
-    ramps = list(ramps)
-    for changes in log.commands(site).values():
-        ramps += [change.ramp for change in changes if change.ramp is not None]
-    return start, ramps
-
-
-def find_users(scenario: Scenario) -> tuple[str, list[str]]:
-    """Finds the slave arm that several users control together, and these users.
-
-    Each user moves the arm of a master, and the slave follows the masters.
-
-    Args:
-        scenario: The description of the experiment.
-
-    Returns:
-        Name of the first slave, empty if there is no slave. Names of all masters, each of which
-        represents its user.
-    """
-    slaves = []
-    masters = []
-    for site, spec in scenario.sites.items():
-        if spec.role == "slave":
-            slaves.append(site)
-        elif spec.role == "master":
-            masters.append(site)
-    first_slave = slaves[0] if slaves else ""
-    return first_slave, masters
-
-
-class UserShares(NamedTuple):
-    """How much of a slave's motion each of its users determines, at K times.
-
-    The slave follows the master of each user with a weight, the dominance factor. For example,
-    shares of 0.7 and 0.3 mean that the first user leads. In some experiments a program moves
-    the arm of one user. Whenever another user leads, a person intervenes.
-
-    Attributes:
-        shares: The slave's dominance factors for its U users, shape (K, U).
-        leader: Index of the user with the largest factor, shape (K,). If no factor is larger
-            than the others, it is the index of the program's user.
-        program: Index of the user whose arm the program moves.
-    """
-
-    shares: Array
-    leader: Ints
-    program: int
-
-
-def find_program(log: Log) -> str:
-    """Returns the user whose arm a program moved in a run.
-
-    This is the last user with a hand of kind "own", or otherwise the last user whose arm a
-    policy moved, through the LeRobot plugin or in an environment.
-
-    Args:
-        log: Log of the run.
-
-    Returns:
-        Name of the user. Empty if no program moved an arm.
-    """
-    users = find_users(log.scenario)[1]
-    held_by_policy = [user for user in users if _is_held_by_policy(log, user)]
-    moved_by_program = [user for user in users if log.scenario.sites[user].has_program_hand]
-    # the last candidate wins, and the name is empty if there is no candidate
-    candidates = ["", *held_by_policy, *moved_by_program]
-    return candidates[-1]
-
-
-def list_program_sites(log: Log) -> list[str]:
-    """Lists the sites whose arms a program moved in a run, in scenario order.
-
-    The program is a hand of kind "own", or a policy that moved the arm through the LeRobot
-    plugin or in an environment. Unlike a script, the program reacts to the motion of the arms.
-
-    Args:
-        log: Log of the run.
-    """
-    return [
-        site
-        for site in log.scenario.sites
-        if log.scenario.sites[site].has_program_hand or _is_held_by_policy(log, site)
-    ]
-
-
-def _is_held_by_policy(log: Log, site: str) -> bool:
-    """Returns True if the events of a log say that a policy took hold of the arm of a site."""
-    text_start = f"{site}: {POLICY} {TAKEN} "
-    for event in log.events:
-        if event.kind == "hand" and event.text.startswith(text_start):
-            return True
-    return False
-
-
-def find_user_shares(scenario: Scenario, alpha: Array, program: str = "") -> UserShares:
-    """Returns the weights with which the slave arm follows the arm of each user over time.
-
-    The slave is the arm at the task, which several users guide together. `find_users`
-    determines the slave and the users.
-
-    Args:
-        scenario: The description of the experiment.
-        alpha: Dominance factors of the slave, the weights with which it follows its P peers, at
-            K times, shape (K, P).
-        program: Name of the user whose arm a program moves. Empty for the last user.
-
-    Returns:
-        The weights, and the user with the largest weight at each time.
-
-    Raises:
-        UsageError: There is no user with this name.
-    """
-    slave, users = find_users(scenario)
-    program = program or users[-1]
-    if program not in users:
-        possible_users = " or ".join(users)
-        raise UsageError(
-            f"the program can hold the arm of {possible_users}, not of {program!r}"
+        # the factors of the remaining peers are divided by their sum
+        alpha = history.alpha * is_present
+        rate = history.rate * is_present
+        before = history.before * is_present[:-1]
+        total = alpha.sum(axis=1, keepdims=True)
+        total_rate = rate.sum(axis=1, keepdims=True)
+        total_before = before.sum(axis=1, keepdims=True)
+        # derivative of alpha / total by the quotient rule
+        numerator = rate * total - alpha * total_rate
+        return cls(
+            alpha=alpha / total,
+            rate=numerator / total**2,
+            before=before / total_before,
         )
 
-    peers = scenario.peers(slave)
-    columns = [peers.index(user) for user in users]
-    shares = alpha[:, columns]
 
-    program_index = users.index(program)
-    program_share = shares[:, program_index]
-    program_leads = program_share >= shares.max(axis=1)
-    largest = shares.argmax(axis=1)
-    leader = np.where(program_leads, program_index, largest)
-    return UserShares(shares, leader, program_index)
+class DominancePlan(NamedTuple):
+    """Changes of the weights (dominance factors) with which a site follows its P peers.
+
+    Every change is a ramp from the old to the new factors. A sudden change is a ramp without
+    length. A ramp that begins while another one is in progress starts from the values reached
+    at that time.
+
+    Attributes:
+        start: Factors at the start of the session, shape (P,).
+        ramps: Changes of the factors.
+        h_s: The tick period of the site, in s.
+    """
+
+    start: Array
+    ramps: list[DominanceRamp]
+    h_s: float
+
+    @classmethod
+    def of_scenario(cls, scenario: Scenario, site: str) -> "DominancePlan":
+        """Returns the changes of dominance factors that the scenario plans for a site.
+
+        Args:
+            scenario: The description of the experiment.
+            site: Name of the site.
+        """
+        factors = scenario.dominance[site]
+        start = np.array([factors.get(peer, 0.0) for peer in scenario.peers(site)])
+        h_s = 1.0 / scenario.sites[site].rate_hz
+        return cls(start, list(scenario.scripted_ramps(site)), h_s)
+
+    @classmethod
+    def of_log(cls, log: Log, site: str) -> "DominancePlan":
+        """Returns the planned changes of a run and those that commands requested.
+
+        Args:
+            log: The log of the run.
+            site: Name of the site.
+
+        Raises:
+            LogError: A recorded change is not valid.
+        """
+        plan = cls.of_scenario(log.scenario, site)
+        for changes in log.commands(site).values():
+            plan.ramps.extend(change.ramp for change in changes if change.ramp is not None)
+        return plan
+
+    def drop_finished(self, from_s: float) -> "DominancePlan":
+        """Removes changes that were complete before a given time.
+
+        The start factors are changed so that the factors from this time on stay the same.
+
+        Args:
+            from_s: Time from which the factors must stay the same, in s.
+        """
+        sorted_ramps = sorted(self.ramps, key=lambda ramp: ramp.start_ns)
+        started = sum(ramp.start_ns * 1e-9 <= from_s for ramp in sorted_ramps)
+        if started < 2:
+            return self._replace(ramps=sorted_ramps)
+
+        # the last ramp that has started may still be in progress
+        finished = self._replace(ramps=sorted_ramps[: started - 1])
+        remaining = sorted_ramps[started - 1 :]
+        last_start = np.array([remaining[0].start_ns * 1e-9])
+        history = finished.evaluate(last_start)
+        return self._replace(start=history.alpha[0], ramps=remaining)
+
+    def evaluate(self, t_s: Array) -> DominanceHistory:
+        """Computes the dominance factors over time, as the simulation does.
+
+        Args:
+            t_s: Ascending times, one tick period apart, shape (K,), in s.
+        """
+        alpha = np.tile(self.start, (len(t_s), 1))
+        rate = np.zeros((len(t_s), len(self.start)))
+        # the ramp in progress: its factors at start and end, and its times
+        from_factors = self.start
+        to_factors = self.start
+        start_s = 0.0
+        end_s = 0.0
+        sorted_ramps = sorted(self.ramps, key=lambda ramp: ramp.start_ns)
+        for ramp in sorted_ramps:
+            next_start_s = ramp.start_ns * 1e-9
+            finished_share = 1.0
+            if next_start_s < end_s:
+                elapsed_s = next_start_s - start_s
+                finished_share = elapsed_s / (end_s - start_s)
+            interpolated = from_factors + (to_factors - from_factors) * finished_share
+            # exact factors at the end of a finished ramp, which interpolation would round
+            from_factors = to_factors if finished_share == 1.0 else interpolated
+            to_factors = np.array(ramp.alpha)
+            start_s = next_start_s
+            end_s = ramp.end_ns * 1e-9
+
+            has_started = t_s >= start_s - RAMP_TIME_TOLERANCE_S
+            has_not_ended = t_s < end_s - RAMP_TIME_TOLERANCE_S
+            is_in_ramp = has_started & has_not_ended
+            alpha[has_started] = to_factors
+            rate[has_started] = 0.0
+            if is_in_ramp.any():
+                length_s = (ramp.end_ns - ramp.start_ns) * 1e-9
+                slope = (to_factors - from_factors) / length_s
+                since_start_s = t_s[is_in_ramp, np.newaxis] - start_s
+                alpha[is_in_ramp] = from_factors + slope * since_start_s
+                rate[is_in_ramp] = slope
+
+        alpha_left = alpha[:-1]
+        rate_left = rate[:-1]
+        at_period_ends = alpha_left + self.h_s * rate_left
+        return DominanceHistory(alpha, rate, at_period_ends)
 
 
 def find_lost_peers(log: Log, site: str, t_s: Array) -> NDArray[np.bool_]:
@@ -299,166 +257,39 @@ class PeerLoss(NamedTuple):
     from_s: float
     to_s: float
 
+    @classmethod
+    def list_of_log(cls, log: Log) -> "list[PeerLoss]":
+        """Lists the times in which sites continued without a peer whose messages had stopped.
 
-def list_losses(log: Log) -> list[PeerLoss]:
-    """Lists the times in which sites continued without a peer whose messages had stopped.
+        In these times the dominance factors differ from the planned ones, because a site
+        distributes the share of the lost peer among the others.
 
-    In these times the dominance factors differ from the planned ones, because a site
-    distributes the share of the lost peer among the others.
+        Args:
+            log: The log of the run.
 
-    Args:
-        log: The log of the run.
+        Returns:
+            The spans of time, ordered by site and peer. Empty if no peer was lost.
+        """
+        losses = []
+        for site in log.sites:
+            site_log = log[site]
+            is_lost = find_lost_peers(log, site, site_log.t_s)
+            lost = is_lost.astype(int)
+            times_s = site_log.t_s
+            if len(site_log):
+                end_s = site_log.t_s[-1] + 1.0 / site_log.rate_hz
+                times_s = np.append(site_log.t_s, end_s)
 
-    Returns:
-        The spans of time, ordered by site and peer. Empty if no peer was lost.
-    """
-    losses = []
-    for site in log.sites:
-        site_log = log[site]
-        is_lost = find_lost_peers(log, site, site_log.t_s)
-        lost = is_lost.astype(int)
-        times_s = site_log.t_s
-        if len(site_log):
-            end_s = site_log.t_s[-1] + 1.0 / site_log.rate_hz
-            times_s = np.append(site_log.t_s, end_s)
-
-        for j, peer in enumerate(site_log.peers):
-            # +1 where a loss begins, and -1 where it ends
-            changes = np.diff(lost[:, j], prepend=0, append=0)
-            start_rows = np.flatnonzero(changes > 0)
-            end_rows = np.flatnonzero(changes < 0)
-            starts_s = times_s[start_rows].tolist()
-            ends_s = times_s[end_rows].tolist()
-            for from_s, to_s in zip(starts_s, ends_s, strict=True):
-                losses.append(PeerLoss(site, peer, from_s, to_s))
-    return losses
-
-
-def list_scripted_ramps(scenario: Scenario, site: str) -> tuple[Array, list[DominanceRamp]]:
-    """Lists the changes of dominance factors that the scenario plans for an arm.
-
-    Dominance factors are the weights with which the arm follows its P peers, the other arms.
-
-    Args:
-        scenario: The description of the experiment.
-        site: Name of the site.
-
-    Returns:
-        The factors at the start, shape (P,).
-        The planned changes, each a ramp from the old to the new factors.
-    """
-    factors = scenario.dominance[site]
-    peers = scenario.peers(site)
-    start = np.array([factors.get(peer, 0.0) for peer in peers])
-    return start, scenario.scripted_ramps(site)
-
-
-def drop_finished_ramps(
-    start: Array,
-    ramps: Sequence[DominanceRamp],
-    from_s: float,
-) -> tuple[Array, list[DominanceRamp]]:
-    """Removes changes of dominance factors that were completed before a given time.
-
-    A ramp is a linear change of the factors, the weights with which an arm follows others. The
-    start factors are adapted so that the factors after this time stay the same.
-
-    Args:
-        start: Factors at the start of the session, shape (P,).
-        ramps: All ramps.
-        from_s: Time from which the factors must stay the same, in s.
-
-    Returns:
-        The new start factors, shape (P,).
-        The remaining ramps.
-    """
-    sorted_ramps = sorted(ramps, key=lambda ramp: ramp.start_ns)
-    started = sum(ramp.start_ns * 1e-9 <= from_s for ramp in sorted_ramps)
-    if started < 2:
-        return start, sorted_ramps
-
-    # the last ramp that has started may still be in progress
-    finished = sorted_ramps[: started - 1]
-    remaining = sorted_ramps[started - 1 :]
-    last_start = np.array([remaining[0].start_ns * 1e-9])
-    history = evaluate_ramps(start, finished, last_start, 0.0)
-    return history.alpha[0], remaining
-
-
-def evaluate_ramps(
-    start: Array,
-    ramps: Sequence[DominanceRamp],
-    t_s: Array,
-    h_s: float,
-) -> DominanceHistory:
-    """Computes dominance factors over time from their start values and their changes.
-
-    The factors are the weights with which a site follows its peers. A change is a ramp: the
-    factors move linearly to their new values, as in the simulation. A ramp that begins while
-    another one is in progress starts from the values reached at that time.
-
-    Args:
-        start: Factors at the start of the session, shape (P,).
-        ramps: Changes of the factors.
-        t_s: Ascending times, one tick period apart, shape (K,), in s.
-        h_s: The tick period, in s.
-    """
-    alpha = np.tile(start, (len(t_s), 1))
-    rate = np.zeros((len(t_s), len(start)))
-    # the ramp in progress: its factors at start and end, and its times
-    from_factors = start
-    to_factors = start
-    start_s = 0.0
-    end_s = 0.0
-    sorted_ramps = sorted(ramps, key=lambda ramp: ramp.start_ns)
-    for ramp in sorted_ramps:
-        next_start_s = ramp.start_ns * 1e-9
-        finished_share = 1.0
-        if next_start_s < end_s:
-            elapsed_s = next_start_s - start_s
-            finished_share = elapsed_s / (end_s - start_s)
-        interpolated = from_factors + (to_factors - from_factors) * finished_share
-        # exact factors at the end of a finished ramp, which interpolation would round
-        from_factors = to_factors if finished_share == 1.0 else interpolated
-        to_factors = np.array(ramp.alpha)
-        start_s = next_start_s
-        end_s = ramp.end_ns * 1e-9
-
-        has_started = t_s >= start_s - RAMP_TIME_TOLERANCE_S
-        has_not_ended = t_s < end_s - RAMP_TIME_TOLERANCE_S
-        is_in_ramp = has_started & has_not_ended
-        alpha[has_started] = to_factors
-        rate[has_started] = 0.0
-        if is_in_ramp.any():
-            length_s = (ramp.end_ns - ramp.start_ns) * 1e-9
-            slope = (to_factors - from_factors) / length_s
-            since_start_s = t_s[is_in_ramp, np.newaxis] - start_s
-            alpha[is_in_ramp] = from_factors + slope * since_start_s
-            rate[is_in_ramp] = slope
-
-    alpha_left = alpha[:-1]
-    rate_left = rate[:-1]
-    at_period_ends = alpha_left + h_s * rate_left
-    return DominanceHistory(alpha, rate, at_period_ends)
-
-
-def plan_dominance(scenario: Scenario, site: str, t_s: Array) -> Array:
-    """Returns the dominance factors of an arm over time, as its scenario plans them.
-
-    A dominance factor is the weight, from 0 to 1, with which an arm follows another arm. A
-    scenario can shift these weights during the run, for example from a teacher to a student.
-
-    Args:
-        scenario: The description of the experiment.
-        site: Name of the site.
-        t_s: Ascending times, shape (K,), in s.
-
-    Returns:
-        Factors with which the site follows its P peers, shape (K, P).
-    """
-    start, ramps = list_scripted_ramps(scenario, site)
-    period_s = 1.0 / scenario.sites[site].rate_hz
-    return evaluate_ramps(start, ramps, t_s, period_s).alpha
+            for j, peer in enumerate(site_log.peers):
+                # +1 where a loss begins, and -1 where it ends
+                changes = np.diff(lost[:, j], prepend=0, append=0)
+                start_rows = np.flatnonzero(changes > 0)
+                end_rows = np.flatnonzero(changes < 0)
+                starts_s = times_s[start_rows].tolist()
+                ends_s = times_s[end_rows].tolist()
+                for from_s, to_s in zip(starts_s, ends_s, strict=True):
+                    losses.append(PeerLoss(site, peer, from_s, to_s))
+        return losses
 
 
 KD_SHAPE_TOLERANCE = 1e-9

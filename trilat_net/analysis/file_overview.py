@@ -41,11 +41,10 @@ from ..results import JsonObject, Result, finite_or_none
 from ..scenario import END_WINDOW_S, list_arm_notes
 from .link_summary import (
     ONE_WAY_SCHEMA_VERSION,
+    ClockSummary,
     LinkSummary,
     ValueStatistics,
     sample_ages_ns,
-    summarise_clock,
-    summarise_links,
 )
 from .site_signals import (
     SETTLED_ERROR_RAD,
@@ -53,7 +52,7 @@ from .site_signals import (
     settling_time_of_all_s,
     settling_time_s,
 )
-from .timeline import find_mode_intervals, list_changes
+from .timeline import Timeline
 
 MOST_LISTED_GAPS = 1000
 """Largest number of gaps that are listed per channel."""
@@ -484,7 +483,7 @@ def _describe_link_health(log: Log, peer: str, site: str) -> JsonObject:
     Returns:
         The facts as plain values, ready for JSON.
     """
-    clock_summary = summarise_clock(log, peer, site)
+    clock_summary = ClockSummary.of_link(log, peer, site)
     one_way_us = np.zeros(0, dtype=np.int64)  # not measured in virtual time
     version = _parse_number(log.session.get("schema_version", "")) or 0
     if log.driver == "live" and version >= ONE_WAY_SCHEMA_VERSION:
@@ -599,7 +598,7 @@ def summarise_run(log: Log, twin: Log | None = None) -> JsonObject:
             "taken_at_tick": entry.taken_at_tick,
             "sentence": entry.sentence,
         }
-        for entry in list_changes(log)
+        for entry in Timeline(log).changes
     ]
 
     return {
@@ -626,7 +625,9 @@ def summarise_run(log: Log, twin: Log | None = None) -> JsonObject:
         "records": sum(site["records"] for site in sites.values()),
         "missing": sum(site["missing"] for site in sites.values()),
         "sites": sites,
-        "links": {link.name: _summarise_link(log, link) for link in summarise_links(log)},
+        "links": {
+            link.name: _summarise_link(log, link) for link in LinkSummary.list_of_log(log)
+        },
         "changes": changes,
     }
 
@@ -673,7 +674,7 @@ def _summarise_site(log: Log, site: str, twin: Log | None) -> JsonObject:
         "made_ticks": executed,
         "missing": max(0, ticks - log.absent_ticks(site) - len(site_log)),
         "diverged_at_s": site_log.diverged_s,
-        "modes": [interval._asdict() for interval in find_mode_intervals(site_log)],
+        "modes": [interval._asdict() for interval in Timeline(log).find_mode_intervals(site)],
         "q_end_rad": site_log.q[-1].tolist() if len(site_log) else None,
         "max_error_rad": _largest_magnitude(site_log.e),
         "max_error_end_rad": _largest_magnitude(site_log.e[at_end]),
@@ -692,10 +693,10 @@ def _summarise_site(log: Log, site: str, twin: Log | None) -> JsonObject:
 def _summarise_link(log: Log, link: LinkSummary) -> JsonObject:
     """Returns the quantities of a link for `summary.json`, such as its delays and losses."""
     counts = link.counts
-    clock = summarise_clock(log, link.peer, link.site)
+    clock = ClockSummary.of_link(log, link.peer, link.site)
 
     stated = []
-    for model in link.stated:
+    for model in link.stated.models:
         moments = model.link.moments()
         stated.append(
             {
@@ -711,7 +712,7 @@ def _summarise_link(log: Log, link: LinkSummary) -> JsonObject:
         age_ms = link.age_ms._asdict()
 
     return {
-        "delay_ms": finite_or_none(link.stated[0].link.moments().mean_ms),
+        "delay_ms": finite_or_none(link.stated.models[0].link.moments().mean_ms),
         "stated": stated,
         "drawn_ms": link.drawn_ms._asdict() if link.drawn_ms else None,
         "age_ms": age_ms,

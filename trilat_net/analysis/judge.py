@@ -23,7 +23,7 @@ from ..scenario import Scenario, describe_law_conditions, list_law_situations
 from .blas_threads import limit_blas_threads
 from .certificate.certificate_result import Certificate
 from .certificate.observed_energy import find_energy_laws
-from .certificate.premises import find_missing_functionals
+from .certificate.premise_quantities import MissingFunctional
 from .certificate.stability_certificate import certify_log
 from .decision_facts import LoopRoots, RunFindings, StabilityDecision
 from .delay_period import find_final_link
@@ -193,5 +193,5 @@ def judge_virtual_run(
 
 def _has_energies(scenario: Scenario) -> bool:
     """Returns True if a run has the energy function V, or energies that its laws declare."""
-    has_functional = not find_missing_functionals(scenario)
+    has_functional = not MissingFunctional.list_of_scenario(scenario)
     return has_functional or bool(find_energy_laws(scenario, own_laws=True))

@@ -22,12 +22,11 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..core import AHEAD_LIMIT_NS, LOST, Array, DelayKind
+from ..core import AHEAD_LIMIT_NS, LOST, Array, DelayKind, LinkSchedule, first_ticks
 from ..log import Ints, Log, SiteLog
 from ..records import NS_PER_S
-from ..scenario import LinkSchedule, first_ticks
 from .aligned import Bools
-from .timeline import StatedModel, list_changes, list_stated_models
+from .timeline import StatedLink, Timeline
 
 
 class _PredictedDelivery(NamedTuple):
@@ -306,6 +305,32 @@ class ValueStatistics(NamedTuple):
     min: float
     max: float
 
+    @classmethod
+    def of_values(cls, values: ArrayLike) -> "ValueStatistics | None":
+        """Computes mean, standard deviation, percentiles and extremes of numbers like delays.
+
+        Args:
+            values: The numbers.
+
+        Returns:
+            The statistics. `None` if there are no numbers.
+        """
+        numbers = np.asarray(values, dtype=np.float64)
+        if not numbers.size:
+            return None
+        percentages = (50.0, 95.0, 99.0, 0.0, 100.0)  # the last two are the extremes
+        percentiles = np.percentile(numbers, percentages)
+        p50, p95, p99, low, high = percentiles.tolist()
+        return cls(
+            mean=float(numbers.mean()),
+            deviation=float(numbers.std()),
+            p50=p50,
+            p95=p95,
+            p99=p99,
+            min=low,
+            max=high,
+        )
+
 
 class _AgeHistogram(NamedTuple):
     """Histogram of the ages of another arm's states that were used in control periods (ticks).
@@ -360,45 +385,45 @@ class ClockSummary(NamedTuple):
         """
         return self.bound_max_us == 0 and self.offset_us == 0
 
+    @classmethod
+    def of_link(cls, log: Log, peer: str, site: str) -> "ClockSummary | None":
+        """Returns how far the clocks of two arms differ, as one of them estimated in a session.
 
-def summarise_clock(log: Log, peer: str, site: str) -> ClockSummary | None:
-    """Returns the difference between the clocks of two arms, as one of the arms estimated it.
+        The age of a message is known only as accurately as this difference.
 
-    The age of a message is known only as accurately as this difference.
+        Args:
+            log: The log of the run.
+            peer: Name of the peer.
+            site: Name of the site that estimated the clock.
 
-    Args:
-        log: The log of the run.
-        peer: Name of the peer.
-        site: Name of the site that estimated the clock.
+        Returns:
+            The estimates. `None` in virtual time, or if the site published no estimates.
+        """
+        stats = [report for report in log.link_stats(site) if peer in report.offset_us]
+        if not stats:
+            return None
+        bounds_us = [report.bound_us.get(peer, 0) for report in stats]
+        round_trips_us = [report.rtt_us.get(peer, -1) for report in stats]
+        measured_us = [trip_us for trip_us in round_trips_us if trip_us >= 0]
 
-    Returns:
-        The estimates. `None` in virtual time, or if the site published no estimates.
-    """
-    stats = [report for report in log.link_stats(site) if peer in report.offset_us]
-    if not stats:
-        return None
-    bounds_us = [report.bound_us.get(peer, 0) for report in stats]
-    round_trips_us = [report.rtt_us.get(peer, -1) for report in stats]
-    measured_us = [trip_us for trip_us in round_trips_us if trip_us >= 0]
+        drift_ppm = None
+        drift_bound_ppm = None
+        for event in log.events:
+            if event.kind == "clock" and event.member == site and event.about == peer:
+                drift_ppm = event.drift_ppb / 1e3
+                drift_bound_ppm = event.drift_bound_ppb / 1e3
 
-    drift_ppm = None
-    drift_bound_ppm = None
-    for event in log.events:
-        if event.kind == "clock" and event.member == site and event.about == peer:
-            drift_ppm = event.drift_ppb / 1e3
-            drift_bound_ppm = event.drift_bound_ppb / 1e3
-
-    return ClockSummary(
-        offset_us=stats[-1].offset_us[peer],
-        offset_first_us=stats[0].offset_us[peer],
-        drift_ppm=drift_ppm,
-        drift_bound_ppm=drift_bound_ppm,
-        bound_us=bounds_us[-1],
-        bound_p50_us=float(np.median(bounds_us)),
-        bound_max_us=max(bounds_us),
-        rtt_min_us=min(measured_us, default=None),
-        faults=stats[-1].clock_faults.get(peer, 0),
-    )
+        return cls(
+            offset_us=stats[-1].offset_us[peer],
+            offset_first_us=stats[0].offset_us[peer],
+            drift_ppm=drift_ppm,
+            drift_bound_ppm=drift_bound_ppm,
+            bound_us=bounds_us[-1],
+            bound_p50_us=float(np.median(bounds_us)),
+            bound_max_us=max(bounds_us),
+            rtt_min_us=min(measured_us, default=None),
+            faults=stats[-1].clock_faults.get(peer, 0),
+        )
 
 
 class SampleCounts(NamedTuple):
@@ -444,8 +469,7 @@ class LinkSummary(NamedTuple):
     Attributes:
         peer: Name of the sender.
         site: Name of the receiver.
-        stated: Delay models that the scenario and its changes prescribe for the link, in the
-            order of time.
+        stated: Delay models that the scenario and its changes prescribe for the link.
         drawn_ms: Statistics of the delays that these models gave to the samples, in ms.
         age_ms: Statistics of the effective delay, which is the age of the sample in use at each
             tick, in ms.
@@ -461,7 +485,7 @@ class LinkSummary(NamedTuple):
 
     peer: str
     site: str
-    stated: list[StatedModel]
+    stated: StatedLink
     drawn_ms: ValueStatistics | None
     age_ms: ValueStatistics | None
     ages: _AgeHistogram | None
@@ -487,57 +511,43 @@ class LinkSummary(NamedTuple):
         """
         counts = self.counts
         is_as_stated = counts is None or not (counts.late or counts.missing)
-        return is_as_stated and has_one_constant_delay(self.stated)
+        return is_as_stated and self.stated.has_one_constant_delay
 
+    @classmethod
+    def list_of_log(cls, log: Log) -> "list[LinkSummary]":
+        """Returns delays, losses and message counts of every network link of a run.
 
-def has_one_constant_delay(states: list[StatedModel]) -> bool:
-    """Returns True if a network link delays every message equally, and loses none.
+        The summaries have the order of the receivers, and then of the senders, in the scenario.
 
-    The stability theorem requires constant delays.
+        Args:
+            log: The log of the run.
 
-    Args:
-        states: Delay models of the link over time.
-    """
-    link = states[0].link
-    is_constant = link.to_core_model().kind == DelayKind.CONSTANT
-    is_lossless = not (link.loss or link.duplicate or link.outages_s)
-    return is_constant and is_lossless and len(states) == 1
+        Raises:
+            LogError: A record names a change that is not valid.
+        """
+        stated_links = Timeline(log).stated_links
+        arrivals_by_site = {site: _read_arrivals(log, site) for site in log.sites}
+        sent = {}
+        for peer in log.sites:
+            newest = max(
+                int(arrivals[peer].sample.max(initial=-1))
+                for arrivals in arrivals_by_site.values()
+                if peer in arrivals
+            )
+            sent[peer] = _count_sent(log, peer, newest)
 
-
-def summarise_links(log: Log) -> list[LinkSummary]:
-    """Returns delays, losses and message counts of every network link of a run.
-
-    The summaries have the order of the receivers, and then of the senders, in the scenario.
-
-    Args:
-        log: The log of the run.
-
-    Raises:
-        LogError: A record names a change that is not valid.
-    """
-    changed = list_changes(log)
-    arrivals_by_site = {site: _read_arrivals(log, site) for site in log.sites}
-    sent = {}
-    for peer in log.sites:
-        newest = max(
-            int(arrivals[peer].sample.max(initial=-1))
-            for arrivals in arrivals_by_site.values()
-            if peer in arrivals
-        )
-        sent[peer] = _count_sent(log, peer, newest)
-
-    return [
-        _summarise_link(
-            log=log,
-            states=list_stated_models(log, f"{peer}->{site}", changed),
-            peer=peer,
-            site=site,
-            sent=sent[peer],
-            arrivals=arrivals,
-        )
-        for site in log.sites
-        for peer, arrivals in arrivals_by_site[site].items()
-    ]
+        return [
+            _summarise_link(
+                log=log,
+                stated=stated_links[f"{peer}->{site}"],
+                peer=peer,
+                site=site,
+                sent=sent[peer],
+                arrivals=arrivals,
+            )
+            for site in log.sites
+            for peer, arrivals in arrivals_by_site[site].items()
+        ]
 
 
 def sample_ages_ns(log: Log, peer: str, site: str) -> Ints:
@@ -558,32 +568,6 @@ def sample_ages_ns(log: Log, peer: str, site: str) -> Ints:
     has_sample = used >= 0
     stamp_ns = used[has_sample] * NS_PER_S // log.scenario.sites[peer].rate_hz
     return site_log.tick[has_sample] * NS_PER_S // site_log.rate_hz - stamp_ns
-
-
-def compute_statistics(values: ArrayLike) -> ValueStatistics | None:
-    """Computes mean, standard deviation, percentiles and extremes of numbers, such as delays.
-
-    Args:
-        values: The numbers.
-
-    Returns:
-        The statistics. `None` if there are no numbers.
-    """
-    numbers = np.asarray(values, dtype=np.float64)
-    if not numbers.size:
-        return None
-    percentages = (50.0, 95.0, 99.0, 0.0, 100.0)  # the last two are the extremes
-    percentiles = np.percentile(numbers, percentages)
-    p50, p95, p99, low, high = percentiles.tolist()
-    return ValueStatistics(
-        mean=float(numbers.mean()),
-        deviation=float(numbers.std()),
-        p50=p50,
-        p95=p95,
-        p99=p99,
-        min=low,
-        max=high,
-    )
 
 
 def bin_ages(age_ns: Ints) -> _AgeHistogram | None:
@@ -614,7 +598,7 @@ def bin_ages(age_ns: Ints) -> _AgeHistogram | None:
 
 def _summarise_link(
     log: Log,
-    states: list[StatedModel],
+    stated: StatedLink,
     peer: str,
     site: str,
     sent: int,
@@ -624,7 +608,7 @@ def _summarise_link(
 
     Args:
         log: The log of the run.
-        states: Delay models of the link over time.
+        stated: Delay models of the link over time.
         peer: Name of the sender.
         site: Name of the receiver.
         sent: Number of samples that the peer sent.
@@ -675,13 +659,13 @@ def _summarise_link(
             judged=judged,
         )
         if log.driver == "live" and site_log.record(0).v >= ONE_WAY_SCHEMA_VERSION:
-            one_way_us = compute_statistics(arrivals.delay_us)
+            one_way_us = ValueStatistics.of_values(arrivals.delay_us)
     return LinkSummary(
         peer=peer,
         site=site,
-        stated=states,
-        drawn_ms=compute_statistics(delivery.drawn_ms),
-        age_ms=compute_statistics(age_ns / 1e6),
+        stated=stated,
+        drawn_ms=ValueStatistics.of_values(delivery.drawn_ms),
+        age_ms=ValueStatistics.of_values(age_ns / 1e6),
         ages=bin_ages(age_ns),
         first_use_s=first_use_s,
         ticks_without_new=ticks_without_new,
@@ -758,27 +742,27 @@ class DelayDistribution(NamedTuple):
     delay_ms: Array
     age_ms: Array
 
+    @classmethod
+    def list_of_log(cls, log: Log) -> "list[DelayDistribution]":
+        """Collects the delays of all messages on every network link of a run, for histograms.
 
-def measure_delay_distributions(log: Log) -> list[DelayDistribution]:
-    """Collects the delays of all messages on every network link of a run, for histograms.
+        The ages at which control loops used the messages are added.
 
-    The ages at which control loops used the messages are added.
+        Args:
+            log: Log of the run.
 
-    Args:
-        log: Log of the run.
-
-    Returns:
-        An entry per link, ordered by receiver and then by sender.
-    """
-    distributions = []
-    for site in log.sites:
-        for peer, arrivals in _read_arrivals(log, site).items():
-            newest_sample = int(arrivals.sample.max(initial=-1))
-            sent_count = _count_sent(log, peer, newest_sample)
-            delay_ms = predict_delivery(log, peer, site, sent_count).drawn_ms
-            # A link without a model has only measured delays, and only in a live session.
-            if not len(delay_ms) and log.driver == "live":
-                delay_ms = arrivals.delay_us / 1e3
-            age_ms = sample_ages_ns(log, peer, site) / 1e6
-            distributions.append(DelayDistribution(peer, site, delay_ms, age_ms))
-    return distributions
+        Returns:
+            An entry per link, ordered by receiver and then by sender.
+        """
+        distributions = []
+        for site in log.sites:
+            for peer, arrivals in _read_arrivals(log, site).items():
+                newest_sample = int(arrivals.sample.max(initial=-1))
+                sent_count = _count_sent(log, peer, newest_sample)
+                delay_ms = predict_delivery(log, peer, site, sent_count).drawn_ms
+                # A link without a model has only measured delays, and only in a live session.
+                if not len(delay_ms) and log.driver == "live":
+                    delay_ms = arrivals.delay_us / 1e3
+                age_ms = sample_ages_ns(log, peer, site) / 1e6
+                distributions.append(DelayDistribution(peer, site, delay_ms, age_ms))
+        return distributions

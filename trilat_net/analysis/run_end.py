@@ -35,9 +35,9 @@ from ..hooks import find_hook
 from ..log import Ints, Log, SiteLog
 from ..scenario import Scenario
 from .arm_rows import HANGING_RAD, build_arm_rows
-from .site_signals import SETTLED_ERROR_RAD, find_last_error
-from .timeline import list_effective_commands
-from .torque_sources import compute_operator_script
+from .site_signals import SETTLED_ERROR_RAD, JointError
+from .timeline import Timeline
+from .torque_sources import SourceRows
 from .twins.envelope_trend import FLOOR_RAD, EnvelopeFit, EnvelopeTrend, fit_envelopes
 
 SETTLED_SPEED_RAD_S = 1e-2
@@ -255,8 +255,8 @@ class RunEnd(NamedTuple):
         Args:
             log: The log of the run.
         """
-        end = trace_log(log).classify_end(log.scenario)
-        error = find_last_error(log)
+        end = RunTrace.of_log(log).classify_end(log.scenario)
+        error = JointError.find_last_of_all(log)
         if error is not None:
             end = end._replace(end_error_rad=error.value, end_error_where=error.joint)
         if end.behaviour is EndBehaviour.DIVERGED:
@@ -293,6 +293,98 @@ class RunTrace(NamedTuple):
     diverged_at_s: float | None = None
     pushed_until_s: float = 0.0
     changed_until_s: float = 0.0
+
+    @classmethod
+    def of_log(cls, log: Log) -> "RunTrace":
+        """Reduces a log to the data that are needed to judge the end of its run.
+
+        The reduced data of a long log fit into memory. Simulations without a log produce data
+        of the same kind.
+
+        Args:
+            log: The log of the run.
+
+        Returns:
+            For each joint and each interval of 50 ms: the largest magnitude of its error and of
+            its velocity, and its last angle. Also the external torques at the end, and the
+            times of the last push and the last change.
+        """
+        buckets = []
+        tau_x = []
+        push_times_s = []
+        for site in log.sites:
+            site_log = log[site]
+            site_buckets = cls.reduce_records(
+                bucket=site_log.tick * BUCKETS_PER_S // site_log.rate_hz,
+                e=site_log.e,
+                qd=site_log.qd,
+                q=site_log.q,
+                into=NO_BUCKETS,
+            )
+            buckets.append(site_buckets)
+            tau_x.append(site_log.tau_x[-1] if len(site_log) else np.zeros(1))
+            push_times_s.append(_find_unscripted_push_s(log, site_log))
+
+        change_times_s = [change.at_s for change in Timeline(log).effective_commands]
+        return cls(
+            buckets=buckets,
+            tau_x=tau_x,
+            diverged_at_s=log.diverged_s,
+            pushed_until_s=max(push_times_s, default=0.0),
+            changed_until_s=max(change_times_s, default=0.0),
+        )
+
+    @staticmethod
+    def reduce_records(
+        bucket: Ints,
+        e: Array,
+        qd: Array,
+        q: Array,
+        into: Array,
+    ) -> Array:
+        """Adds further records of a site to the data from which the end of its run is judged.
+
+        The records of an interval (bucket) are reduced to the largest |e|, the largest |qd| and
+        the last q of each joint, see `RunTrace`. In task space e has as many columns as the
+        task has coordinates. Columns that e, qd or q lack are filled with zeros.
+
+        Args:
+            bucket: Index of the interval of each record, ascending, shape (K,).
+            e: Synchronisation errors, shape (K, n).
+            qd: Joint velocities, shape (K, n), in rad/s.
+            q: Joint angles, shape (K, n), in rad.
+            into: Data of all earlier records. They may be changed in place, and may have spare
+                rows.
+
+        Returns:
+            The data with the new records.
+        """
+        if not len(bucket):
+            return into
+        joints = max(q.shape[1], e.shape[1])
+
+        def pad(x: Array) -> Array:
+            missing = joints - x.shape[1]
+            return np.pad(x, ((0, 0), (0, missing)))
+
+        magnitudes = np.abs(np.hstack([pad(e), pad(qd)]))
+        if not len(into):
+            into = np.zeros((0, 3 * joints))
+        lacking = int(bucket[-1]) + 1 - len(into)
+        if lacking > 0:
+            # half as much again, so that a long run is not copied for every batch
+            spare = len(into) // 2
+            extra = np.full((lacking + spare, 3 * joints), -1.0)
+            into = np.vstack([into, extra])
+
+        starts = np.flatnonzero(np.diff(bucket, prepend=-1))
+        last_records = np.append(starts[1:], len(q)) - 1
+        rows = bucket[starts]
+        peaks = np.maximum.reduceat(magnitudes, starts, axis=0)
+        earlier_peaks = into[rows, : 2 * joints]
+        into[rows, : 2 * joints] = np.maximum(earlier_peaks, peaks)
+        into[rows, 2 * joints :] = pad(q)[last_records]
+        return into
 
     def classify_end(self, scenario: Scenario) -> RunEnd:
         """Judges from reduced data whether the motion died away at the end of a run.
@@ -356,98 +448,6 @@ class RunTrace(NamedTuple):
 
 NO_BUCKETS = np.zeros((0, 3))
 """The buckets of a site without records."""
-
-
-def reduce_to_buckets(
-    bucket: Ints,
-    e: Array,
-    qd: Array,
-    q: Array,
-    into: Array,
-) -> Array:
-    """Adds further records of a site to the data from which the end of its run is judged.
-
-    The records of an interval (bucket) are reduced to the largest |e|, the largest |qd| and the
-    last q of each joint, see `RunTrace`. In task space e has as many columns as the task has
-    coordinates. Columns that e, qd or q lack are filled with zeros.
-
-    Args:
-        bucket: Index of the interval of each record, ascending, shape (K,).
-        e: Synchronisation errors, shape (K, n).
-        qd: Joint velocities, shape (K, n), in rad/s.
-        q: Joint angles, shape (K, n), in rad.
-        into: Data of all earlier records. They may be changed in place, and may have spare
-            rows.
-
-    Returns:
-        The data with the new records.
-    """
-    if not len(bucket):
-        return into
-    joints = max(q.shape[1], e.shape[1])
-
-    def pad(x: Array) -> Array:
-        missing = joints - x.shape[1]
-        return np.pad(x, ((0, 0), (0, missing)))
-
-    magnitudes = np.abs(np.hstack([pad(e), pad(qd)]))
-    if not len(into):
-        into = np.zeros((0, 3 * joints))
-    lacking = int(bucket[-1]) + 1 - len(into)
-    if lacking > 0:
-        # half as much again, so that a long run is not copied for every batch
-        spare = len(into) // 2
-        extra = np.full((lacking + spare, 3 * joints), -1.0)
-        into = np.vstack([into, extra])
-
-    starts = np.flatnonzero(np.diff(bucket, prepend=-1))
-    last_records = np.append(starts[1:], len(q)) - 1
-    rows = bucket[starts]
-    peaks = np.maximum.reduceat(magnitudes, starts, axis=0)
-    earlier_peaks = into[rows, : 2 * joints]
-    into[rows, : 2 * joints] = np.maximum(earlier_peaks, peaks)
-    into[rows, 2 * joints :] = pad(q)[last_records]
-    return into
-
-
-def trace_log(log: Log) -> RunTrace:
-    """Reduces a log to the data that are needed to judge the end of its run.
-
-    The reduced data of a long log fit into memory. Simulations without a log produce data of
-    the same kind.
-
-    Args:
-        log: The log of the run.
-
-    Returns:
-        For each joint and each interval of 50 ms: the largest magnitude of its error and of its
-        velocity, and its last angle. Also the external torques at the end, and the times of the
-        last push and the last change.
-    """
-    buckets = []
-    tau_x = []
-    push_times_s = []
-    for site in log.sites:
-        site_log = log[site]
-        site_buckets = reduce_to_buckets(
-            bucket=site_log.tick * BUCKETS_PER_S // site_log.rate_hz,
-            e=site_log.e,
-            qd=site_log.qd,
-            q=site_log.q,
-            into=NO_BUCKETS,
-        )
-        buckets.append(site_buckets)
-        tau_x.append(site_log.tau_x[-1] if len(site_log) else np.zeros(1))
-        push_times_s.append(_find_unscripted_push_s(log, site_log))
-
-    change_times_s = [change.at_s for change in list_effective_commands(log)]
-    return RunTrace(
-        buckets=buckets,
-        tau_x=tau_x,
-        diverged_at_s=log.diverged_s,
-        pushed_until_s=max(push_times_s, default=0.0),
-        changed_until_s=max(change_times_s, default=0.0),
-    )
 
 
 def _find_unscripted_push_s(log: Log, site_log: SiteLog) -> float:
@@ -1022,7 +1022,7 @@ def _find_last_operator_action(scenario: Scenario, span_s: float) -> float:
                 continue
             # an action on joints has the identity in place of the end effector's Jacobian
             source_J = np.eye(len(actor.a)) if actor.a else at_start.J[0]
-            planned_action = compute_operator_script(actor, t_s, source_J)
+            planned_action = SourceRows(actor).compute_script(t_s, source_J)
             action_steps = np.abs(np.diff(planned_action, axis=0))
             is_change = action_steps.max(axis=1, initial=0.0) > 0.0
             last_change_s = float(t_s[1:][is_change].max(initial=0.0))

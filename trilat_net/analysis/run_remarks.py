@@ -24,10 +24,10 @@ import numpy as np
 
 from ..hooks import find_hook
 from ..log import Log
-from .dominance_history import list_program_sites
 from .link_summary import sample_ages_ns
+from .shared_slave import list_program_sites
 from .site_signals import external_torques
-from .timeline import list_effective_commands
+from .timeline import Timeline
 
 LARGE_PUSH_SHARE = 0.5
 """Smallest torque of operators and walls that gives a remark, as a share of the torque limit.
@@ -179,7 +179,7 @@ def _find_odd_age(log: Log) -> _OddAge | None:
         The age on the link with the largest difference. `None` if every link agrees.
     """
     changed = {change.link for change in log.scenario.timeline}
-    changed |= {change.link for change in list_effective_commands(log)}
+    changed |= {change.link for change in Timeline(log).effective_commands}
     ages = []
     for name, link in log.scenario.links.items():
         stated_ms, deviation_ms = link.moments()

@@ -17,15 +17,15 @@ from typing import Any, NamedTuple, TypeVar, cast
 
 import numpy as np
 
-from ..core import POSE, POSITION, TorqueSource
+from ..core import POSE, POSITION
 from ..log import Log, compute_continuous_vectors
 from ..scenario import Scenario
-from .aligned import AlignedRecords, align_records
+from .aligned import AlignedRecords
 from .arm_rows import build_arm_rows
-from .dominance_history import DominanceHistory, trace_dominance
+from .dominance_history import DominanceHistory
 from .following import JointFollowing, build_following
-from .link_summary import LinkSummary, summarise_links
-from .torque_sources import TorqueSplit, attribute_torque, list_walls
+from .link_summary import LinkSummary
+from .torque_sources import TorqueSplit, VirtualWall
 
 T = TypeVar("T")
 
@@ -85,11 +85,11 @@ class RunView:
         Metrics of arms without records have a reason in place of a value.
         """
         runs = {}
-        for site, records in align_records(self.log).items():
+        for site, records in AlignedRecords.by_site(self.log).items():
             runs[site] = SiteRun(
                 records=records,
-                torque=attribute_torque(records, self.scenario),
-                dominance=trace_dominance(self.log, site, records.t_s),
+                torque=TorqueSplit.with_script(records, self.scenario),
+                dominance=DominanceHistory.of_log(self.log, site, records.t_s),
             )
         return runs
 
@@ -117,17 +117,18 @@ class RunView:
 
         The name "m1->s" denotes the link from arm m1 to arm s.
         """
-        return {link.name: link for link in summarise_links(self.log)}
+        return {link.name: link for link in LinkSummary.list_of_log(self.log)}
 
     @cached_property
-    def walls(self) -> dict[str, tuple[str, TorqueSource]]:
+    def walls(self) -> dict[str, tuple[str, VirtualWall]]:
         """All virtual walls by name, each with the arm that can touch it.
 
         The name "s/1" denotes the first wall of arm s. Walls of an arm are counted from 1.
         """
         walls = {}
         for site in self.log.sites:
-            for number, wall in enumerate(list_walls(self.scenario.sites[site]), 1):
+            spec = self.scenario.sites[site]
+            for number, wall in enumerate(VirtualWall.list_of_site(spec), 1):
                 walls[f"{site}/{number}"] = (site, wall)
         return walls
 

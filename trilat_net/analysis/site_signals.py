@@ -121,21 +121,21 @@ class JointError(NamedTuple):
             return None
         return JointError.find_largest(site_log, from_s=float(site_log.t_s[-1]) - END_WINDOW_S)
 
+    @classmethod
+    def find_last_of_all(cls, log: Log) -> "JointError | None":
+        """Finds the largest tracking error of all arms in the last second of their records.
 
-def find_last_error(log: Log) -> JointError | None:
-    """Finds the largest tracking error of all arms in the last second of their records.
+        This error shows whether the arms agree at the end of the run.
 
-    This error shows whether the arms agree at the end of the run.
+        Args:
+            log: Log of the run.
 
-    Args:
-        log: Log of the run.
-
-    Returns:
-        The error. `None` if no record of that second has a finite error.
-    """
-    errors = [JointError.find_in_last_second(log[site]) for site in log.sites]
-    known = [error for error in errors if error is not None]
-    return max(known, key=lambda error: error.value, default=None)
+        Returns:
+            The error. `None` if no record of that second has a finite error.
+        """
+        errors = [JointError.find_in_last_second(log[site]) for site in log.sites]
+        known = [error for error in errors if error is not None]
+        return max(known, key=lambda error: error.value, default=None)
 
 
 def largest_magnitude(values: Array) -> Array:

@@ -9,62 +9,18 @@ Invariant:
       of the arms.
 """
 
-from collections.abc import Sequence
+from functools import cached_property
 from itertools import groupby
 from typing import NamedTuple
 
 import msgspec
 import numpy as np
 
-from ..core import HELD_OVERRUN_TICKS, LifeAlarm
+from ..core import HELD_OVERRUN_TICKS, DelayKind, LifeAlarm
 from ..errors import count_nouns
-from ..log import Log, SiteLog
+from ..log import Log
 from ..net import MODES, ModeMeaning
 from ..scenario import Change, LinkBase, describe_event, find_requester
-
-
-def list_effective_commands(log: Log) -> list[Change]:
-    """Lists the commands of a run that changed something.
-
-    A command that sets a link, or the dominance factors of a site (the weights with which it
-    follows its peers), to their present values is left out. Orders to sites, such as "stop",
-    are always included.
-
-    Args:
-        log: The log of the run.
-
-    Returns:
-        The commands, by the time at which they take effect.
-
-    Raises:
-        LogError: A record names a change that is not valid.
-    """
-    scenario = log.scenario
-    commands = []
-    for site in log.sites:
-        log.commands(site)  # raises LogError if a change is not valid
-        for texts in log.changes(site).values():
-            commands += [msgspec.json.decode(text, type=Change) for text in texts]
-
-    # links and factors hold the values in force while the changes are replayed in order
-    links: dict[str, LinkBase] = dict(scenario.links)
-    factors = dict(scenario.dominance)
-    effective_commands = []
-
-    planned = [(change, False) for change in scenario.timeline]
-    requested = [(change, True) for change in commands]
-    changes = sorted([*planned, *requested], key=lambda entry: entry[0].at_s)
-    for change, is_command in changes:
-        has_effect = True
-        if change.link:
-            has_effect = links[change.link] != change.after
-            links[change.link] = change.after
-        elif change.dominance:
-            has_effect = factors[change.dominance] != change.to
-            factors[change.dominance] = change.to
-        if is_command and has_effect:
-            effective_commands.append(change)
-    return effective_commands
 
 
 class _AppliedChange(NamedTuple):
@@ -138,125 +94,6 @@ class _ModeInterval(NamedTuple):
         return MODES[self.mode]
 
 
-class StatedModel(NamedTuple):
-    """Delay model that the scenario, or a change during the run, prescribes for a network link.
-
-    Measured delays are compared with it.
-
-    Attributes:
-        from_s: Time from which the model applies, in s after the start of the session. It
-            applies to samples sent from this time on.
-        link: The model: delay, losses and order of the samples.
-    """
-
-    from_s: float
-    link: LinkBase
-
-
-def list_changes(log: Log) -> list[_AppliedChange]:
-    """Lists all changes before the end of a run, in the order in which they took effect.
-
-    The records also name ticks that a site had to skip. Skipped ticks are included only if the
-    site skipped so many ticks that it held its position.
-
-    Args:
-        log: The log of the run.
-
-    Raises:
-        LogError: A record names a change that is not valid.
-    """
-    applied_changes = [
-        _AppliedChange(change, change.owner, None, change.describe())
-        for change in log.scenario.timeline
-    ]
-
-    change_events = {
-        (event.member, event.command): event for event in log.events if event.kind == "change"
-    }
-
-    for site in log.sites:
-        log.commands(site)  # raises if a record names a change that is not valid for the site
-        for tick, texts in log.changes(site).items():
-            for text in texts:
-                change = msgspec.json.decode(text, type=Change)
-                event = change_events.get((site, text))
-                if event is None:
-                    sentence = change.describe()
-                else:
-                    sentence = describe_event(event.kind, event.text, event.command)
-                applied_changes.append(_AppliedChange(change, site, tick, sentence))
-    end_s = recorded_end_s(log)
-    visible_entries = []
-    for entry in applied_changes:
-        is_short_skip = 0 < entry.change.ticks <= HELD_OVERRUN_TICKS
-        if entry.change.at_s < end_s and not is_short_skip:
-            visible_entries.append(entry)
-    return sorted(visible_entries, key=lambda entry: entry.change.at_s)
-
-
-def list_stated_models(
-    log: Log,
-    link: str,
-    changed: Sequence[_AppliedChange],
-) -> list[StatedModel]:
-    """Lists the delay models that a network link had during a run.
-
-    The first one is in force at the start, and each change adds another.
-
-    Args:
-        log: The log of the run.
-        link: Name of the link, "j->i".
-        changed: Changes of the run, from `list_changes`.
-    """
-    later_models = [
-        StatedModel(entry.change.at_s, entry.change.after)
-        for entry in changed
-        if entry.change.link == link
-    ]
-    return [StatedModel(0.0, log.scenario.links[link]), *later_models]
-
-
-def recorded_end_s(log: Log) -> float:
-    """Returns the time at which the last recorded control period of a run ends, in s.
-
-    If there are no records, it is the planned end of the run.
-
-    Args:
-        log: The log of the run.
-    """
-    site_logs = [log[site] for site in log.sites]
-    recorded_logs = [site_log for site_log in site_logs if len(site_log)]
-    ends_s = [float(site_log.t_s[-1]) + 1.0 / site_log.rate_hz for site_log in recorded_logs]
-    return max(ends_s, default=log.scenario.duration_s)
-
-
-def find_mode_intervals(site_log: SiteLog) -> list[_ModeInterval]:
-    """Finds the times in which an arm did not follow the other arms, in order.
-
-    In these times the site, the process that runs the arm, held its position, slowed down to a
-    stop, or moved back to the motion that it should follow.
-
-    Args:
-        site_log: The site's part of the log.
-
-    Returns:
-        The intervals. Empty if the arm followed the others all the time.
-    """
-    modes: list[str] = site_log.mode.tolist()
-    if all(MODES[mode].follows for mode in set(modes)):
-        return []
-
-    times_s = np.append(site_log.t_s, site_log.t_s[-1] + 1.0 / site_log.rate_hz).tolist()
-    intervals = []
-    first = 0
-    for mode, records in groupby(modes):
-        end = first + len(list(records))
-        if not MODES[mode].follows:
-            intervals.append(_ModeInterval(mode, times_s[first], times_s[end]))
-        first = end
-    return intervals
-
-
 class _RaisedAlarm(NamedTuple):
     """An interval in which a site raised an alarm: it held, was stopped, or had a fault.
 
@@ -283,41 +120,225 @@ class _RaisedAlarm(NamedTuple):
         return f"{self.site} {self.word} {self.from_s:.3f}-{self.to_s:.3f} s: {self.reason}"
 
 
-def list_alarms(log: Log) -> list[_RaisedAlarm]:
-    """Lists the alarms of all arms, in the order of their start.
+class _StatedModel(NamedTuple):
+    """Delay model that the scenario, or a change during the run, prescribes for a network link.
 
-    If a person ordered an arm to stop, the reason of the alarm names this person.
+    Measured delays are compared with it.
+
+    Attributes:
+        from_s: Time from which the model applies, in s after the start of the session. It
+            applies to samples sent from this time on.
+        link: The model: delay, losses and order of the samples.
+    """
+
+    from_s: float
+    link: LinkBase
+
+
+class StatedLink(NamedTuple):
+    """Delay models that a network link had during a run, as the scenario and changes state.
+
+    Attributes:
+        models: The models in order of time. The first one is in force at the start, and each
+            change adds another.
+    """
+
+    models: tuple[_StatedModel, ...]
+
+    @property
+    def has_one_constant_delay(self) -> bool:
+        """True if the link delays every message equally, and loses none.
+
+        The stability theorem requires constant delays.
+        """
+        link = self.models[0].link
+        is_constant = link.to_core_model().kind == DelayKind.CONSTANT
+        is_lossless = not (link.loss or link.duplicate or link.outages_s)
+        return is_constant and is_lossless and len(self.models) == 1
+
+
+class Timeline:
+    """What happened in a run over time: changes of settings, modes of the arms, and alarms.
 
     Args:
         log: The log of the run.
-
-    Raises:
-        LogError: A record names a change that is not valid.
     """
-    requesters = {
-        (entry.site, entry.taken_at_tick): find_requester(entry.sentence)
-        for entry in list_changes(log)
-    }
 
-    alarms_raised = []
-    for site in log.sites:
-        if log.scenario.sites[site].on_stale.action != "glide":
-            continue
-        site_log = log[site]
-        for mode, from_s, to_s in find_mode_intervals(site_log):
-            state = site_log.states[int(np.searchsorted(site_log.t_s, from_s))]
-            alarm = LifeAlarm.find(
-                session=log.scenario.name,
-                site=site,
-                mode=mode,
-                mem=state.mem,
-                shared=len(state.q_des),
-            )
-            if alarm is None:
+    def __init__(self, log: Log) -> None:
+        self._log = log
+
+    @cached_property
+    def end_s(self) -> float:
+        """The time at which the last recorded control period ends, in s.
+
+        If there are no records, it is the planned end of the run.
+        """
+        site_logs = [self._log[site] for site in self._log.sites]
+        recorded_logs = [site_log for site_log in site_logs if len(site_log)]
+        ends_s = [
+            float(site_log.t_s[-1]) + 1.0 / site_log.rate_hz for site_log in recorded_logs
+        ]
+        return max(ends_s, default=self._log.scenario.duration_s)
+
+    @cached_property
+    def changes(self) -> list[_AppliedChange]:
+        """All changes before the end of the run, in the order in which they took effect.
+
+        The records also name ticks that a site had to skip. Skipped ticks are included only if
+        the site skipped so many ticks that it held its position.
+
+        Raises:
+            LogError: A record names a change that is not valid.
+        """
+        log = self._log
+        applied_changes = [
+            _AppliedChange(change, change.owner, None, change.describe())
+            for change in log.scenario.timeline
+        ]
+
+        change_events = {
+            (event.member, event.command): event
+            for event in log.events
+            if event.kind == "change"
+        }
+
+        for site in log.sites:
+            log.commands(
+                site
+            )  # raises if a record names a change that is not valid for the site
+            for tick, texts in log.changes(site).items():
+                for text in texts:
+                    change = msgspec.json.decode(text, type=Change)
+                    event = change_events.get((site, text))
+                    if event is None:
+                        sentence = change.describe()
+                    else:
+                        sentence = describe_event(event.kind, event.text, event.command)
+                    applied_changes.append(_AppliedChange(change, site, tick, sentence))
+
+        visible_entries = []
+        for entry in applied_changes:
+            is_short_skip = 0 < entry.change.ticks <= HELD_OVERRUN_TICKS
+            if entry.change.at_s < self.end_s and not is_short_skip:
+                visible_entries.append(entry)
+        return sorted(visible_entries, key=lambda entry: entry.change.at_s)
+
+    @cached_property
+    def effective_commands(self) -> list[Change]:
+        """The commands that changed something, by the time at which they take effect.
+
+        A command that sets a link, or the dominance factors of a site (the weights with which
+        it follows its peers), to their present values is left out. Orders to sites, such as
+        "stop", are always included.
+
+        Raises:
+            LogError: A record names a change that is not valid.
+        """
+        scenario = self._log.scenario
+        commands = []
+        for site in self._log.sites:
+            self._log.commands(site)  # raises LogError if a change is not valid
+            for texts in self._log.changes(site).values():
+                commands += [msgspec.json.decode(text, type=Change) for text in texts]
+
+        # links and factors hold the values in force while the changes are replayed in order
+        links: dict[str, LinkBase] = dict(scenario.links)
+        factors = dict(scenario.dominance)
+        effective_commands = []
+
+        planned = [(change, False) for change in scenario.timeline]
+        requested = [(change, True) for change in commands]
+        changes = sorted([*planned, *requested], key=lambda entry: entry[0].at_s)
+        for change, is_command in changes:
+            has_effect = True
+            if change.link:
+                has_effect = links[change.link] != change.after
+                links[change.link] = change.after
+            elif change.dominance:
+                has_effect = factors[change.dominance] != change.to
+                factors[change.dominance] = change.to
+            if is_command and has_effect:
+                effective_commands.append(change)
+        return effective_commands
+
+    @cached_property
+    def stated_links(self) -> dict[str, StatedLink]:
+        """The delay models of every network link of the scenario, by the name "j->i".
+
+        Raises:
+            LogError: A record names a change that is not valid.
+        """
+        stated_links = {}
+        for name, link in self._log.scenario.links.items():
+            later_models = [
+                _StatedModel(entry.change.at_s, entry.change.after)
+                for entry in self.changes
+                if entry.change.link == name
+            ]
+            stated_links[name] = StatedLink((_StatedModel(0.0, link), *later_models))
+        return stated_links
+
+    def find_mode_intervals(self, site: str) -> list[_ModeInterval]:
+        """Finds the times in which an arm did not follow the other arms, in order.
+
+        In these times the site, the process that runs the arm, held its position, slowed down
+        to a stop, or moved back to the motion that it should follow.
+
+        Args:
+            site: Name of the site.
+
+        Returns:
+            The intervals. Empty if the arm followed the others all the time.
+        """
+        site_log = self._log[site]
+        modes: list[str] = site_log.mode.tolist()
+        if all(MODES[mode].follows for mode in set(modes)):
+            return []
+
+        times_s = np.append(site_log.t_s, site_log.t_s[-1] + 1.0 / site_log.rate_hz).tolist()
+        intervals = []
+        first = 0
+        for mode, records in groupby(modes):
+            end = first + len(list(records))
+            if not MODES[mode].follows:
+                intervals.append(_ModeInterval(mode, times_s[first], times_s[end]))
+            first = end
+        return intervals
+
+    @cached_property
+    def alarms(self) -> list[_RaisedAlarm]:
+        """The alarms of all arms, in the order of their start.
+
+        If a person ordered an arm to stop, the reason of the alarm names this person.
+
+        Raises:
+            LogError: A record names a change that is not valid.
+        """
+        log = self._log
+        requesters = {
+            (entry.site, entry.taken_at_tick): find_requester(entry.sentence)
+            for entry in self.changes
+        }
+
+        alarms_raised = []
+        for site in log.sites:
+            if log.scenario.sites[site].on_stale.action != "glide":
                 continue
-            requester = requesters.get((site, state.tick), "")
-            reason = f"ordered by {requester}" if requester else alarm.reason
-            alarms_raised.append(
-                _RaisedAlarm(site, alarm.word, reason, from_s=from_s, to_s=to_s)
-            )
-    return sorted(alarms_raised, key=lambda alarm: alarm.from_s)
+            site_log = log[site]
+            for mode, from_s, to_s in self.find_mode_intervals(site):
+                state = site_log.states[int(np.searchsorted(site_log.t_s, from_s))]
+                alarm = LifeAlarm.find(
+                    session=log.scenario.name,
+                    site=site,
+                    mode=mode,
+                    mem=state.mem,
+                    shared=len(state.q_des),
+                )
+                if alarm is None:
+                    continue
+                requester = requesters.get((site, state.tick), "")
+                reason = f"ordered by {requester}" if requester else alarm.reason
+                alarms_raised.append(
+                    _RaisedAlarm(site, alarm.word, reason, from_s=from_s, to_s=to_s)
+                )
+        return sorted(alarms_raised, key=lambda alarm: alarm.from_s)

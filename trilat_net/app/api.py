@@ -14,7 +14,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ..analysis import Certificate, LogMetrics, compute_log_metrics
+from ..analysis import Certificate, LogMetrics
 from ..entry_points import find_viewer
 from ..errors import UsageError
 from ..execution import LogCheckReport, SimulatedLog, simulate_scenario
@@ -202,7 +202,7 @@ def metrics(log: AnyLog) -> LogMetrics:
     """
     log_of_run = _open(log)
     log_of_run.require_records()
-    return compute_log_metrics(log_of_run)
+    return LogMetrics.of_log(log_of_run)
 
 
 def choose_report_folder(log: Path) -> Path:

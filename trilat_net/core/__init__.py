@@ -30,9 +30,7 @@ __all__ = [
     "LifeReason",
     "PlantState",
     "TickInput",
-    "describe_divergence",
     "describe_mode",
-    "find_life_reason",
     "first_tick_at",
     "tick_ns",
     # Sites and their arrays
@@ -57,16 +55,12 @@ __all__ = [
     "TickRepeater",
     "links_bytes",
     "make_layout",
-    "needed_pages",
     # Numbers and vectors
     "Array",
     "IntArray",
     "Pair",
     "Points",
-    "Row",
-    "RowArray",
     "Vector",
-    "relative_rotation",
     "rotation_matrix",
     "sincos",
     "tanh",
@@ -82,26 +76,15 @@ __all__ = [
     "POSE",
     "POSITION",
     "ArmLinks",
+    "ChainDynamics",
     "ChainJoint",
+    "FramePose",
     "Matrix",
     "Three",
-    "apply",
-    "build_chain",
     "chain_stages",
-    "dot",
-    "find_acceleration",
     "forward_kinematics",
-    "inverse_dynamics",
-    "mass_matrix",
-    "multiply",
-    "parameter_gradient",
-    "place_end_effector",
-    "place_joints",
-    "propagate_motion",
     "regressor",
-    "rotate",
     "theta_from_links",
-    "three",
     "two_link_stages",
     # Torques of operators and environments
     "LIVE_KINDS",
@@ -117,16 +100,16 @@ __all__ = [
     "ROW_SUM_TOLERANCE",
     "DelayKind",
     "LinkModel",
+    "LinkSchedule",
     "TraceEnd",
     "dominance",
     "draw_pair",
     "find_balancing_weights",
     "find_reach",
+    "first_ticks",
     "is_irreducible",
-    "link_dtype",
     "link_key",
     "perron_vector",
-    "schedule_deliveries",
     # Live hands and hands of users
     "GRIP_NS",
     "SILENCE_NS",
@@ -134,14 +117,11 @@ __all__ = [
     "HandCommand",
     "HandContext",
     "HandInForce",
-    "HandMemory",
     "HandProgram",
     "HandReach",
     "HandRules",
     "HandView",
     "OwnHand",
-    "advance_hand",
-    "empty_hand_vector",
     # Safeguards and rest
     "BLEND_S",
     "HELD_OVERRUN_TICKS",
@@ -162,73 +142,47 @@ __all__ = [
     "compile_to_address",
     "compiled",
     "list_numbers",
-    "list_remembered",
     "plug_law",
-    "read_memory",
-    "sum_work",
     # Runs of several sites, alone and side by side
     "CompiledRun",
-    "LaneEndedError",
     "LaneEpisodes",
-    "LaneTwin",
     "RunGroup",
     "RunInputs",
     "TwinLanes",
     "describe_structure",
     "group_runs",
     "prepare_lanes",
-    "suits_twins",
 ]
 
 if TYPE_CHECKING:
     from .arms import chain_stages, two_link_stages
-    from .arms.chain import (
-        COULOMB_SPEED,
-        LINK_PARAMETERS,
-        ChainJoint,
-        Matrix,
-        Three,
-        apply,
-        build_chain,
-        dot,
-        find_acceleration,
-        inverse_dynamics,
-        mass_matrix,
-        multiply,
-        parameter_gradient,
-        place_end_effector,
-        place_joints,
-        propagate_motion,
-        rotate,
-        three,
-    )
+    from .arms.chain import COULOMB_SPEED, LINK_PARAMETERS, ChainJoint, Matrix, Three
+    from .arms.chain_dynamics import ChainDynamics
     from .arms.elementary import sincos, tanh
     from .arms.exogenous import LIVE_KINDS, OWN_KINDS, SCRIPTED_KINDS, TorqueKind, TorqueSource
-    from .arms.rotation import relative_rotation, rotation_matrix
+    from .arms.frame_pose import FramePose
+    from .arms.rotation import rotation_matrix
     from .arms.task_space import POSE, POSITION
     from .arms.two_link_arm import ArmLinks, forward_kinematics, regressor, theta_from_links
     from .lanes.lane_episodes import LaneEpisodes
     from .lanes.lane_structure import describe_structure
     from .lanes.run_groups import RunGroup, group_runs, prepare_lanes
-    from .lanes.twin_lanes import LaneEndedError, LaneTwin, TwinLanes, suits_twins
+    from .lanes.twin_lanes import TwinLanes
     from .life.live_hand import (
         GRIP_NS,
         SILENCE_NS,
         TAKEN,
         HandCommand,
         HandInForce,
-        HandMemory,
         HandReach,
         HandRules,
-        advance_hand,
-        empty_hand_vector,
     )
     from .life.own_hand import HandContext, HandProgram, HandView, OwnHand
     from .life.resting import REST_RATE_1_S
     from .life.safeguards import BLEND_S
     from .life.session_life import HELD_OVERRUN_TICKS
     from .links import dominance
-    from .links.channel import LOST, schedule_deliveries
+    from .links.channel import LOST
     from .links.delay import (
         LINK_MODEL_DTYPE,
         MAX_DELAY_US,
@@ -244,21 +198,14 @@ if TYPE_CHECKING:
         is_irreducible,
         perron_vector,
     )
-    from .links.link import AHEAD_LIMIT_NS, link_dtype
+    from .links.link import AHEAD_LIMIT_NS
+    from .links.link_schedule import LinkSchedule, first_ticks
     from .links.philox import link_key
     from .plug.compiled_law import compiled, plug_law
     from .plug.law_channel import MAX_RECORD_SENT, MAX_SENT, LawChannel, SentVector
-    from .plug.law_energy import LawEnergies, LawRecords, PeerRecords, sum_work
+    from .plug.law_energy import LawEnergies, LawRecords, PeerRecords
     from .plug.plugged import compile_to_address, list_numbers
-    from .plug.user_law import (
-        LawContext,
-        LawInput,
-        PeerView,
-        UserLaw,
-        UserLawFactory,
-        list_remembered,
-        read_memory,
-    )
+    from .plug.user_law import LawContext, LawInput, PeerView, UserLaw, UserLawFactory
     from .step.compiled_run import CompiledRun
     from .step.control import ROBUST_RESIDUE
     from .step.fingerprint import compute_fingerprint
@@ -271,7 +218,6 @@ if TYPE_CHECKING:
         MAX_RAMPS,
         SiteArrays,
         links_bytes,
-        needed_pages,
     )
     from .step.site_setup import (
         ChainSetup,
@@ -299,43 +245,37 @@ if TYPE_CHECKING:
         LifeReason,
         PlantState,
         TickInput,
-        describe_divergence,
         describe_mode,
-        find_life_reason,
         first_tick_at,
         tick_ns,
     )
-    from .step.vectors import Array, IntArray, Pair, Points, Row, RowArray, Vector
+    from .step.vectors import Array, IntArray, Pair, Points, Vector
 else:
     __getattr__ = import_on_use(
         __name__,
         {
-            "arms.chain": (
-                "COULOMB_SPEED ChainJoint LINK_PARAMETERS Matrix Three apply build_chain "
-                "dot find_acceleration inverse_dynamics mass_matrix multiply "
-                "parameter_gradient place_end_effector place_joints propagate_motion rotate "
-                "three"
-            ),
+            "arms.chain": "COULOMB_SPEED ChainJoint LINK_PARAMETERS Matrix Three",
+            "arms.chain_dynamics": "ChainDynamics",
             "arms.chain_stages": "chain_stages",
             "arms.elementary": "sincos tanh",
             "arms.exogenous": "LIVE_KINDS OWN_KINDS SCRIPTED_KINDS TorqueKind TorqueSource",
-            "arms.rotation": "relative_rotation rotation_matrix",
+            "arms.frame_pose": "FramePose",
+            "arms.rotation": "rotation_matrix",
             "arms.task_space": "POSE POSITION",
             "arms.two_link_arm": "ArmLinks forward_kinematics regressor theta_from_links",
             "arms.two_link_stages": "two_link_stages",
             "lanes.lane_episodes": "LaneEpisodes",
             "lanes.lane_structure": "describe_structure",
             "lanes.run_groups": "RunGroup group_runs prepare_lanes",
-            "lanes.twin_lanes": "LaneEndedError LaneTwin TwinLanes suits_twins",
+            "lanes.twin_lanes": "TwinLanes",
             "life.live_hand": (
-                "GRIP_NS HandCommand HandInForce HandMemory HandReach HandRules SILENCE_NS "
-                "TAKEN advance_hand empty_hand_vector"
+                "GRIP_NS HandCommand HandInForce HandReach HandRules SILENCE_NS TAKEN"
             ),
             "life.own_hand": "HandContext HandProgram HandView OwnHand",
             "life.resting": "REST_RATE_1_S",
             "life.safeguards": "BLEND_S",
             "life.session_life": "HELD_OVERRUN_TICKS",
-            "links.channel": "LOST schedule_deliveries",
+            "links.channel": "LOST",
             "links.delay": (
                 "DelayKind LINK_MODEL_DTYPE LinkModel MAX_DELAY_US TraceEnd draw_pair"
             ),
@@ -343,25 +283,21 @@ else:
                 "ROW_SUM_TOLERANCE dominance find_balancing_weights find_reach "
                 "is_irreducible perron_vector"
             ),
-            "links.link": "AHEAD_LIMIT_NS link_dtype",
+            "links.link": "AHEAD_LIMIT_NS",
+            "links.link_schedule": "LinkSchedule first_ticks",
             "links.philox": "link_key",
             "plug.compiled_law": "compiled plug_law",
             "plug.law_channel": "LawChannel MAX_RECORD_SENT MAX_SENT SentVector",
-            "plug.law_energy": "LawEnergies LawRecords PeerRecords sum_work",
+            "plug.law_energy": "LawEnergies LawRecords PeerRecords",
             "plug.plugged": "compile_to_address list_numbers",
-            "plug.user_law": (
-                "LawContext LawInput PeerView UserLaw UserLawFactory list_remembered "
-                "read_memory"
-            ),
+            "plug.user_law": "LawContext LawInput PeerView UserLaw UserLawFactory",
             "step.compiled_run": "CompiledRun",
             "step.control": "ROBUST_RESIDUE",
             "step.fingerprint": "compute_fingerprint",
             "step.jit": "compiling_notice is_core_cached leaf loop_leaf",
             "step.recorded_ticks": "RecordedRows TickRepeater",
             "step.run_inputs": "RunInputs",
-            "step.site_arrays": (
-                "MAX_CHANGES MAX_LINKS_BYTES MAX_RAMPS SiteArrays links_bytes needed_pages"
-            ),
+            "step.site_arrays": "MAX_CHANGES MAX_LINKS_BYTES MAX_RAMPS SiteArrays links_bytes",
             "step.site_setup": (
                 "ChainSetup Gains Law LinkSetup MotionLimits RestGains Scheme SiteSetup "
                 "StaleAction StaleRule TaskSetup make_layout"
@@ -369,9 +305,9 @@ else:
             "step.site_step": "Site",
             "step.ticks": (
                 "BUCKETS_PER_S CoreChange DominanceRamp LifeAlarm LifeOrder LifeReason "
-                "MAX_ARRIVALS PlantState RELEASE_REASONS TickInput describe_divergence "
-                "describe_mode find_life_reason first_tick_at tick_ns"
+                "MAX_ARRIVALS PlantState RELEASE_REASONS TickInput describe_mode "
+                "first_tick_at tick_ns"
             ),
-            "step.vectors": "Array IntArray Pair Points Row RowArray Vector",
+            "step.vectors": "Array IntArray Pair Points Vector",
         },
     )

@@ -28,7 +28,6 @@ from ..scenario import (
     HandPlayer,
     PlantPlayer,
     Scenario,
-    draw_link_samples,
     make_hand_players,
 )
 
@@ -120,35 +119,6 @@ class FusedRun(CompiledRun):
             plants={i: plants[name] for i, name in enumerate(names) if name in plants},
         )
         self.scenario = scenario
-        # The samples that each site uses in all ticks, computed when they are read.
-        self._used: dict[int, IntArray] = {}
-
-    def read_samples_in_use(self, i: int, count: int) -> IntArray:
-        """Returns which samples a site used in its latest ticks, shape (count, peers).
-
-        A sample is the state that a peer, another site, sent in one of its ticks. The samples
-        follow from the delays of the links alone, so they are computed again and not stored.
-        The run must not repeat a log, because its samples would then arrive as recorded.
-
-        Args:
-            i: Index of the site.
-            count: Number of ticks, at most the number of executed ticks.
-
-        Returns:
-            For each tick of the site, the ticks in which the peers sent the samples. -1 before
-            the first sample of a peer.
-        """
-        stop = self.ticks[i]
-        if i not in self._used or len(self._used[i]) < stop:
-            duration_s = max(self.scenario.duration_s, self.ran_s)
-            name = self.scenario.names[i]
-            rate_hz = self.scenario.sites[name].rate_hz
-            used = [
-                draw_link_samples(link, rate_hz, duration_s)
-                for link in self.scenario.setup(name).links
-            ]
-            self._used[i] = np.stack(used, axis=1)
-        return self._used[i][stop - count : stop]
 
 
 def explain_not_repeatable(log: Log, *, own_laws: bool = False) -> str:

@@ -397,14 +397,14 @@ def _run_twins(
         log: Log of the recorded run, with which the repeated run is compared.
     """
     # Imported here, so that programs that need no twins do not load this code.
-    from ..core import LaneEndedError, suits_twins
+    from ..core import TwinLanes
 
     run = FusedRun(scenario, inputs=inputs)
     has_changes = inputs is not None and bool(inputs.changes)
     count = 1 + len(pushes)
-    if not has_changes and suits_twins(run, count, ticks, LANE_SITE_TICKS):
+    if not has_changes and TwinLanes.suits(run, count, ticks, LANE_SITE_TICKS):
         # If an arm leaves its limits, all runs are executed again, one by one.
-        with suppress(LaneEndedError):
+        with suppress(TwinLanes.EndedError):
             return _LaneTwinRuns(scenario, pushes, ticks, inputs, log).run()
     return _TwinRuns(scenario, pushes, ticks, inputs, log).run()
 
@@ -750,14 +750,14 @@ class _LaneTwinRuns(_TwinRuns):
         record_count: int,
     ) -> list[Any]:
         """Creates the run and its twins (displaced copies), each in a lane of the vectors."""
-        from ..core import LaneTwin, TwinLanes
+        from ..core import TwinLanes
 
         run = FusedRun(scenario, inputs=inputs)
         count = 1 + len(self._pushes)
         self._lanes = TwinLanes(
             run, count=count, ticks=ticks, feed=run.memory.feed, kept=record_count
         )
-        return [LaneTwin(self._lanes, lane) for lane in range(count)]
+        return self._lanes.list_runs()
 
     def _execute_window(self, end_s: float) -> None:
         """Continues a run and its displaced copies (twins), and measures their differences.

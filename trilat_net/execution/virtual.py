@@ -29,7 +29,6 @@ from ..core import (
     PlantState,
     Site,
     TickInput,
-    describe_divergence,
     describe_mode,
 )
 from ..errors import CodeFailed, count_nouns
@@ -155,11 +154,9 @@ class SiteChannels:
 
     def _make_mode_entry(self, output: TickRecord, law_failure: Exception | None) -> SiteEntry:
         """Returns the event of a change of the site's mode, for example after a fault."""
-        if output.mode is Mode.DIVERGED:
-            text = describe_divergence(self._site, output)
-            return self.make_new_event_entry("diverged", text, output.t_ns)
         text = describe_mode(self._site, output, glides=self._glides, law_failure=law_failure)
-        return self.make_new_event_entry("mode", text, output.t_ns)
+        kind = "diverged" if output.mode is Mode.DIVERGED else "mode"
+        return self.make_new_event_entry(kind, text, output.t_ns)
 
     def _exclude_skipped_ticks(self, tick: int, cmd: Sequence[str]) -> None:
         """Excludes the ticks that a site skipped from the counts of missing messages.

@@ -19,7 +19,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from ..core import LawContext, LawEnergies, LawInput, LawRecords, compiled, sum_work
+from ..core import LawContext, LawEnergies, LawInput, LawRecords, compiled
 from ..fields import NotNegative, NotNegativeJoints, Positive, PositiveJoints
 from .conditions import PASSIVE_OUTSIDE, LawSituation, StabilityCondition
 from .interface import ERROR_DAMPING, STIFFNESS, EnergyLaw
@@ -182,7 +182,7 @@ class Tanks(EnergyLaw):
         received_energies = [E_seen[:, j : j + 1] for j in range(len(sent_energies))]
         coupling_torque = seen.tau - seen.memory["carried"]
         # `sum_work` is the work of the controller on the arm; the arm gave the opposite.
-        energy_from_arm = -sum_work(coupling_torque, seen.q)
+        energy_from_arm = -seen.sum_work(coupling_torque)
         dissipated_energy = np.zeros(len(energy_from_arm))
         return LawEnergies(
             gave=sent_energies,

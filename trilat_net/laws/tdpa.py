@@ -29,7 +29,7 @@ from typing import Any, ClassVar, Literal
 
 import numpy as np
 
-from ..core import LawContext, LawEnergies, LawInput, LawRecords, compiled, sum_work
+from ..core import LawContext, LawEnergies, LawInput, LawRecords, compiled
 from ..fields import NotNegative, NotNegativeJoints, Positive
 from .conditions import PASSIVE_OUTSIDE, LawSituation, StabilityCondition
 from .interface import DAMPING, STIFFNESS, EnergyLaw
@@ -907,7 +907,7 @@ class Tdpa(EnergyLaw):
             known_energies = np.hstack([sent["W_led"], sent["W_followed"]])
             observed.append(known_energies)
         coupling_torque = seen.tau - seen.memory["carried"]
-        work = sum_work(coupling_torque, seen.q)
+        work = seen.sum_work(coupling_torque)
         return LawEnergies(
             gave=gave,
             took=took,

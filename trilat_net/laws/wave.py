@@ -49,7 +49,6 @@ from ..core import (
     LawRecords,
     compiled,
     find_balancing_weights,
-    sum_work,
 )
 from ..fields import KeyProblem, NotNegative, NotNegativeJoints, Positive, PositiveJoints
 from .conditions import (
@@ -664,7 +663,7 @@ class Wave(EnergyLaw):
             unused_energies.append(unused)
         coupling_torque = seen.tau - seen.memory["carried"]
         # Work of the controller on the arm; the arm gave the opposite.
-        work = sum_work(coupling_torque, seen.q)
+        work = seen.sum_work(coupling_torque)
         damped = seen.memory["damped"]
         return LawEnergies(
             gave=sent_energies,

@@ -24,7 +24,9 @@ __all__ = [
     "compose_doctor",
     "compose_ping",
     "compose_topic_delays",
+    "describe_energy_obstacle",
     "describe_judgement",
+    "describe_moving_states",
     "err",
     "format_number",
     "print_error",
@@ -67,6 +69,8 @@ if TYPE_CHECKING:
     from .export import Exporter
     from .exports import list_export_formats
     from .figures.registry import FIGURES, figure, write_figures, write_overlay
+    from .linear_text import describe_moving_states
+    from .premise_text import describe_energy_obstacle
     from .rerun_viewer import ViewerOptions, open_rerun
     from .result_text import MARKS, Block, MarkedText, TextTable, compose, format_number
     from .style import FIGURE_FORMATS, REPORT_DPI, write_figure
@@ -90,6 +94,8 @@ else:
             "export": "Exporter",
             "exports": "list_export_formats",
             "figures.registry": "FIGURES figure write_figures write_overlay",
+            "linear_text": "describe_moving_states",
+            "premise_text": "describe_energy_obstacle",
             "rerun_viewer": "ViewerOptions open_rerun",
             "result_text": "Block MARKS MarkedText TextTable compose format_number",
             "style": "FIGURE_FORMATS REPORT_DPI style write_figure",
@@ -113,10 +119,9 @@ register_hooks(
         "head a certificate": "certificate_text:compose_headline",
         "describe a push": "twin_text:describe_push",
         "describe a finding": "finding_text:describe_finding",
+        "describe what roots leave out": "decision_text:describe_left_out",
         "list the sentences of a finding": "finding_text:list_finding_sentences",
         "describe a premise": "premise_text:describe_quantities",
-        "describe missing functionals": "premise_text:describe_missing_functionals",
-        "describe closed groups": "premise_text:describe_closed_groups",
         "name the theorem": "verdict_text:name_theorem",
     },
 )

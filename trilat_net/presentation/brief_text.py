@@ -14,7 +14,7 @@ Invariant:
 
 from collections.abc import Iterator
 
-from ..analysis import Certificate, LogMetrics, Metric, Quantity, quantities
+from ..analysis import Certificate, LogMetrics, Metric, Quantity
 from ..errors import count_nouns
 from .certificate_text import (
     CertificateLine,
@@ -105,7 +105,7 @@ def compose_key_metrics(metrics: LogMetrics) -> Iterator[Block]:
     Args:
         metrics: All metrics of the run.
     """
-    by_key = {quantity.key: quantity for quantity in quantities()}
+    by_key = {quantity.key: quantity for quantity in LogMetrics.list_quantities()}
     rows = []
     for key in _KEY_METRICS:
         row = _make_row(metrics, by_key[key])

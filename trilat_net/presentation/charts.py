@@ -22,15 +22,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ..analysis import (
-    find_mode_intervals,
-    joint_positions_m,
-    list_changes,
-    list_stated_models,
-    measure_delay_distributions,
-    recorded_end_s,
-    site_signals,
-)
+from ..analysis import DelayDistribution, Timeline, joint_positions_m, site_signals
 from ..core import Array
 from ..log import Ints, Log, SiteLog
 from . import plot_signals, style
@@ -119,8 +111,8 @@ class ChartBuilder:
     def __init__(self, log: Log, twin: Log | None) -> None:
         self._log = log
         self._twin = twin
-        self._changes = list_changes(log)
-        self._end_s = recorded_end_s(log)
+        self._timeline = Timeline(log)
+        self._end_s = self._timeline.end_s
         self._tables: list[ColumnTable] = []
         self._has_values: list[list[bool]] = []  # by table and column
         self.leads = trace_leads(log)
@@ -180,11 +172,11 @@ class ChartBuilder:
         for index, site in enumerate(log.sites):
             if len(log[site]):
                 arms.append(self._build_arm(index, site))
-            intervals = find_mode_intervals(log[site])
+            intervals = self._timeline.find_mode_intervals(site)
             spans[site] = [ModeSpan(index, *interval) for interval in intervals]
 
         changes = []
-        for number, applied in enumerate(self._changes, 1):
+        for number, applied in enumerate(self._timeline.changes, 1):
             change = applied.change
             changes.append(MarkedChange(number, change.at_s, applied.site, change.link))
 
@@ -639,8 +631,8 @@ class ChartBuilder:
         lines: list[StatedLine] = []
         for peer in log[site].peers:
             colour = log.sites.index(peer)
-            link_models = list_stated_models(log, f"{peer}->{site}", self._changes)
-            t_s, mean_ms = age_and_lateness.trace_stated_delay(log, link_models)
+            link = f"{peer}->{site}"
+            t_s, mean_ms = age_and_lateness.trace_stated_delay(self._timeline, link)
             # The trace has three points per model: its start, its end, and a gap.
             models = zip(t_s[::3], t_s[1::3], mean_ms[::3], strict=True)
             for start_s, end_s, delay_ms in models:
@@ -664,7 +656,7 @@ class ChartBuilder:
         A curve at x shows the percentage of ages, or of delays, that are at most x ms. The age
         of a message is its delay plus the time until a newer message replaces it.
         """
-        distributions = measure_delay_distributions(self._log)
+        distributions = DelayDistribution.list_of_log(self._log)
         x_ms = age_and_lateness.choose_delay_axis_ms(distributions)
         for site in self._log.sites:
             series = []

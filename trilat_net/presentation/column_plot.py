@@ -24,7 +24,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from ..analysis import recorded_end_s
+from ..analysis import Timeline
 from ..core import Array
 from ..errors import UnknownName, UsageError, suggest_nearest
 from ..log import UNIT_SUFFIXES, Column, Ints, Log
@@ -155,7 +155,7 @@ def _check_interval(
         UsageError: The first time is not before the last time, or the log ends before the first
             time.
     """
-    end_s = recorded_end_s(log)
+    end_s = Timeline(log).end_s
     first_s = 0.0 if from_s is None else float(from_s)
     last_s = end_s if until_s is None else float(until_s)
     if not first_s < last_s:

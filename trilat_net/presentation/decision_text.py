@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterable
 from typing import Any
 
 from ..analysis import EndBehaviour, decision_facts
-from ..errors import count_nouns
+from ..errors import count_nouns, join_words
 from .verdict_text import THEOREM
 
 
@@ -46,7 +46,57 @@ def _describe_roots(roots: decision_facts.LoopRoots) -> str:
     if roots.drifting:
         drift = f"{roots.drifting} of its motions keep their speed, the others "
     rate = f"{drift}{roots.rate_per_s:+.3g} /s"
-    return f"this rest: {roots.verdict}, {rate}{omega}{roots.span}"
+    return f"this rest: {roots.verdict}, {rate}{omega}{_describe_span(roots)}"
+
+
+def _describe_span(roots: decision_facts.LoopRoots) -> str:
+    """Returns a clause on the ticks and delays over which the roots were computed."""
+    if roots.is_continuous:
+        ages = ", of the mean ages" if roots.has_mean_ages else ""
+        return f", in continuous time{ages}"
+    return describe_tick_span(roots.span_s, roots.deviation_per_s, repeats=roots.repeats)
+
+
+def describe_tick_span(
+    span_s: float | None, deviation_per_s: float | None, *, repeats: bool
+) -> str:
+    """Returns a clause on the time for which the roots of a sampled loop were computed.
+
+    If the controllers compute in ticks (periods of the control loop) that are not all alike,
+    the roots belong to a span of several ticks.
+
+    Args:
+        span_s: The time, in s. None if all ticks are alike.
+        deviation_per_s: Uncertainty of the rate due to delays that do not repeat, in 1/s. None
+            if they nearly repeat.
+        repeats: True if the delays repeat after this time.
+
+    Returns:
+        The clause, with a leading comma. Empty if all ticks are alike.
+    """
+    if span_s is None:
+        return ""
+    if repeats:
+        return f", over the period of {span_s:.6g} s"
+    if deviation_per_s is None:
+        return f", over {span_s:.6g} s, after which the delays nearly repeat"
+    return f", over {span_s:.4g} s of the delays in use, +- {deviation_per_s:.1g} /s"
+
+
+def describe_left_out(roots: decision_facts.LoopRoots) -> str:
+    """Returns a phrase about the programs whose reaction the linear analysis leaves out.
+
+    A program that moves an arm can be any code, which cannot be linearised. The phrase is empty
+    if there is no such program.
+
+    Args:
+        roots: The roots of the loop.
+    """
+    if not roots.programs:
+        return ""
+    if len(roots.programs) == 1:
+        return f"how the program at {roots.programs[0]} reacts to the arms"
+    return f"how the programs at {join_words(roots.programs)} react to the arms"
 
 
 def _describe_root_basis(roots: decision_facts.LoopRoots) -> str:

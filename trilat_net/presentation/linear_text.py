@@ -11,23 +11,15 @@ Invariant:
 """
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from itertools import chain
 
 import numpy as np
 
-from ..analysis import (
-    QUOTED_AT_HZ,
-    EdgeScan,
-    FrequencyBand,
-    LinearAnalysis,
-    Passivity,
-    PortAnalysis,
-    Transparency,
-    TwoPort,
-)
+from ..analysis import QUOTED_AT_HZ, LinearAnalysis, Passivity, PortAnalysis, TwoPort
 from ..core import Array
 from ..errors import count_nouns
+from .decision_text import describe_tick_span
 from .result_text import Block, MarkedText, TextTable
 
 _COLOURS = {"stable": "green", "unstable": "red", "at the edge": "yellow"}
@@ -58,24 +50,27 @@ def compose_linear(analysis: LinearAnalysis) -> Iterator[Block]:
     yield from (f"note: {note}" for note in analysis.notes)
     if analysis.ports is not None:
         yield from describe_ports(analysis.ports)
-    yield from (_describe_scan(scan, analysis.scenario.name) for scan in analysis.scans)
+    yield from _describe_scans(analysis)
 
 
-def _describe_scan(scan: EdgeScan, name: str) -> str:
-    """Returns a line with the values of a setting at which the loop becomes stable or unstable.
+def _describe_scans(analysis: LinearAnalysis) -> Iterator[str]:
+    """Yields lines with the values of settings at which the loop becomes stable or unstable.
 
     An example is "control.Kd from 0 to 10: stable from 1.2 on (3.4 rad/s)".
 
     Args:
-        scan: Result of a scan of the setting's values.
-        name: Name of the scenario.
+        analysis: The analysis, with a scan of the values of each setting.
     """
-    edge_texts = []
-    for edge in scan.edges:
-        state = "stable" if edge.stable_above else "unstable"
-        edge_texts.append(f"{state} from {edge.value:.6g} on ({edge.omega_rad_s:.4g} rad/s)")
-    result = ", ".join(edge_texts) or f"stability of {name} does not change"
-    return f"{scan.key} from {scan.low:g} to {scan.high:g}: {result}"
+    for scan in analysis.scans:
+        edge_texts = []
+        for edge in scan.edges:
+            state = "stable" if edge.stable_above else "unstable"
+            edge_texts.append(
+                f"{state} from {edge.value:.6g} on ({edge.omega_rad_s:.4g} rad/s)"
+            )
+        unchanged = f"stability of {analysis.scenario.name} does not change"
+        result = ", ".join(edge_texts) or unchanged
+        yield f"{scan.key} from {scan.low:g} to {scan.high:g}: {result}"
 
 
 def describe_equilibrium(analysis: LinearAnalysis) -> Iterator[str]:
@@ -179,13 +174,30 @@ def tabulate_roots(analysis: LinearAnalysis) -> TextTable:
             row += ["same", "same"]
         elif sampled is not None:
             row += [f"{sampled.s.real:.4g}", f"{sampled.s.imag:.4g}"]
-        rows.append([*row, root.description])
+        rows.append([*row, describe_moving_states(root.states)])
 
     heads = ["re 1/s", "im rad/s", "Hz", "damping", "modes"]
     if has_sampled_columns:
         heads += ["re as computed", "im as computed"]
     heads.append("what moves")
     return TextTable(heads, rows, align="r" * (len(heads) - 1) + "l")
+
+
+def describe_moving_states(states: Sequence[str]) -> str:
+    """Returns the states of a loop that move together, grouped by site.
+
+    Sites with the same state share a phrase: "q2 of m1, m2, s" stands for the second joint
+    angle of three sites.
+
+    Args:
+        states: Names of the states, each after the name of its site, such as "m1.q2".
+    """
+    sites: dict[str, list[str]] = {}
+    for state in states:
+        site, _, name = state.partition(".")
+        sites.setdefault(name, []).append(site)
+    phrases = [f"{name} of {', '.join(sorted(owners))}" for name, owners in sites.items()]
+    return "; ".join(phrases)
 
 
 def describe_zero_roots(analysis: LinearAnalysis) -> str:
@@ -240,8 +252,11 @@ def describe_linear_verdict(analysis: LinearAnalysis) -> str:
         growth += f" at {rightmost.s.imag:.4g} rad/s"
     is_of_sampled_loop = analysis.sampled is not None
     if is_of_sampled_loop:
-        # If ticks differ, the basis is a phrase such as ", over the period of 0.05 s".
-        ticks = analysis.decisive.basis.removeprefix(",") or " tick by tick"
+        spectrum = analysis.decisive
+        span = describe_tick_span(
+            spectrum.span_s, spectrum.deviation_per_s, repeats=spectrum.is_exact
+        )
+        ticks = span.removeprefix(",") or " tick by tick"
         growth += f", as computed{ticks}"
 
     motion = "the slowest motion"
@@ -300,9 +315,7 @@ def describe_ports(ports: PortAnalysis) -> list[str]:
         )
         return lines
 
-    for transparency in ports.transparency:
-        lines.append(f"  {_describe_transparency(ports, transparency)}")
-    return lines
+    return [*lines, *_describe_transparency(ports)]
 
 
 def _describe_conditions(ports: PortAnalysis) -> list[str]:
@@ -403,9 +416,9 @@ def _describe_passivity(passivity: Passivity, unit: str = "", kind: str = "") ->
     return f"{text}; adding {damping} at each {kind} would make it passive"
 
 
-def _list_bands(bands: tuple[FrequencyBand, ...]) -> str:
+def _list_bands(bands: Sequence[tuple[float, float]]) -> str:
     """Returns frequency bands as text, at most `_MAX_BANDS` of them."""
-    ranges = [f"{band.from_hz:.3g}-{band.to_hz:.3g}" for band in bands[:_MAX_BANDS]]
+    ranges = [f"{from_hz:.3g}-{to_hz:.3g}" for from_hz, to_hz in bands[:_MAX_BANDS]]
     text = f"at {', '.join(ranges)} Hz"
     if len(bands) > _MAX_BANDS:
         text += f" and {count_nouns(len(bands) - _MAX_BANDS, 'range')} more"
@@ -494,20 +507,21 @@ def _describe_failing(ports: PortAnalysis, group: list[TwoPort]) -> str:
     return f"{subject}: fails {frequencies}; {least}"
 
 
-def _describe_transparency(ports: PortAnalysis, transparency: Transparency) -> str:
-    """Returns a sentence about the impedance that an operator feels at an arm.
+def _describe_transparency(ports: PortAnalysis) -> Iterator[str]:
+    """Yields a sentence about the impedance that an operator feels along each joint.
 
     The impedance (force over velocity) is stated while the other arm can move freely, and while
     the other arm is clamped. The larger the ratio of the two, the better the operator can feel
     what the other arm touches.
     """
-    unit = ports.impedance_unit(transparency.joint)
-    port_name = ports.name_port(transparency.joint)
-    free, clamped = transparency.interpolate_magnitudes(QUOTED_AT_HZ)
-    low_hz, high_hz = transparency.band_hz
-    return (
-        f"{transparency.operator_site} feels of {transparency.other_site}, {port_name}: "
-        f"{free:.4g} {unit} free and {clamped:.4g} clamped at {QUOTED_AT_HZ:g} Hz; "
-        f"over {low_hz:g}-{high_hz:g} Hz the ratio is {transparency.ratio_db:.3g} dB, "
-        f"the difference {transparency.difference_nm_s_rad:.3g} {unit}"
-    )
+    for transparency in ports.transparency:
+        unit = ports.impedance_unit(transparency.joint)
+        port_name = ports.name_port(transparency.joint)
+        free, clamped = transparency.interpolate_magnitudes(QUOTED_AT_HZ)
+        low_hz, high_hz = transparency.band_hz
+        yield (
+            f"  {transparency.operator_site} feels of {transparency.other_site}, {port_name}: "
+            f"{free:.4g} {unit} free and {clamped:.4g} clamped at {QUOTED_AT_HZ:g} Hz; "
+            f"over {low_hz:g}-{high_hz:g} Hz the ratio is {transparency.ratio_db:.3g} dB, "
+            f"the difference {transparency.difference_nm_s_rad:.3g} {unit}"
+        )

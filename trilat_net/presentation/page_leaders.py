@@ -16,7 +16,7 @@ from typing import NamedTuple
 import numpy as np
 from markupsafe import Markup
 
-from ..analysis import list_ramps, recorded_end_s, trace_dominance
+from ..analysis import DominanceHistory, DominancePlan, Timeline
 from ..core import Array
 from ..errors import join_words
 from ..log import Log
@@ -107,18 +107,17 @@ def _trace_lead(log: Log, slave: str) -> _Lead:
     The points are those at which the slopes of the weights change. Straight lines between the
     points therefore show the weights at all times.
     """
-    end_s = recorded_end_s(log)
-    _, ramps = list_ramps(log, slave)
+    end_s = Timeline(log).end_s
 
     # Candidates: equal steps, and the start and the end of each ramp. A point just before the
     # start shows a jump as a vertical line.
     times_s = [np.linspace(0.0, end_s, _INSTANTS)]
-    for ramp in ramps:
+    for ramp in DominancePlan.of_log(log, slave).ramps:
         start_s = ramp.start_ns * 1e-9
         times_s.append(np.array([start_s - _STEP_S, start_s, ramp.end_ns * 1e-9]))
     t_s = np.unique(np.clip(np.concatenate(times_s), 0.0, end_s))
 
-    factors = trace_dominance(log, slave, t_s).alpha
+    factors = DominanceHistory.of_log(log, slave, t_s).alpha
     followed = np.flatnonzero(factors.max(axis=0) > 0.0)
     peers = [log.scenario.peers(slave)[index] for index in followed]
     factors_of_followed = factors[:, followed]
@@ -249,7 +248,7 @@ def _render_bar(log: Log, lead: _Lead) -> Markup:
     The areas of the peers are stacked. The height of an area is the weight of its peer, and the
     areas together fill the bar.
     """
-    end_s = recorded_end_s(log)
+    end_s = Timeline(log).end_s
     tops = 1.0 - np.cumsum(lead.shares, axis=1)
     bottoms = tops + lead.shares
     peers = []

@@ -25,7 +25,7 @@ from ..analysis import (
     JointError,
     RunView,
     Stability,
-    list_alarms,
+    Timeline,
     measure_undelayed_error,
 )
 from ..errors import count_nouns, join_words
@@ -411,7 +411,7 @@ def render_alarms(log: Log) -> Markup:
     Returns:
         HTML of the list. Empty if there were no alarms.
     """
-    alarms = list_alarms(log)
+    alarms = Timeline(log).alarms
     if not alarms:
         return Markup()
 

@@ -16,7 +16,7 @@ from typing import NamedTuple
 import numpy as np
 from markupsafe import Markup
 
-from ..analysis import Bools, find_mode_intervals, list_alarms, recorded_end_s
+from ..analysis import Bools, Timeline
 from ..core import Array
 from ..errors import count_nouns, join_words
 from ..log import Log
@@ -121,7 +121,7 @@ def list_moments(log: Log, facts: JsonObject) -> list[_RunMoment]:
         *_list_modes(log),
         *_list_hands(log),
         *_list_errors(log, facts),
-        _RunMoment(recorded_end_s(log), "The record ends."),
+        _RunMoment(Timeline(log).end_s, "The record ends."),
     ]
     return sorted(moments, key=lambda moment: moment.t_s)
 
@@ -248,15 +248,15 @@ def _list_modes(log: Log) -> Iterator[_RunMoment]:
     The sentence contains the reason if there was an alarm. Arms that did the same at the same
     time share a sentence.
     """
-    alarms_by_start = {(alarm.site, alarm.from_s): alarm for alarm in list_alarms(log)}
-    end_s = recorded_end_s(log)
+    timeline = Timeline(log)
+    alarms_by_start = {(alarm.site, alarm.from_s): alarm for alarm in timeline.alarms}
     sites_by_moment: dict[tuple[float, str], list[str]] = {}
     alarming_moments = set()
     for site in log.sites:
-        for mode, from_s, to_s in find_mode_intervals(log[site]):
+        for mode, from_s, to_s in timeline.find_mode_intervals(site):
             alarm = alarms_by_start.get((site, from_s))
             reason = "" if alarm is None else f" ({alarm.word}: {alarm.reason})"
-            end_text = "to the end" if to_s >= end_s else f"until {to_s:.3f} s"
+            end_text = "to the end" if to_s >= timeline.end_s else f"until {to_s:.3f} s"
             text = f"{_DID.get(mode, mode)} {end_text}{reason}"
 
             moment = (from_s, text)

@@ -13,7 +13,7 @@ Invariant:
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
-from ..analysis import find_missing_functionals, premise_quantities
+from ..analysis import RunningEnergy, premise_quantities
 from ..errors import count_nouns
 from ..scenario import Scenario
 
@@ -63,7 +63,27 @@ def explain_no_functional(scenario: Scenario) -> str:
         The names of these arms' sites and the reasons, separated by semicolons. Empty if the
         energy exists for every arm.
     """
-    return describe_missing_functionals(find_missing_functionals(scenario))
+    return describe_missing_functionals(
+        premise_quantities.MissingFunctional.list_of_scenario(scenario)
+    )
+
+
+def describe_energy_obstacle(energy: RunningEnergy) -> str:
+    """Explains why the energy function V of a running session cannot be computed.
+
+    Args:
+        energy: The energy of the session.
+
+    Returns:
+        The reason, for a live display. Empty if V can be computed.
+    """
+    if energy.missing:
+        return describe_missing_functionals(energy.missing)
+    if energy.degrades:
+        return "shares change when a peer is lost: `trilat certify` computes V"
+    if energy.closed_groups:
+        return describe_closed_groups(energy.closed_groups)
+    return ""
 
 
 def describe_missing_functionals(

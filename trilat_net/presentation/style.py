@@ -34,7 +34,7 @@ from matplotlib.lines import Line2D
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 from numpy.typing import NDArray
 
-from ..analysis import find_mode_intervals, list_changes, recorded_end_s
+from ..analysis import Timeline
 from ..core import Array
 from ..files import write_whole
 from ..log import Ints, Log, SiteLog
@@ -736,9 +736,10 @@ class TimeFigure:
         self.log = log
         self.figure = figure
         self._small_pt = form.small_pt
-        self._interval_s = interval_s or (0.0, recorded_end_s(log))
+        timeline = Timeline(log)
+        self._interval_s = interval_s or (0.0, timeline.end_s)
 
-        shown_changes = list_changes(log)
+        shown_changes = timeline.changes
         if interval_s is not None:
             # Numbers of other changes would be drawn beside the panels.
             first_s, last_s = interval_s
@@ -746,7 +747,7 @@ class TimeFigure:
                 applied for applied in shown_changes if first_s <= applied.change.at_s <= last_s
             ]
         self._changes = list(enumerate(shown_changes, 1))
-        self._modes = {site: find_mode_intervals(log[site]) for site in log.sites}
+        self._modes = {site: timeline.find_mode_intervals(site) for site in log.sites}
 
     def trace(
         self, axes: Axes, site: str, values: Array, width: float | None = None, **options: Any

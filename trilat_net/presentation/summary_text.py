@@ -22,18 +22,13 @@ from itertools import groupby
 from typing import Any
 
 from ..analysis import (
-    FrequencyResponse,
     LogMetrics,
     Metric,
     Quantity,
     RunView,
-    StatedModel,
-    find_mode_intervals,
+    Timeline,
     link_summary,
-    list_alarms,
-    list_changes,
     measure_undelayed_error,
-    quantities,
 )
 from ..errors import count_nouns
 from ..execution import LogCheckReport, Rerun
@@ -92,7 +87,7 @@ def format_run_lines(log: Log) -> list[str]:
         LogError: A record names a change that does not exist in the log.
     """
     return [
-        *_limit_lines([f"*** {alarm}" for alarm in list_alarms(log)]),
+        *_limit_lines([f"*** {alarm}" for alarm in Timeline(log).alarms]),
         *format_outside_lines(log),
         *format_link_lines(log),
         *_format_change_lines(log),
@@ -136,13 +131,13 @@ def format_link_lines(log: Log) -> list[str]:
         The lines. Empty if all links have a constant delay and no losses.
     """
     lines = []
-    for link in link_summary.summarise_links(log):
+    for link in link_summary.LinkSummary.list_of_log(log):
         if link.plain:
             continue
-        is_measured = any(model.link.measured for model in link.stated)
+        is_measured = any(model.link.measured for model in link.stated.models)
         origin = "" if is_measured else "stated "
 
-        clauses = [f"link {link.name}: {origin}{_format_stated_models(link.stated)}"]
+        clauses = [f"link {link.name}: {origin}{_format_stated_models(link)}"]
         if link.one_way_us is not None and is_measured:
             clauses.append(f"one way {_format_spread(link.one_way_us, 1e-3)}")
         if link.age_ms is None:
@@ -165,7 +160,7 @@ def _format_change_lines(log: Log) -> list[str]:
         log: Log of the run.
     """
     lines = []
-    for change in list_changes(log):
+    for change in Timeline(log).changes:
         tick = change.taken_at_tick
         origin = "by the scenario" if tick is None else f"applied at tick {tick}"
         lines.append(f"change: {change.sentence} ({origin})")
@@ -181,9 +176,10 @@ def _format_mode_lines(log: Log) -> list[str]:
     Args:
         log: Log of the run.
     """
+    timeline = Timeline(log)
     lines = []
     for site in log.sites:
-        intervals = find_mode_intervals(log[site])
+        intervals = timeline.find_mode_intervals(site)
         if not intervals:
             continue
         phrases = []
@@ -207,22 +203,22 @@ def format_clock_lines(log: Log) -> list[str]:
     lines = []
     for site in log.sites:
         for peer in log[site].peers:
-            clock = link_summary.summarise_clock(log, peer, site)
+            clock = link_summary.ClockSummary.of_link(log, peer, site)
             if clock is not None and not clock.shared:
                 lines.append(f"clock of {peer} seen by {site}: {_format_clock(clock)}")
     return _limit_lines(lines)
 
 
-def _format_stated_models(states: Sequence[StatedModel]) -> str:
+def _format_stated_models(summary: link_summary.LinkSummary) -> str:
     """Returns how a link delays and loses messages during a run, as its scenario states.
 
     For example: "constant 400 ms, then constant 800 ms from 5 s on".
 
     Args:
-        states: Delay models of the link, in the order of time. If there are more than three,
-            only the first and the last are described, with the number of changes between them.
+        summary: Summary of the link. If the link had more than three delay models, only the
+            first and the last are described, with the number of changes between them.
     """
-    first_model, *later_models = states
+    first_model, *later_models = summary.stated.models
     phrases = [first_model.link.describe()]
     if len(later_models) > 2:
         phrases.append(f"{count_nouns(len(later_models) - 1, 'change')}")
@@ -764,7 +760,9 @@ def compose_metrics(metrics: LogMetrics) -> Iterator[Block]:
         metrics: The metrics of the run.
     """
     reasons: dict[str, list[str]] = {}
-    tables = groupby(quantities(), key=lambda quantity: (quantity.group, quantity.of))
+    tables = groupby(
+        LogMetrics.list_quantities(), key=lambda quantity: (quantity.group, quantity.of)
+    )
     for (group, _), group_quantities in tables:
         yield from _compose_group(group, list(group_quantities), metrics, reasons)
     yield from _compose_sharing(metrics)
@@ -925,31 +923,22 @@ def _compose_impedance(metrics: LogMetrics) -> Iterator[Block]:
         axis = f"{direction} {metrics.label(response.joint)}"
         title = f"{response.kind}{source_text} at {response.at}, {axis}"
         unit = metrics.unit(response.unit, response.joint)
-        listed_ratios: Sequence[FrequencyResponse] = [response.ratio]
-        if len(response.spectrum) > 1:
-            # Every step-th ratio is listed. The step is rounded up, so that at most
-            # _MAX_FREQUENCIES ratios are listed.
-            step = math.ceil(len(response.spectrum) / _MAX_FREQUENCIES)
-            listed_ratios = response.spectrum[::step]
-        for index, ratio in enumerate(listed_ratios):
+        listed_ratios = response.spectrum if len(response.spectrum) > 1 else [response.ratio]
+        # Every step-th ratio is listed. The step is rounded up, so that at most
+        # _MAX_FREQUENCIES ratios are listed.
+        step = math.ceil(len(listed_ratios) / _MAX_FREQUENCIES)
+        for index, ratio in enumerate(listed_ratios[::step]):
             shown_title = title if index == 0 else ""
-            rows.append([shown_title, unit, *_list_response_cells(ratio)])
+            # If the ratio could not be estimated, the last cell has the reason.
+            cells = ["", "", "", "", ratio.why]
+            if ratio.gain is not None:
+                numbers = (ratio.frequency_hz, ratio.gain, ratio.phase_rad, ratio.coherence)
+                cells = [_format_value(number or 0.0) for number in numbers]
+                error = _NO_NUMBER if ratio.error is None else f"{100.0 * ratio.error:.1g} %"
+                cells.append(f"+- {error}")
+            rows.append([shown_title, unit, *cells])
     headers = ["felt over frequency", "", "Hz", "gain", "phase rad", "coherence", ""]
     yield from _tabulate(headers, rows, text_columns=2)
-
-
-def _list_response_cells(ratio: FrequencyResponse) -> list[str]:
-    """Returns the table cells of one frequency: frequency, gain, phase, coherence and error.
-
-    If the ratio could not be estimated, the last cell contains the reason, and the others are
-    empty.
-    """
-    if ratio.gain is None:
-        return ["", "", "", "", ratio.why]
-    numbers = (ratio.frequency_hz, ratio.gain, ratio.phase_rad, ratio.coherence)
-    cells = [_format_value(number or 0.0) for number in numbers]
-    error = _NO_NUMBER if ratio.error is None else f"{100.0 * ratio.error:.1g} %"
-    return [*cells, f"+- {error}"]
 
 
 def _apply_any(metrics: Iterable[Metric]) -> bool:

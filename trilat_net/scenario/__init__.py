@@ -49,11 +49,8 @@ __all__ = [
     # Links and delays
     "ConstantDelay",
     "LinkBase",
-    "LinkSchedule",
     "PictureDelay",
-    "draw_link_samples",
     "draw_used_samples",
-    "first_ticks",
     # Operators and environments
     "FAILED_HAND",
     "POLICY",
@@ -134,13 +131,7 @@ if TYPE_CHECKING:
     from .own_plant import OwnPlant
     from .plant_player import PlantContext, PlantPlayer, make_plant_players
     from .run_changes import LinkTables, parse_core_change, resolve_change
-    from .sample_uses import (
-        LinkSchedule,
-        PictureDelay,
-        draw_link_samples,
-        draw_used_samples,
-        first_ticks,
-    )
+    from .sample_uses import PictureDelay, draw_used_samples
     from .scenario_reader import (
         ExperimentText,
         embedded_names_reader,
@@ -184,9 +175,7 @@ else:
             "own_plant": "OwnPlant",
             "plant_player": "PlantContext PlantPlayer make_plant_players",
             "run_changes": "LinkTables parse_core_change resolve_change",
-            "sample_uses": (
-                "LinkSchedule PictureDelay draw_link_samples draw_used_samples first_ticks"
-            ),
+            "sample_uses": "PictureDelay draw_used_samples",
             "scenario_reader": (
                 "ExperimentText embedded_names_reader list_shipped load_scenario "
                 "parse_embedded parse_scenario read_template reseed_scenario"

@@ -28,24 +28,18 @@ from .. import fields
 from ..core import (
     ArmLinks,
     Array,
+    ChainDynamics,
     ChainJoint,
     ChainSetup,
+    FramePose,
     Gains,
     HandReach,
     Law,
     MotionLimits,
     RestGains,
-    RowArray,
     TaskSetup,
     Three,
     Vector,
-    apply,
-    build_chain,
-    mass_matrix,
-    multiply,
-    place_end_effector,
-    place_joints,
-    relative_rotation,
     rotation_matrix,
     theta_from_links,
 )
@@ -390,14 +384,20 @@ class ArmModel(NamedTuple):
             x = l1 * math.cos(upper_arm) + l2 * math.cos(forearm)
             y = l1 * math.sin(upper_arm) + l2 * math.sin(forearm)
             return [x, y]
-        return list(place_end_effector(self._place_links(q), np.array(self.chain.tip_m)))
+        position, _ = self._place_end_effector(q)
+        coordinates: list[float] = position.tolist()
+        return coordinates
 
-    def _place_links(self, q: Vector | Array) -> RowArray:
-        """Returns the data of a chain's joints, with all links placed at the angles `q`."""
+    @property
+    def _dynamics(self) -> ChainDynamics:
+        """Dynamics and kinematics of the chain."""
         assert self.chain is not None
-        rows = build_chain(self.chain.joints)
-        place_joints(rows, np.asarray(q, dtype=np.float64))
-        return rows
+        return ChainDynamics(self.chain, self.theta)
+
+    def _place_end_effector(self, q: Vector) -> tuple[Array, Array]:
+        """Returns the end effector's position, shape (3,), and its Jacobian, shape (6, n)."""
+        position, J, _ = self._dynamics.place(np.array([q], dtype=np.float64))
+        return position[0], J[0]
 
     def end_effector_orientation(self, q: Vector) -> tuple[float, float, float]:
         """Returns the orientation of the end effector at the joint angles `q`.
@@ -410,10 +410,7 @@ class ArmModel(NamedTuple):
         """
         if self.chain is None:
             return 0.0, 0.0, q[0] + q[1]
-        rows = self._place_links(q)
-        # This call computes R_base, the rotation from the base to each link.
-        place_end_effector(rows, np.array(self.chain.tip_m))
-        return relative_rotation(rows[-1]["R_base"], np.array(self.chain.tip_rotation).T)
+        return self._dynamics.find_orientation(q)
 
     @property
     def reach(self) -> HandReach:
@@ -501,10 +498,9 @@ class ArmModel(NamedTuple):
         """
         assert self.chain is not None
         assert self.chain.task is not None
-        rows = self._place_links(q)
-        place_end_effector(rows, np.array(self.chain.tip_m))
-        J = np.hstack([self.chain.task.scale * rows["J_lin"], rows["J_ang"]]).T
-        return J[: self.counts.shared]
+        _, J = self._place_end_effector(q)
+        task_J = np.vstack([self.chain.task.scale * J[:3], J[3:]])
+        return task_J[: self.counts.shared]
 
     def largest_gravity(self, g_m_s2: float) -> tuple[float, ...]:
         """Returns the largest torques that gravity can exert on the joints of the planar arm.
@@ -533,12 +529,7 @@ class ArmModel(NamedTuple):
         Returns:
             The symmetric matrix, shape (n, n), in kg m^2 for rotating joints.
         """
-        rows = self._place_links(q)
-        mass_matrix(rows, self.theta)
-        # The kernel computes only the lower triangle of the symmetric matrix.
-        lower = np.tril(rows["M"])
-        M: Array = lower + np.tril(lower, -1).T
-        return M
+        return self._dynamics.find_inertia(q)
 
     def compute_rest_gains(
         self,
@@ -772,15 +763,13 @@ def _place_base(
     R_x = rotation_matrix((roll, 0.0, 0.0))
     R_y = rotation_matrix((0.0, pitch, 0.0))
     R_z = rotation_matrix((0.0, 0.0, yaw))
-    base = multiply(R_z, multiply(R_y, R_x))
-    first = joints[0]
+    turn = FramePose(R_z) @ (FramePose(R_y) @ FramePose(R_x))
     x, y, z = arm.base_xyz_m
-    turned = apply(base, first.origin_m)
-    placed = first._replace(
-        rotation=multiply(base, first.rotation),
-        origin_m=(turned[0] + x, turned[1] + y, turned[2] + z),
-    )
-    return (placed, *joints[1:]), apply(base, gravity)
+    base = FramePose(turn.rotation, (x, y, z))
+    first = joints[0]
+    pose = base @ FramePose(first.rotation, first.origin_m)
+    placed = first._replace(rotation=pose.rotation, origin_m=pose.origin_m)
+    return (placed, *joints[1:]), base.turn(gravity)
 
 
 def _build_chain_model(arm: Arm, task: Task, urdf_chain: UrdfChain) -> ArmModel:

@@ -22,12 +22,9 @@ import numpy as np
 from ..core import (
     REST_RATE_1_S,
     Array,
+    ChainDynamics,
     Law,
     SiteSetup,
-    build_chain,
-    inverse_dynamics,
-    place_joints,
-    propagate_motion,
     theta_from_links,
 )
 from .arms import Arm, ArmModel
@@ -252,38 +249,22 @@ def _sample_chain(model: ArmModel, q0: Array, speed: Array) -> _ArmSamples:
         speed: Speed of each joint, in rad/s, shape (n,).
     """
     assert model.chain is not None
-    gravity = np.array(model.chain.gravity_m_s2)
     frictionless = [joint._replace(viscous=0.0, coulomb=0.0) for joint in model.chain.joints]
-    rows = build_chain(frictionless)
-    joints = len(q0)
-    still = np.zeros(joints)
-    velocities = speed * _list_patterns(joints)
-
-    def compute_torque(v: Array) -> Array:
-        """Returns the torque that gravity and Coriolis forces require in a pose, in N m.
-
-        The pose is that for which the chain was placed most recently.
-
-        Args:
-            v: Joint velocities, in rad/s, shape (n,). The joints do not accelerate.
-        """
-        torque = np.zeros(joints)
-        propagate_motion(chain=rows, gravity=gravity, qd=v, v=v, a=still)
-        inverse_dynamics(chain=rows, theta=model.theta, v=v, a=still, torque=torque)
-        return torque
+    dynamics = ChainDynamics(model.chain._replace(joints=tuple(frictionless)), model.theta)
+    # The first motion is none at all, so that its torque is that of gravity.
+    velocities = np.vstack([np.zeros(len(q0)), speed * _list_patterns(len(q0))])
+    still = np.zeros_like(velocities)
 
     inertias = []
     gravity_torques = []
     coriolis_torques = []
     for q in _draw_poses(model, q0):
         inertias.append(model.inertia(q))
-        place_joints(rows, q)
-        G = compute_torque(still)
-        coriolis = np.zeros(joints)
-        for v in velocities:
-            coriolis = np.maximum(coriolis, np.abs(compute_torque(v) - G))
+        poses = np.tile(q, (len(velocities), 1))
+        torques = dynamics.compute_torque(poses, qd=velocities, v=velocities, a=still)
+        G = torques[0]
         gravity_torques.append(np.abs(G))
-        coriolis_torques.append(coriolis)
+        coriolis_torques.append(np.abs(torques - G).max(axis=0))
     return _ArmSamples(
         M=np.array(inertias),
         G=np.array(gravity_torques),

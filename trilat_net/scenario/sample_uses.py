@@ -6,142 +6,19 @@ the experiment. They can therefore be drawn again. For example, a report can sho
 saw although the log does not contain it.
 
 Invariant:
-    - The random numbers of a connection are the same as in a run.
     - The picture that a user sees depends only on the scenario, its seed and the number of the
       control period.
 """
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping
 from functools import lru_cache
 
 import numpy as np
 
-from ..core import (
-    LINK_MODEL_DTYPE,
-    LOST,
-    IntArray,
-    LinkModel,
-    LinkSetup,
-    Row,
-    link_dtype,
-    link_key,
-    schedule_deliveries,
-)
+from ..core import IntArray, LinkSchedule, LinkSetup, link_key
 from ..records import NS_PER_S
 from .delay_models import LinkBase
 from .scenario_types import Scenario
-
-_BLOCK = 8192
-"""Number of samples that are scheduled at once."""
-
-
-class LinkSchedule:
-    """Computes when each message on a simulated network link should arrive at the receiver.
-
-    Every arm's process sends its state (a sample) once per control period. The arrival times
-    follow from the delays and losses in the description of the experiment, and are computed by
-    the same function as during a run. Each delay model applies to messages that are sent at or
-    after its start time.
-
-    Args:
-        setup: Setup of the link, as the kernel reads it.
-        changed_models: Models of delay and loss that the link gets by changes during the run.
-
-    Attributes:
-        models: All models of the link, in the order of their start times.
-        row: State of the link: a row of the array that the kernel reads.
-    """
-
-    def __init__(self, setup: LinkSetup, changed_models: Sequence[LinkModel] = ()) -> None:
-        points: list[tuple[int, int]] = []
-        models: list[LinkModel] = []
-        for model, trace in zip(setup.models, setup.traces, strict=True):
-            if trace is not None:
-                model = model._replace(trace_first=len(points), trace_count=len(trace))
-                for t_us, delay_us in trace:
-                    points.append((int(t_us), int(delay_us)))
-            models.append(model)
-        models += changed_models
-        # The sort is stable, so if two models have the same start time, the changed model
-        # applies.
-        models.sort(key=lambda model: model.from_ns)
-        self.models = np.array(models, LINK_MODEL_DTYPE)
-        self._points = np.array([*points, *setup.outages], dtype=np.int64).reshape(-1, 2)
-
-        row: Row = np.zeros(1, link_dtype(0))[0]
-        row.rate_hz = setup.rate_hz
-        row.key = setup.key
-        row.models = len(self.models)
-        row.used = -1
-        row.scheduled = -1
-        row.outage_first = len(points)
-        row.outage_count = len(setup.outages)
-        self.row = row
-        self._block = np.empty(_BLOCK, dtype=np.int64)
-
-    def draw(self, end: int) -> IntArray:
-        """Computes when the next messages of the link are due at the receiver.
-
-        The first of these messages is the one after the last message of the previous call.
-
-        Args:
-            end: Number of the sample after the last one.
-
-        Returns:
-            Due times in ns after the epoch, one per sample. A sample that is lost has the value
-            LOST.
-        """
-        first = int(self.row.scheduled) + 1
-        due_ns = np.empty(max(0, end - first), dtype=np.int64)
-        for start in range(first, end, _BLOCK):
-            stop = min(start + _BLOCK, end)
-            schedule_deliveries(
-                sample=stop - 1,
-                link=self.row,
-                models=self.models,
-                dues=self._block,
-                points=self._points,
-            )
-            positions = np.arange(start, stop) % _BLOCK
-            due_ns[start - first : stop - first] = self._block[positions]
-        return due_ns
-
-    def draw_releases(self, end: int, receiver_hz: int) -> tuple[IntArray, IntArray]:
-        """Computes when the next messages of the link are used by the receiver.
-
-        A message is used in the first control period of the receiver that begins at or after
-        its arrival. Lost messages are left out.
-
-        Args:
-            end: Number of the message before which the computation ends.
-            receiver_hz: Rate of the receiver's control loop, in Hz.
-
-        Returns:
-            Two arrays of the same length: the numbers of the messages, and for each the number
-            of the receiver's control period in which it is first used.
-        """
-        samples = np.arange(int(self.row.scheduled) + 1, end)
-        due_ns = self.draw(end)
-        stamp_ns = samples * NS_PER_S // int(self.row.rate_hz)
-        # A sample never comes into use at its own sending time.
-        ticks = first_ticks(np.maximum(due_ns, stamp_ns + 1), receiver_hz)
-        is_delivered = due_ns != LOST
-        return samples[is_delivered], ticks[is_delivered]
-
-
-def first_ticks(due_ns: IntArray, rate_hz: int) -> IntArray:
-    """Returns the first control period of the receiver at or after each delivery time.
-
-    It is `core.ticks.first_tick_at` for an array of times.
-
-    Args:
-        due_ns: Times in ns after the epoch (the common start time).
-        rate_hz: Tick rate, in Hz.
-
-    Returns:
-        Numbers of the ticks, one per time.
-    """
-    return -(-due_ns * rate_hz // NS_PER_S)
 
 
 @lru_cache(maxsize=256)
@@ -172,43 +49,9 @@ def draw_used_samples(
         models=(link.to_core_model(),),
         traces=(link.points,),
     )
-    used = draw_link_samples(setup, receiver_hz, duration_s)
+    used = LinkSchedule(setup).draw_run(receiver_hz, duration_s)
     used.flags.writeable = False
     return used
-
-
-def draw_link_samples(setup: LinkSetup, receiver_hz: int, duration_s: float) -> IntArray:
-    """Computes which message is in use in each control period, for a link with all its changes.
-
-    Args:
-        setup: The link of an arm, with its planned changes and outages, see `Scenario.setup`.
-        receiver_hz: Tick rate of the receiving site, in Hz.
-        duration_s: Duration of the run, in s.
-
-    Returns:
-        Number of the sample in every tick, shape (ticks,). -1 before the first sample.
-    """
-    sent = round(duration_s * setup.rate_hz)
-    samples, releases = LinkSchedule(setup).draw_releases(sent, receiver_hz)
-    ticks = max(2, round(duration_s * receiver_hz))
-    return _list_newest(samples, releases, ticks)
-
-
-def _list_newest(samples: IntArray, releases: IntArray, ticks: int) -> IntArray:
-    """Returns, for each control period, the newest message that has been received by then.
-
-    Args:
-        samples: Numbers of the samples.
-        releases: Tick in which each sample comes into use.
-        ticks: Number of ticks.
-
-    Returns:
-        Numbers of samples, shape (ticks,). -1 before the first sample.
-    """
-    newest = np.full(ticks, -1, dtype=np.int64)
-    is_within = releases < ticks
-    np.maximum.at(newest, releases[is_within], samples[is_within])
-    return np.maximum.accumulate(newest)
 
 
 def count_silences(used: IntArray, receiver_hz: int, silence_ns: int) -> int:
@@ -285,7 +128,9 @@ class PictureDelay:
         Returns:
             Number of the shown sample of each peer. -1 before the first sample.
         """
-        for peer, releases in self._draw_until(tick):
+        for peer, (rate_hz, schedule) in self._links.items():
+            end = self._find_end(tick, rate_hz)
+            releases = schedule.draw_releases(end, self._receiver_hz)
             samples, ticks = np.concatenate((self._waiting[peer], releases), axis=1)
             is_released = ticks <= tick
             self._waiting[peer] = np.stack((samples, ticks))[:, ~is_released]
@@ -308,19 +153,19 @@ class PictureDelay:
             delay of the picture; then the user sees what the controller uses.
         """
         return {
-            peer: _list_newest(samples, releases, ticks)
-            for peer, (samples, releases) in self._draw_until(ticks - 1)
+            peer: schedule.draw_used(
+                self._find_end(ticks - 1, rate_hz), self._receiver_hz, ticks
+            )
+            for peer, (rate_hz, schedule) in self._links.items()
         }
 
-    def _draw_until(self, tick: int) -> Iterator[tuple[str, tuple[IntArray, IntArray]]]:
-        """Yields the states that other arms sent, and the tick from which the user sees each.
+    def _find_end(self, tick: int, rate_hz: int) -> int:
+        """Returns the number of samples that another arm sent before a tick of the site.
 
-        A tick is a control period of this arm.
+        A sample that is sent at the time of the tick itself is not shown yet.
 
         Args:
             tick: Tick of the site.
+            rate_hz: Tick rate of the other arm, in Hz.
         """
-        for peer, (rate_hz, schedule) in self._links.items():
-            # A sample that is sent at the time of the tick itself is not shown yet.
-            end = -(-tick * rate_hz // self._receiver_hz)
-            yield peer, schedule.draw_releases(end, self._receiver_hz)
+        return -(-tick * rate_hz // self._receiver_hz)

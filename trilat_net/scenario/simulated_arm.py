@@ -12,8 +12,7 @@ Invariant:
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..core import Array, build_chain, find_acceleration, place_joints
-from ..records import MAX_JOINTS
+from ..core import Array, ChainDynamics
 from .arms import build_arm
 from .scenario_types import Scenario
 
@@ -52,8 +51,7 @@ class SimulatedArm:
         self.qd = np.array(spec.qd0_rad_s)
         self.chain = model.chain
         self.theta = heavier * model.theta
-        self._joints = build_chain(model.chain.joints, MAX_JOINTS)
-        self._gravity = np.array(model.chain.gravity_m_s2)
+        self._dynamics = ChainDynamics(self.chain, self.theta)
 
     def accelerate(self, torque: ArrayLike) -> Array:
         """Computes the joint accelerations that a torque would cause, without moving the arm.
@@ -64,18 +62,8 @@ class SimulatedArm:
         Returns:
             Accelerations in rad/s^2 or m/s^2, shape (n,).
         """
-        acceleration = np.zeros_like(self.q)
-        place_joints(self._joints, self.q)
-        find_acceleration(
-            chain=self._joints,
-            theta=self.theta,
-            gravity=self._gravity,
-            q=self.q,
-            qd=self.qd,
-            torque=np.asarray(torque, dtype=np.float64),
-            qdd=acceleration,
-        )
-        return acceleration
+        torque_on_joints = np.asarray(torque, dtype=np.float64)
+        return self._dynamics.find_acceleration(self.q, self.qd, torque_on_joints)
 
     def move(self, torque: ArrayLike, period_s: float) -> None:
         """Simulates the motion of the arm for one period under a constant torque.

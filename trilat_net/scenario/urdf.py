@@ -29,7 +29,7 @@ from xml.etree.ElementTree import Element
 
 import numpy as np
 
-from ..core import Matrix, Three, apply, multiply, sincos
+from ..core import FramePose, Matrix, Three
 from ..errors import ScenarioError, count_nouns, suggest_nearest
 from ..fields import MAX_QUANTITY
 from ..records import MAX_JOINTS
@@ -67,12 +67,9 @@ m is the mass and c the centre of mass. The inertia is about the origin of a fra
 """
 
 _ORIGIN: Three = (0.0, 0.0, 0.0)
-_IDENTITY: Matrix = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
 _NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?", re.ASCII)
 _MOVING_KINDS = ("revolute", "continuous", "prismatic")
 _KINDS = (*_MOVING_KINDS, "fixed", "floating", "planar")
-_plain_sincos = getattr(sincos, "py_func", sincos)
-"""The function `sincos` as plain Python. Compiling it takes longer than reading a file."""
 
 
 class UrdfPayload(NamedTuple):
@@ -148,23 +145,6 @@ class UrdfChain(NamedTuple):
     tip_rotation: Matrix
     tip_origin_m: Three
     notes: tuple[str, ...]
-
-
-class _Pose(NamedTuple):
-    """Position and orientation of a coordinate frame, expressed in another frame."""
-
-    rotation: Matrix = _IDENTITY
-    origin_m: Three = _ORIGIN
-
-    def __matmul__(self, inner: "_Pose") -> "_Pose":
-        """Returns the product of two poses, which places one frame inside another.
-
-        The pose `inner` is expressed in the frame of this pose. The result is the same frame,
-        expressed in the frame in which this pose is expressed.
-        """
-        x, y, z = apply(self.rotation, inner.origin_m)
-        ox, oy, oz = self.origin_m
-        return _Pose(multiply(self.rotation, inner.rotation), (ox + x, oy + y, oz + z))
 
 
 class _Edge(NamedTuple):
@@ -277,7 +257,7 @@ def read_urdf(
     notes: list[str] = []
     moved_links: set[str] = set()
     # pose of the current joint in the frame of the previous moving link
-    pose = _Pose()
+    pose = FramePose()
     last_moving = max(n for n, edge in enumerate(path) if edge.moves)
     for n, edge in enumerate(path):
         pose = pose @ _read_origin(edge.element, _joint(edge.name))
@@ -295,7 +275,7 @@ def read_urdf(
             bodies.append(_LinkBody("payload", _read_payload(payload, path[n + 1 :])))
         body = _lump_bodies(edge, bodies, notes)
         joints.append(_read_joint(edge, pose, body, notes))
-        pose = _Pose()
+        pose = FramePose()
 
     _check_supplied_inertias(robot, inertias.links, moved_links)
     return UrdfChain(
@@ -639,7 +619,7 @@ def _find_path(robot: _Robot, base: str, tip: str) -> list[_Edge]:
 
 def _walk_carried(
     robot: _Robot, moving: _Edge, path: Sequence[_Edge], notes: list[str]
-) -> Iterator[tuple[str, _Pose]]:
+) -> Iterator[tuple[str, FramePose]]:
     """Yields all links that move together with one joint, with their poses.
 
     These are the links up to the next moving joint of the arm. Moving joints of a side branch,
@@ -656,7 +636,7 @@ def _walk_carried(
         moves.
     """
     on_path = {edge.name for edge in path}
-    waiting = [(moving.child, _Pose())]
+    waiting = [(moving.child, FramePose())]
     while waiting:
         name, pose = waiting.pop()
         yield name, pose
@@ -673,7 +653,7 @@ def _walk_carried(
 
 def _read_bodies(
     robot: _Robot,
-    carried: Sequence[tuple[str, _Pose]],
+    carried: Sequence[tuple[str, FramePose]],
     path: Sequence[_Edge],
     inertias: _Inertias,
     notes: list[str],
@@ -727,7 +707,7 @@ def _read_bodies(
 
 def _read_body(
     name: str,
-    pose: _Pose,
+    pose: FramePose,
     inertial: "_Inertial",
     path: Sequence[_Edge],
     inertias: _Inertias,
@@ -755,7 +735,7 @@ def _read_body(
     slack = max(LEAST_MOMENT_KG_M2, CONSISTENCY * moments[2])
     problem = _find_moments_problem(moments, -slack, slack)
     if not problem:
-        return _LinkBody(name, _move_body(mass, centre, tensor, pose))
+        return _LinkBody(name, (pose @ centre).place_body(mass, tensor))
 
     if inertias.balance:
         tensor = balance_tensor(tensor)
@@ -763,7 +743,7 @@ def _read_body(
         notes.append(
             f"{_link(name)}: {problem}; balanced to {least:.4g}, {middle:.4g} and {most:.4g}"
         )
-        return _LinkBody(name, _move_body(mass, centre, tensor, pose))
+        return _LinkBody(name, (pose @ centre).place_body(mass, tensor))
     supplied = inertias.links.get(name)
     if supplied is not None and supplied.inertia_kg_m2 is not None:
         raise ScenarioError(problem, path=f"{_key(name)}.inertia_kg_m2")
@@ -771,8 +751,8 @@ def _read_body(
         _refuse(_link(name), f"{problem}; {_advise_balance(name, path)}")
 
     # `_lump_bodies` decides whether the link counts as stated or as a point.
-    stated = _move_body(mass, centre, tensor, pose)
-    point = _move_body(mass, centre, _POINT_TENSOR, pose)
+    stated = (pose @ centre).place_body(mass, tensor)
+    point = (pose @ centre).place_body(mass, _POINT_TENSOR)
     return _LinkBody(name, stated, point, problem)
 
 
@@ -803,7 +783,7 @@ def _note_supplied(name: str, supplied: LinkInertia) -> str:
 
 
 def _read_joint(
-    edge: _Edge, pose: _Pose, inertia: BodyParameters, notes: list[str]
+    edge: _Edge, pose: FramePose, inertia: BodyParameters, notes: list[str]
 ) -> UrdfJoint:
     """Reads a moving joint of the arm from a URDF file: axis, range, friction and moved body.
 
@@ -1007,7 +987,7 @@ def _read_vector(
     return x, y, z
 
 
-def _read_origin(parent: Element, subject: str) -> _Pose:
+def _read_origin(parent: Element, subject: str) -> FramePose:
     """Reads the pose that the XML element <origin> states for a joint or an inertia.
 
     Without this element, the pose is that of the parent element's frame.
@@ -1017,7 +997,7 @@ def _read_origin(parent: Element, subject: str) -> _Pose:
     """
     origin = _child(parent, "origin", subject)
     if origin is None:
-        return _Pose()
+        return FramePose()
     unknown_keys = origin.attrib.keys() - {"xyz", "rpy"}
     if unknown_keys:
         _refuse(
@@ -1029,15 +1009,7 @@ def _read_origin(parent: Element, subject: str) -> _Pose:
     if "xyz" in origin.attrib:
         offset = _read_vector(origin, "xyz", subject, MAX_OFFSET_M)
     angles = _read_vector(origin, "rpy", subject) if "rpy" in origin.attrib else _ORIGIN
-
-    # The rotation is R_z(yaw) R_y(pitch) R_x(roll); s and c are sines and cosines.
-    (sr, cr), (sp, cp), (sy, cy) = map(_plain_sincos, angles)
-    rotation = (
-        (cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr),
-        (sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr),
-        (-sp, cp * sr, cp * cr),
-    )
-    return _Pose(rotation, offset)
+    return FramePose.from_angles(angles, offset)
 
 
 # Inertia
@@ -1055,7 +1027,7 @@ class _Inertial(NamedTuple):
     """
 
     mass: float
-    centre: _Pose
+    centre: FramePose
     tensor: Matrix
     lacks: str
 
@@ -1096,17 +1068,17 @@ def _read_inertial(link: Element, name: str, supplied: LinkInertia | None) -> _I
         return None
 
     mass = supplied.mass_kg
-    centre = _Pose()
+    centre = FramePose()
     tensor = None
     if inertial is not None:
         mass, centre, tensor = _read_stated_inertial(inertial, name, supplied)
     if supplied.inertia_kg_m2 is not None:
         # A supplied tensor has the axes of the link, and not those of the <origin>.
-        centre = _Pose(_IDENTITY, centre.origin_m)
+        centre = FramePose(origin_m=centre.origin_m)
         tensor = fill_tensor(supplied.inertia_kg_m2)
     if supplied.com_m is not None:
         x, y, z = supplied.com_m
-        centre = _Pose(centre.rotation, (x, y, z))
+        centre = FramePose(centre.rotation, (x, y, z))
 
     lacks = ""
     if mass is None:
@@ -1118,7 +1090,7 @@ def _read_inertial(link: Element, name: str, supplied: LinkInertia | None) -> _I
 
 def _read_stated_inertial(
     inertial: Element, name: str, supplied: LinkInertia
-) -> tuple[float | None, _Pose, Matrix | None]:
+) -> tuple[float | None, FramePose, Matrix | None]:
     """Reads the mass, the frame and the inertia tensor from an XML element <inertial>.
 
     Parts that the experiment replaces are not read. Therefore errors in such parts do not
@@ -1143,7 +1115,7 @@ def _read_stated_inertial(
         entries = [_read_number(tensor_element, key, subject) for key in _TENSOR_KEYS]
         tensor = fill_tensor(entries)
     is_frame_replaced = supplied.com_m is not None and supplied.inertia_kg_m2 is not None
-    centre = _Pose() if is_frame_replaced else _read_origin(inertial, subject)
+    centre = FramePose() if is_frame_replaced else _read_origin(inertial, subject)
     return mass, centre, tensor
 
 
@@ -1170,7 +1142,7 @@ def _read_payload(payload: UrdfPayload, fixed: Sequence[_Edge]) -> BodyParameter
     Raises:
         ScenarioError: The moments of inertia of the payload are impossible.
     """
-    pose = _Pose()
+    pose = FramePose()
     for edge in fixed:
         pose = pose @ _read_origin(edge.element, _joint(edge.name))
     tensor = fill_tensor(payload.inertia_kg_m2)
@@ -1180,7 +1152,8 @@ def _read_payload(payload: UrdfPayload, fixed: Sequence[_Edge]) -> BodyParameter
     if problem:
         _refuse("payload", problem)
     x, y, z = payload.com_m
-    return _move_body(payload.mass_kg, _Pose(_IDENTITY, (x, y, z)), tensor, pose)
+    centre = pose @ FramePose(origin_m=(x, y, z))
+    return centre.place_body(payload.mass_kg, tensor)
 
 
 def _principal_moments(tensor: Matrix) -> list[float]:
@@ -1214,40 +1187,6 @@ def _find_moments_problem(moments: Sequence[float], bound: float, slack: float) 
     if largest - smallest - middle > slack:
         return f"{stated}, but no moment of a body exceeds the sum of the other two"
     return ""
-
-
-def _move_body(mass: float, centre: _Pose, tensor: Matrix, pose: _Pose) -> BodyParameters:
-    """Returns the inertial parameters of a body in another frame.
-
-    The tensor I about the centre of mass is rotated, R I R^T, and moved to the origin of the
-    other frame by the parallel axis theorem.
-
-    Args:
-        mass: Mass, in kg.
-        centre: Frame of the centre of mass with the axes of the tensor, in the frame of the
-            link.
-        tensor: Inertia about the centre of mass, in kg m^2.
-        pose: Frame of the link, expressed in the other frame.
-    """
-    # Rows of the rotation R, and the centre of mass in the other frame.
-    (r0, r1, r2), (x, y, z) = pose @ centre
-    # Columns of I R^T. The entries of R I R^T follow row by row.
-    columns = (apply(tensor, r0), apply(tensor, r1), apply(tensor, r2))
-    (xx, xy, xz) = apply(columns, r0)
-    (_, yy, yz) = apply(columns, r1)
-    (_, _, zz) = apply(columns, r2)
-    return (
-        mass,
-        mass * x,
-        mass * y,
-        mass * z,
-        xx + mass * (y * y + z * z),
-        xy - mass * x * y,
-        yy + mass * (x * x + z * z),
-        xz - mass * x * z,
-        yz - mass * y * z,
-        zz + mass * (x * x + y * y),
-    )
 
 
 def _lump_bodies(edge: _Edge, bodies: Sequence[_LinkBody], notes: list[str]) -> BodyParameters:
@@ -1310,9 +1249,7 @@ def _find_sum_problem(total: BodyParameters) -> str:
         )
     x, y, z = (moment / mass for moment in total[1:4])
     # Shifting the tensor with a negative mass expresses it about the centre of mass.
-    about_centre = _move_body(
-        -mass, _Pose(_IDENTITY, (x, y, z)), fill_tensor(total[4:]), _Pose()
-    )
+    about_centre = FramePose(origin_m=(x, y, z)).place_body(-mass, fill_tensor(total[4:]))
     moments = _principal_moments(fill_tensor(about_centre[4:]))
     slack = CONSISTENCY * moments[2]
     return _find_moments_problem(moments, max(LEAST_MOMENT_KG_M2, slack), slack)

@@ -27,7 +27,6 @@ from ..core import (
     Array,
     is_irreducible,
     links_bytes,
-    needed_pages,
 )
 from ..errors import ScenarioError, count_nouns
 from ..fields import TomlTable
@@ -663,7 +662,7 @@ def check_links_memory(scenario: Scenario, site: str) -> None:
         ScenarioError: The limit is exceeded. The error contains the path of the site.
     """
     setup = scenario.setup(site)
-    size_bytes = links_bytes(setup, needed_pages(setup))
+    size_bytes = links_bytes(setup)
     if size_bytes > MAX_LINKS_BYTES:
         raise ScenarioError(
             f"the links of this site would need {size_bytes / 2**20:.0f} MiB, but at most "

@@ -39,13 +39,7 @@ from numpy.typing import NDArray
 from scipy.optimize import least_squares
 from scipy.special import stdtrit
 
-from trilat_net.analysis import (
-    AlignedRecords,
-    Complex,
-    TorqueSplit,
-    align_records,
-    compute_operator_script,
-)
+from trilat_net.analysis import AlignedRecords, Complex, SourceRows, TorqueSplit
 from trilat_net.core import SCRIPTED_KINDS, Array
 from trilat_net.errors import UsageError, count_nouns
 from trilat_net.log import Log, open_log
@@ -248,7 +242,7 @@ def identify_hand(log: Log | str | Path, site: str = "m1") -> HandImpedance:
     scenario = log.scenario
     scenario.find_site(site)
     sines = _find_sines(scenario)
-    records = align_records(log)[site]
+    records = AlignedRecords.by_site(log)[site]
     force, position = _compute_hand_force(records, scenario)
 
     # A segment lasts two periods of the smallest spacing between frequencies (or of the lowest
@@ -392,11 +386,8 @@ def _compute_hand_force(records: AlignedRecords, scenario: Scenario) -> tuple[Ar
     for hand in scenario.sites[records.site].hands:
         operator = hand.actor
         if operator.kind in SCRIPTED_KINDS:
-            scripted_torque += compute_operator_script(
-                operator,
-                records.nominal_s,
-                end_effector.J[0],
-            )
+            script = SourceRows(operator).compute_script(records.nominal_s, end_effector.J[0])
+            scripted_torque += script
 
     hand_torque = split.operator - scripted_torque
     force = end_effector.find_force(hand_torque)

@@ -21,7 +21,7 @@ from trilat_studies.gym_environment import (
 )
 
 import trilat_net as tn
-from trilat_net.analysis.dominance_history import find_program
+from trilat_net.analysis.shared_slave import SharedSlave
 from trilat_net.errors import ScenarioError, UsageError
 from trilat_net.presentation.export import Exporter
 
@@ -122,8 +122,8 @@ def test_saved_episodes_name_a_program_as_mover(tmp_path: Path) -> None:
     log = tn.open_log(env.save(tmp_path / "episode.mcap"))
     (taken,) = [event for event in log.events if event.kind == "hand"]
     assert (taken.member, taken.text) == ("m2", "m2: policy takes hold at t = 0.000 s")
-    assert find_program(log) == "m2"
-    assert find_program(tn.simulate("paper", duration_s=0.1)) == ""
+    assert SharedSlave(log).program == "m2"
+    assert SharedSlave(tn.simulate("paper", duration_s=0.1)).program == ""
 
     summary = Exporter("lerobot", tmp_path / "set").export(log)
     assert "the program is m2 (found in the log)" in summary

@@ -41,20 +41,12 @@ import msgspec
 import numpy as np
 from scipy.optimize import brentq
 
-from trilat_net.analysis import (
-    CharacteristicRoot,
-    EnvelopeTrend,
-    Equilibrium,
-    OperatingConditions,
-    find_rightmost_root,
-    find_samples_in_use,
-    fit_envelopes,
-)
+from trilat_net.analysis import EnvelopeTrend, RestingLoop, fit_envelopes
 from trilat_net.core import BUCKETS_PER_S, Array
 from trilat_net.errors import UsageError
 from trilat_net.execution import FusedRun
 from trilat_net.log import open_log, read_link_delays
-from trilat_net.presentation import MARKS, Block, MarkedText, TextTable
+from trilat_net.presentation import MARKS, Block, MarkedText, TextTable, describe_moving_states
 from trilat_net.results import Result, finite_or_none
 from trilat_net.scenario import BUILT_IN, Scenario, load_scenario
 from trilat_net.work import Progress, ignore_progress
@@ -98,9 +90,7 @@ _CURVE_POINTS = 9
 _EDGE_TOLERANCE = 1e-4
 """Tolerance of ln k at the edge."""
 _FITTING_STEP = 0.9
-"""Smallest factor by which m is multiplied in one step."""
-_NO_ROOT_PER_S = -1e3
-"""Real part that represents a loop without roots, in 1/s."""
+"""Least factor by which m is reduced in one step."""
 _DELAY = re.compile(r"(\d+\.?\d*|\.\d+) ?(us|ms|s|)")
 """A number with an optional unit, as in "40ms"."""
 _UNIT_MS = {"us": 1e-3, "ms": 1.0, "": 1.0, "s": 1e3}
@@ -209,10 +199,7 @@ class ArmGains(Result):
         the edge is lowest, and which of the two limits bounds the stiffness.
         """
         edge = self.edge
-        # Only the text about the moving states is needed, so the value of the root is
-        # arbitrary.
-        moving_states = tuple(edge["moves"])
-        motion = CharacteristicRoot(s=0j, multiplicity=1, states=moving_states).description
+        motion = describe_moving_states(edge["moves"])
         yield (
             f"edge: K = {edge['k_per_s2']:.4g} /s^2 times inertia "
             f"({motion}; {edge['omega_rad_s']:.4g} rad/s)"
@@ -428,9 +415,9 @@ class _GainSearch:
             constant age.
 
     Attributes:
-        conditions: Linearised conditions of the loop.
-        constant_conditions: The same conditions with the constant sample age `age_s`. They are
-            equal to `conditions` if the ages do not vary.
+        loop: The linearised loop of the arms.
+        constant_loop: The same loop with the constant sample age `age_s`. It is equal to `loop`
+            if the ages do not vary.
         rate_hz: Tick rate, in Hz.
         age_s: Constant age of samples, in s.
         inertia: Inertia m of each joint, shape (n,).
@@ -451,18 +438,12 @@ class _GainSearch:
         # margin.
         self._damping = damping / math.sqrt(margin)
 
-        self.conditions = OperatingConditions.derive(scenario)
-        self.constant_conditions = self.conditions
-        self.rate_hz = self.conditions.sites[0].rate_hz
-        if self.conditions.varying:
-            used = find_samples_in_use(self.conditions).used.values()
-            ages_by_link = [np.arange(len(samples)) - samples for samples in used]
-            ages = np.concatenate(ages_by_link)
-            age_ticks = float(np.quantile(ages, quantile, method="higher"))
-            self.constant_conditions = self.fix_age(age_ticks / self.rate_hz)
-
-        largest_age_s = self.constant_conditions.age_s.max()
-        self.age_s = float(largest_age_s)
+        self.loop = RestingLoop.of_scenario(scenario)
+        self.constant_loop = self.loop
+        self.rate_hz = self.loop.rate_hz
+        if self.loop.varies:
+            self.constant_loop = self.loop.fix_age(self.loop.find_age_quantile_s(quantile))
+        self.age_s = self.constant_loop.largest_age_s
         # The heaviest mass is stable up to k = (2 zeta / T)^2, where T is the age. At this k
         # the damping must keep its margin to the sampled-data limit.
         omega_rad_s = 2.0 * self._damping / self.age_s
@@ -527,20 +508,6 @@ class _GainSearch:
         lightest_motion = vectors[:, -1]
         return largest_ratio, lightest_motion**2
 
-    def fix_age(self, age_s: float) -> OperatingConditions:
-        """Returns the linear model of the loop with the same delay for all received data.
-
-        The age of a sample (a state that one arm sent to another) is the time from its sending
-        until its use. A varying delay makes the ages vary. The returned model has a constant
-        age instead, where the analysis needs a single number.
-
-        Args:
-            age_s: The age of all samples, in s.
-        """
-        has_delay = self.conditions.age_s > 0.0
-        ages_s: Array = np.where(has_delay, age_s, 0.0)
-        return self.conditions._replace(age_s=ages_s, varying=False)
-
     def build_law(self, k: float, stiffness_divisor: float = 1.0) -> Any:
         """Returns the control law with the gains that a gain parameter k determines.
 
@@ -577,41 +544,9 @@ class _GainSearch:
             rounded_gains[name] = tuple(map(float, texts))
         return msgspec.structs.replace(law, **rounded_gains)
 
-    def find_root(
-        self, law: Any, pose: Array, loop: OperatingConditions, *, sampled: bool = True
-    ) -> CharacteristicRoot:
-        """Returns the characteristic root of the linearised loop with the largest real part.
-
-        The loop is linearised about the state of rest in the given pose. The real part of the
-        root is the rate, in 1/s, at which small motions grow. A negative value means that they
-        decay.
-
-        Args:
-            law: Control law with its gains.
-            pose: Pose of all arms, shape (n,), in rad or m, for n joints.
-            loop: Linear model of the arms, their tick rates and the delays between them.
-            sampled: True to analyse the sampled loop, False to analyse it in continuous time.
-
-        Returns:
-            The root. If the loop has no roots, a root with a large negative real part is
-            returned.
-        """
-        sites = []
-        for site in loop.sites:
-            gains = law.linear_gains(site.theta)
-            sites.append(site._replace(gains=gains))
-        poses = np.tile(pose, (len(sites), 1))
-        theta = np.array([site.theta for site in sites])
-        equilibrium = Equilibrium(poses, theta, "a pose", 0.0)
-        loop_with_gains = loop._replace(sites=tuple(sites))
-        root = find_rightmost_root(loop_with_gains, equilibrium, sampled=sampled)
-        if root is None:
-            return CharacteristicRoot(complex(_NO_ROOT_PER_S), 1, ())
-        return root
-
     def find_least_edge(
         self,
-        loop: OperatingConditions,
+        loop: RestingLoop,
         poses: Iterable[Array],
         start: float,
         *,
@@ -627,7 +562,7 @@ class _GainSearch:
         first steps of the search are small in this case.
 
         Args:
-            loop: Conditions of the loop.
+            loop: The linearised loop of the arms.
             poses: The poses.
             start: First k of the search, in 1/s^2.
             sampled: True to analyse the sampled loop, False to analyse it in continuous time.
@@ -642,7 +577,7 @@ class _GainSearch:
         least_edge = math.inf
         worst_pose = self._poses[0]
         log_steps = np.arange(24) * math.log(2.0)
-        if loop.varying:
+        if loop.varies:
             small_steps = np.arange(15) * math.log(1.1)
             large_steps = math.log(4.0) + log_steps
             log_steps = np.append(small_steps, large_steps)
@@ -656,8 +591,7 @@ class _GainSearch:
                 and the control loop is stable.
                 """
                 law = self.build_law(math.exp(log_k))
-                root = self.find_root(law, pose, loop, sampled=sampled)
-                return root.s.real
+                return loop.find_root(law, pose, sampled=sampled).s.real
 
             candidates: Iterable[float] = math.log(start) + log_steps
             if least_edge != math.inf:
@@ -688,11 +622,9 @@ class _GainSearch:
             The edge values, as described for `ArmGains.edge`. The further entry `used_per_s2`
             is the k of the tuned gains before the stiffness is divided by the margin.
         """
-        constant, pose = self.find_least_edge(
-            self.constant_conditions, self._poses, self._least_k
-        )
+        constant, pose = self.find_least_edge(self.constant_loop, self._poses, self._least_k)
 
-        varies = self.conditions.varying
+        varies = self.loop.varies
         if varies:
             delay_s = self.age_s
         else:
@@ -700,7 +632,7 @@ class _GainSearch:
             delay_s = 1e-3 * link.moments().mean_ms
         continuous = math.inf
         if delay_s > 0.0:  # without a delay the loop is passive in continuous time
-            fixed = self.fix_age(delay_s)
+            fixed = self.loop.fix_age(delay_s)
             continuous, _ = self.find_least_edge(
                 loop=fixed,
                 poses=[pose],
@@ -709,13 +641,13 @@ class _GainSearch:
             )
         k = constant
         if varies:
-            k, _ = self.find_least_edge(self.conditions, [pose], 0.5 * constant)
+            k, _ = self.find_least_edge(self.loop, [pose], 0.5 * constant)
 
         lightest, _ = self._find_lightest()
         damping_factor = 2.0 * self._damping * lightest
         limit = (self._largest_damping_per_s / damping_factor) ** 2
         law = self.build_law(k)
-        root = self.find_root(law, pose, self.conditions)
+        root = self.loop.find_root(law, pose)
         limit_with_margin = limit / self._margin**2
         lower_edge = min(k, constant)
         # m was fitted to the limit at the least k, up to rounding.
@@ -752,7 +684,7 @@ class _GainSearch:
         delays_s = np.unique(delays_ticks) / self.rate_hz
         curve = []
         for delay_s in delays_s:
-            loop = self.fix_age(delay_s)
+            loop = self.loop.fix_age(delay_s)
             # Up to k = (2 zeta / delay)^2, even the heaviest mass is stable, see `__init__`. So
             # the search starts there.
             stable_k = (2.0 * self._damping / delay_s) ** 2
@@ -782,7 +714,7 @@ class _GainSearch:
             The run as an entry of `ArmGains.runs`, with the simulated and the predicted growth
             rate.
         """
-        root = self.find_root(law, pose, self.conditions)
+        root = self.loop.find_root(law, pose)
         predicted_per_s = root.s.real
         sites = {}
         for n, (name, spec) in enumerate(self._scenario.sites.items()):

@@ -12,7 +12,7 @@ from itertools import groupby
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from trilat_net.analysis import Metric, Quantity, certify_run, compute_log_metrics, quantities
+from trilat_net.analysis import LogMetrics, Metric, Quantity, certify_run
 from trilat_net.errors import UsageError, count_nouns, join_words
 from trilat_net.log import Log, open_log
 from trilat_net.presentation import (
@@ -113,9 +113,9 @@ def compare_metrics(logs: Sequence[Log], names: Sequence[str] = ()) -> _MetricCo
     Raises:
         LogError: A record cannot be read, or names a change that is not valid.
     """
-    measured = [compute_log_metrics(log) for log in logs]
+    measured = [LogMetrics.of_log(log) for log in logs]
     rows = []
-    for quantity in quantities():
+    for quantity in LogMetrics.list_quantities():
         entries = tuple(metrics.run_value(quantity) for metrics in measured)
         if any(entry.applies for entry in entries):
             rows.append(_ComparisonRow(quantity, entries))

@@ -25,16 +25,13 @@ import numpy as np
 from trilat_net import process
 from trilat_net.analysis import (
     NO_BUCKETS,
+    LogMetrics,
     Metric,
     RunEnd,
     RunTrace,
     Stability,
+    VirtualWall,
     build_arm_rows,
-    find_quantity,
-    list_walls,
-    measure_run,
-    reduce_to_buckets,
-    wall_force,
 )
 from trilat_net.core import BUCKETS_PER_S, Array, Site, compute_fingerprint
 from trilat_net.errors import ScenarioError
@@ -121,10 +118,10 @@ class RecordBatch(NamedTuple):
                 there are no earlier records.
 
         Returns:
-            The summary that includes these records, see `reduce_to_buckets`.
+            The summary that includes these records, see `RunTrace.reduce_records`.
         """
         bucket = self.t_ns * BUCKETS_PER_S // NS_PER_S
-        return reduce_to_buckets(
+        return RunTrace.reduce_records(
             bucket=bucket,
             e=self.e,
             qd=self.qd,
@@ -457,7 +454,7 @@ class WindowStats:
         self._to_ns = round(to_s * NS_PER_S)
         self._period_ns = NS_PER_S // spec.rate_hz + 1
         self._arm = build_arm_rows(scenario, site)
-        self._walls = list_walls(spec)
+        self._walls = VirtualWall.list_of_site(spec)
 
         self._last_ns = -1
         self._records = 0
@@ -501,7 +498,7 @@ class WindowStats:
         if self._walls:
             tip = self._arm.place_end_effector(rows_inside.q, rows_inside.qd)
             t_s = rows_inside.t_ns / NS_PER_S
-            forces = [wall_force(wall, t_s, tip) for wall in self._walls]
+            forces = [wall.find_force(t_s, tip) for wall in self._walls]
             total_force = np.sum(forces, axis=0)
             self._add_wall_force(total_force)
 
@@ -933,7 +930,7 @@ class RunMetrics(msgspec.Struct, frozen=True, kw_only=True):
             late_samples=late_samples,
             missing=missing,
         )
-        expected_metrics = measure_run(log, scenario.expect.metrics)
+        expected_metrics = LogMetrics.measure_run(log, scenario.expect.metrics)
         return msgspec.structs.replace(metrics, metrics=expected_metrics)
 
     def compare_with(self, expect: Expect) -> "list[ExpectationResult]":
@@ -1441,7 +1438,7 @@ def _evaluate_metrics(expect: Expect, metrics: RunMetrics) -> Iterator[Expectati
     for key, limits in expect.metrics.items():
         value, reason, _ = metrics.metrics[key]
         measured = None if value is None else Range(value, value)
-        quantity = find_quantity(key)
+        quantity = LogMetrics.find_quantity(key)
         yield _compare_with_range(
             name=f"metrics.{key}",
             measured=measured,

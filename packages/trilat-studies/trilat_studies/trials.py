@@ -36,7 +36,7 @@ from typing import Any, NamedTuple
 
 from msgspec.structs import asdict
 
-from trilat_net.analysis import find_quantity
+from trilat_net.analysis import LogMetrics
 from trilat_net.core import is_core_cached
 from trilat_net.errors import LawFailed, LogError, ScenarioError, TrilatError, count_nouns
 from trilat_net.execution import check_virtual, execute_virtual, verify_log
@@ -291,7 +291,7 @@ def _check_expectations_reachable(scenario: Scenario, source: str) -> None:
 
     for key in expect.metrics:
         try:
-            find_quantity(key)
+            LogMetrics.find_quantity(key)
         except KeyError as error:
             raise ScenarioError(
                 error.args[0], path=f"expect.metrics.{key}", source=source

@@ -27,14 +27,10 @@ from tests.theory.delay_equations import DelayEquations, inertia, make_equations
 from tests.theory.energy import compute_balance as balance_by_hand
 from tests.theory.energy import left_null_vector
 from trilat_net.analysis.certificate.certificate_result import Certificate
-from trilat_net.analysis.certificate.energy_balance import (
-    EnergyBalance,
-    compute_energy_balance,
-    compute_site_energies,
-)
+from trilat_net.analysis.certificate.energy_balance import EnergyBalance, SiteEnergy
 from trilat_net.analysis.certificate.stability_certificate import certify_log
 from trilat_net.analysis.certificate.verdict_facts import StabilityFinding
-from trilat_net.analysis.metrics.log_metrics import LogMetrics, compute_log_metrics
+from trilat_net.analysis.metrics.log_metrics import LogMetrics
 from trilat_net.presentation.premise_text import explain_no_functional
 from trilat_net.scenario import load_scenario, parse_scenario
 
@@ -117,7 +113,7 @@ def test_limits_of_torque_rate_and_reference_are_booked(
 
 def test_a_stop_and_restart_is_booked() -> None:
     """The torque of a stopped site is not that of the law, and the site's estimates stand still."""
-    b = compute_energy_balance(compute_site_energies(make_stopped_log(adaptive_text(), 3000)))
+    b = EnergyBalance.of_energies(SiteEnergy.by_site(make_stopped_log(adaptive_text(), 3000)))
     assert np.abs(b.work["torque limit"]).max() > 0.01 * b.V.max()
     assert np.abs(b.work["estimates"]).max() > 1e-3 * b.V.max()
     assert np.abs(b.unexplained).max() <= 5e-4 * b.scale
@@ -171,7 +167,7 @@ def test_beta_of_ones_is_detected_and_named() -> None:
 
     (20), which is the right null vector of Upsilon, not the left one.
     """
-    ones = compute_energy_balance(
+    ones = EnergyBalance.of_energies(
         make_run("asymmetric", {"duration_s": 2.0, "rate_hz": 1000}).energies,
         paper_weights=True,
     )
@@ -181,8 +177,8 @@ def test_beta_of_ones_is_detected_and_named() -> None:
 
 def test_v_rises_with_the_papers_weights_only() -> None:
     books = make_run("free", LYAPUNOV).energies
-    ones = compute_energy_balance(books, paper_weights=True)
-    right = compute_energy_balance(books)
+    ones = EnergyBalance.of_energies(books, paper_weights=True)
+    right = EnergyBalance.of_energies(books)
     assert ones.V[0] == pytest.approx(32.8, abs=0.1)
     rise, kept = (float((b.V - np.minimum.accumulate(b.V)).max()) for b in (ones, right))
     assert rise == pytest.approx(12.3, abs=0.5)
@@ -289,7 +285,7 @@ def test_a_closed_group_balances_alone() -> None:
         "dominance.m2.s": 0.0,
     }
     energies = make_run("free", {**pair, "duration_s": 1.5, "rate_hz": 500}).energies
-    group = compute_energy_balance({site: energies[site] for site in ("m1", "m2")})
+    group = EnergyBalance.of_energies({site: energies[site] for site in ("m1", "m2")})
     assert group.beta == pytest.approx(np.ones((len(group.t_s), 2)))
     assert find_relative_residual(group) <= 1e-4
     assert group.transfer == pytest.approx(np.zeros(len(group.t_s)), abs=1e-9 * group.scale)
@@ -307,7 +303,7 @@ def check_six_joints(duration_s: float) -> LogMetrics:
     """Checks the certificate of a run of six joints, and its metrics."""
     log = trilat_net.simulate(parse_scenario(six_joint_text(duration_s, 200.0)))
     certificate = certify_log(log)
-    metrics = compute_log_metrics(log)
+    metrics = LogMetrics.of_log(log)
     assert certificate.verdict.finding is StabilityFinding.COVERED, certificate.verdict.text
     assert certificate.balance is not None
     assert find_unexplained_share(certificate.balance) <= BAR
@@ -346,7 +342,7 @@ def test_energy_of_seven_joints_closes() -> None:
     for pose in ("0.5, 0.2]", "0.1, 0.0]", "0.3, 0.1]"):
         text = text.replace(pose, f"{pose[:-1]}, 0.4]")
     log = trilat_net.simulate(parse_scenario(text))
-    balance = compute_energy_balance(compute_site_energies(log))
+    balance = EnergyBalance.of_energies(SiteEnergy.by_site(log))
     assert find_unexplained_share(balance) <= BAR
 
 
@@ -371,8 +367,8 @@ def test_premises_name_joints_at_limits_and_at_stops() -> None:
 
 def test_every_term_of_a_rough_arm_is_needed() -> None:
     """Without its friction, its stops or its wall the energy of a site does not add up."""
-    energies = compute_site_energies(make_rough_log())
-    whole = compute_energy_balance(energies)
+    energies = SiteEnergy.by_site(make_rough_log())
+    whole = EnergyBalance.of_energies(energies)
     assert np.abs(whole.unexplained).max() <= 2e-4 * whole.V.max()
     assert {"stops", "hands", "walls"} == set(whole.external)
     for site, name in (("s", "friction"), ("m2", "friction"), ("m2", "stops"), ("s", "walls")):
@@ -386,7 +382,7 @@ def test_every_term_of_a_rough_arm_is_needed() -> None:
 
 
 def test_friction_and_stops_stand_in_arm_energies() -> None:
-    metrics = compute_log_metrics(make_rough_log())
+    metrics = LogMetrics.of_log(make_rough_log())
     for site in metrics.sites.values():
         assert site["friction_j"].value > 1.0
         assert site["unaccounted_j"].value <= 0.02
@@ -466,7 +462,7 @@ def test_the_axis_of_one_arm_dissipates() -> None:
     taken = certificate.balance.dissipation["open axes"]
     assert taken[-1] > 1e-3
     assert np.diff(taken).min() >= -1e-15
-    for site, energy in compute_site_energies(log).items():
+    for site, energy in SiteEnergy.by_site(log).items():
         terms = {
             name: course for name, course in energy.dissipation.items() if name != "open axes"
         }
@@ -494,7 +490,7 @@ def test_orientations_have_no_v_for_a_reason() -> None:
 def test_false_records_break_the_balance() -> None:
     """Every site's torque is checked against the law in task space."""
     log = trilat_net.simulate(parse_scenario(planar_task_text(duration_s=1.0)))
-    energies = compute_site_energies(log)
+    energies = SiteEnergy.by_site(log)
     motion = energies["s"].motion
     assert (
         np.abs(motion.records.tau - motion.law_torque(np.arange(len(motion.r)))).max() <= 1e-9
@@ -503,4 +499,4 @@ def test_false_records_break_the_balance() -> None:
         motion, constants=motion.constants._replace(Kd=1.01 * motion.constants.Kd)
     )
     assert np.abs(wrong.records.tau - wrong.law_torque(np.arange(len(motion.r)))).max() > 1e-3
-    assert compute_energy_balance(energies).V.max() > 1.0
+    assert EnergyBalance.of_energies(energies).V.max() > 1.0

@@ -6,16 +6,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tests.analysis.builders import make_run
-from trilat_net.analysis.aligned import AlignedRecords, PeerTrajectory, view_delayed_peer
+from trilat_net.analysis.aligned import AlignedRecords, PeerTrajectory
 from trilat_net.analysis.arm_rows import PlanarArmRows
-from trilat_net.analysis.certificate.energy_terms import (
-    SiteConstants,
-    SiteMotion,
-    dominance_change_work,
-    evaluate_functional,
-    link_work,
-    torque_work,
-)
+from trilat_net.analysis.certificate.energy_terms import SiteConstants, SiteMotion
 from trilat_net.analysis.dominance_history import DominanceHistory
 from trilat_net.analysis.torque_sources import TorqueSplit
 
@@ -56,9 +49,7 @@ class Situation:
             for name, pair in zip(("a", "b"), zip(before, after, strict=True), strict=True)
         }
         self.track = draw_records(random, "s", used, 2, NOW)
-        self.views = [
-            view_delayed_peer(self.track, PeerTrajectory(peer)) for peer in self.peers
-        ]
+        self.views = [self.track.view_delayed_peer(PeerTrajectory(peer)) for peer in self.peers]
         self.track.q_des[:] = sum(
             a * v.delayed.q for a, v in zip(self.alpha, self.views, strict=True)
         )
@@ -77,10 +68,10 @@ class Situation:
         )
 
     def v(self, row: int) -> float:
-        return float(evaluate_functional(self.motion).total[row])
+        return float(self.motion.evaluate_functional().total[row])
 
     def booked(self) -> list[float]:
-        return [float(link_work(self.motion, j).total[0]) for j in range(2)]
+        return [float(self.motion.compute_link_work(j).total[0]) for j in range(2)]
 
 
 ticks = st.integers(1, NOW - 2)
@@ -126,7 +117,7 @@ def test_a_held_torque_works_with_its_initial_value(seed: int) -> None:
     site = Situation(seed, (5, 9), (6, 10))
     ends = site.motion.ends
     now, held = np.random.default_rng(seed).normal(size=(2, 2, 2))
-    booked = torque_work(site.motion, now, held)
+    booked = site.motion.compute_torque_work(now, held)
     left = ends.r_left[0] @ (now[0] + held[0])
     right = ends.r_right[0] @ (now[1] + held[0])
     assert float(booked.total[0]) == pytest.approx(0.5 / RATE_HZ * (left + right))
@@ -141,7 +132,7 @@ def test_a_step_of_shares_changes_v_exactly(seed: int, share: float) -> None:
     stepped.track.q_des[1] = sum(
         a * v.delayed.q[1] for a, v in zip(after, stepped.views, strict=True)
     )
-    amount = dominance_change_work(stepped.motion).total[0]
+    amount = stepped.motion.compute_dominance_work().total[0]
     assert float(amount) == pytest.approx(stepped.v(1) - kept.v(1), rel=1e-9, abs=1e-9)
 
 
@@ -159,13 +150,13 @@ def test_slow_delay_change_gives_the_missing_term(seed: int) -> None:
     peer.q[:] = speed * t_s[:, np.newaxis]
     peer = peer._replace(rate_hz=RATE_HZ)
     grown_s = 1e-6
-    peer_view = view_delayed_peer(site.track, PeerTrajectory(peer))
+    peer_view = site.track.view_delayed_peer(PeerTrajectory(peer))
     later = PeerTrajectory(peer).evaluate(peer_view.stamp_s - np.array([0.0, grown_s]))
     site.views[0] = peer_view._replace(delayed=later)
     site.track.q_des[1] = sum(
         a * v.delayed.q[1] for a, v in zip(site.alpha, site.views, strict=True)
     )
-    booked = float(link_work(site.motion, 0).total[0])
+    booked = float(site.motion.compute_link_work(0).total[0])
     e = site.track.e[1]
     qd = site.track.qd[1]
     q = site.track.q[1]

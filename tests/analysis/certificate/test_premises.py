@@ -36,7 +36,7 @@ from trilat_net.analysis.certificate.premises import (
     find_absent_spans,
     gather_facts,
 )
-from trilat_net.analysis.torque_sources import find_wall_energies
+from trilat_net.analysis.torque_sources import WallEnergy
 from trilat_net.analysis.twins import envelope_trend
 from trilat_net.core.step.vectors import Array
 from trilat_net.log.log_reader import Log
@@ -289,7 +289,7 @@ def test_sampled_walls_give_half_k_dx_squared() -> None:
     # the spring is there, and nobody pressed it
     enters = (depth[:-1] == 0.0) & (depth[1:] > 0.0)
     gives += 0.5 * wall.stiffness_n_m * float((depth[1:][enters] ** 2).sum())
-    wall_energy = find_wall_energies(log)[0]
+    wall_energy = WallEnergy.list_of_log(log)[0]
     assert wall_energy.site == "s"
     assert wall_energy.generated_j == pytest.approx(gives, rel=0.02)
     assert wall_energy.required_damping_n_s_m == pytest.approx(0.5 * 2000.0 / 200.0)

@@ -6,10 +6,10 @@ import pytest
 from tests.analysis.builders import make_run
 from trilat_net.analysis.certificate.running_energy import (
     EnergyCourse,
-    RecordWindow,
     RunningEnergy,
 )
 from trilat_net.log.log_reader import Log
+from trilat_net.presentation.premise_text import describe_energy_obstacle
 
 BLOCK = 60
 
@@ -20,8 +20,8 @@ def compute_courses(
     """Returns V of a log whose records arrive block by block, those of its last site later;
     some are missing.
     """
-    windows = {site: RecordWindow(log.scenario, site, kept_s=4.0) for site in log.sites}
-    running = RunningEnergy(log.scenario, windows)
+    running = RunningEnergy(log.scenario, kept_s=4.0)
+    windows = running.windows
     courses_found = []
     blocks = max(len(log[site]) for site in log.sites) // BLOCK + late + 1
     for n in range(blocks):
@@ -35,7 +35,7 @@ def compute_courses(
             course := running.compute_next({site: windows[site].newest for site in log.sites})
         ) is not None:
             courses_found.append(course)
-    assert running.reason == ""
+    assert describe_energy_obstacle(running) == ""
     return courses_found
 
 
@@ -71,8 +71,8 @@ def test_v_without_some_records_is_the_incomplete_logs() -> None:
 def test_v_begins_late_in_a_session_joined_late() -> None:
     log = make_run("rich").log
     whole = make_run("rich").balance
-    windows = {site: RecordWindow(log.scenario, site, kept_s=4.0) for site in log.sites}
-    running = RunningEnergy(log.scenario, windows)
+    running = RunningEnergy(log.scenario, kept_s=4.0)
+    windows = running.windows
     blocks = []
     for first in range(1200, 2400, BLOCK):
         for site in log.sites:
@@ -88,7 +88,7 @@ def test_v_begins_late_in_a_session_joined_late() -> None:
 
 def test_a_law_without_v_is_reported() -> None:
     log = make_run("jitter", {"duration_s": 0.3}).log
-    windows = {site: RecordWindow(log.scenario, site) for site in log.sites}
-    running = RunningEnergy(log.scenario, windows)
-    assert "p_d" in running.reason or "law" in running.reason
+    running = RunningEnergy(log.scenario)
+    obstacle = describe_energy_obstacle(running)
+    assert "p_d" in obstacle or "law" in obstacle
     assert running.compute_next(dict.fromkeys(log.sites, 100)) is None

@@ -14,7 +14,6 @@ from tests.analysis.builders import (
     make_short_log,
 )
 from tests.log.builders import replace_fields, rewrite_log
-from trilat_net.analysis.certificate.premises import find_unjudged_spans
 from trilat_net.analysis.certificate.stability_certificate import certify_log
 from trilat_net.analysis.certificate.verdict_facts import RecordGap, StabilityFinding
 from trilat_net.analysis.run_end import EndBehaviour, Stability
@@ -134,7 +133,7 @@ def test_gaps_are_left_out_and_reported() -> None:
     assert work <= 1e-6  # nobody is said to have given what changed in the gap
     assert find_relative_residual(certificate.balance) <= 1e-3
     # s looks back by 150 ms
-    assert find_unjudged_spans(certificate.balance) == [pytest.approx((0.995, 1.35))]
+    assert certificate.balance.unjudged_spans == [pytest.approx((0.995, 1.35))]
 
 
 def test_a_gap_does_not_break_the_balance() -> None:

@@ -7,8 +7,8 @@ import pytest
 from scipy import signal
 
 from tests.analysis.builders import make_run
-from trilat_net.analysis.metrics.log_metrics import compute_log_metrics
-from trilat_net.analysis.metrics.measured_impedance import FrequencyResponse, estimate_responses
+from trilat_net.analysis.metrics.log_metrics import LogMetrics
+from trilat_net.analysis.metrics.measured_impedance import FrequencyResponse
 
 RATE_HZ = 200
 EVERYTHING = np.ones(60 * RATE_HZ, dtype=np.bool_)
@@ -28,7 +28,7 @@ def estimate_strongest(
     rate_hz: int,
     least: float,
 ) -> FrequencyResponse:
-    return estimate_responses(drive, x, y, usable, rate_hz, least)[0]
+    return FrequencyResponse.estimate(drive, x, y, usable, rate_hz, least)[0]
 
 
 def test_a_known_filter_is_identified() -> None:
@@ -120,7 +120,7 @@ def test_linear_pair_has_its_closed_form_impedance() -> None:
     log = make_run("two_sites", make_shaken_overrides()).log
     (measured_response,) = (
         response
-        for response in compute_log_metrics(log).responses
+        for response in LogMetrics.of_log(log).responses
         if (response.kind, response.at, response.joint) == ("impedance", "m", 1)
     )
     assert measured_response.ratio.frequency_hz == 1.0
@@ -139,7 +139,7 @@ def test_linear_pair_has_its_closed_form_impedance() -> None:
 
 def test_a_still_hand_says_nothing_of_its_site() -> None:
     """`contact`: from 3 s on the wall shakes the arm against a still hand of 30 N m/rad."""
-    responses = compute_log_metrics(make_run("contact", {"rate_hz": 200}).log).responses
+    responses = LogMetrics.of_log(make_run("contact", {"rate_hz": 200}).log).responses
     for response in responses:
         if response.kind == "impedance":
             assert response.ratio.gain is None
@@ -173,7 +173,7 @@ def test_an_impedance_is_measured_over_frequency(hand: dict[str, object], lines:
     log = make_run("two_sites", {**make_shaken_overrides(), "sites.m.hands": [hand]}).log
     measured_response = next(
         response
-        for response in compute_log_metrics(log).responses
+        for response in LogMetrics.of_log(log).responses
         if (response.at, response.joint) == ("m", 1)
     )
     c2 = math.cos(float(log["m"].q[:, 1].mean()))

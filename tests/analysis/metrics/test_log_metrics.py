@@ -22,8 +22,7 @@ from tests.analysis.builders import (
     make_short_log,
 )
 from tests.log.builders import add_clock_readings, replace_fields, replace_scenario, rewrite_log
-from trilat_net.analysis.metrics.log_metrics import compute_log_metrics
-from trilat_net.analysis.metrics.measures import quantities
+from trilat_net.analysis.metrics.log_metrics import LogMetrics
 from trilat_net.log.log_reader import Log
 
 GOLDEN = sorted((Path(__file__).parents[2] / "golden").glob("v*.mcap"))
@@ -31,12 +30,12 @@ GOLDEN = sorted((Path(__file__).parents[2] / "golden").glob("v*.mcap"))
 
 def check_facts(log: Log) -> dict[str, Any]:
     """Returns the facts of a log after checking the rules that all facts obey."""
-    measured = compute_log_metrics(log)
+    measured = LogMetrics.of_log(log)
     facts: dict[str, Any] = json.loads(json.dumps(measured.to_dict(), allow_nan=False))
     assert set(facts["sites"]) == set(log.sites)
     assert len(facts["links"]) == len(log.sites) * (len(log.sites) - 1)
     unknown = facts["unknown"]
-    for quantity in quantities():
+    for quantity in LogMetrics.list_quantities():
         kind = "run" if quantity.of == "run" else f"{quantity.of}s"
         places = {"run": facts["run"]} if kind == "run" else facts[kind]
         for name, values in places.items():
@@ -139,7 +138,7 @@ def test_the_docs_have_a_line_for_every_quantity() -> None:
     table = Path(__file__).parents[3] / "docs" / "data" / "metrics.csv"
     with table.open(encoding="utf-8", newline="") as file:
         keys = [key for row in csv.DictReader(file) for key in row["keys"].split(", ")]
-    assert sorted(keys) == sorted(quantity.key for quantity in quantities())
+    assert sorted(keys) == sorted(quantity.key for quantity in LogMetrics.list_quantities())
 
 
 def test_a_row_is_the_largest_or_the_sum() -> None:
@@ -192,7 +191,7 @@ def test_effort_of_a_constant_and_of_a_sinusoid() -> None:
     a = 3.0
     b = 8.0
     log = make_pair_log(lambda _, t_s: {"tau": [a, b * math.sin(2.0 * math.pi * t_s)]})
-    figures = compute_log_metrics(log).sites["m"]
+    figures = LogMetrics.of_log(log).sites["m"]
     assert figures["effort_nm2_s"].value == pytest.approx((a**2 + b**2 / 2.0) * 4.0, rel=1e-9)
     assert figures["rms_tau_nm"].value == pytest.approx(b / math.sqrt(2.0), rel=1e-9)
     assert figures["peak_tau_nm"].value == pytest.approx(b, rel=1e-9)
@@ -202,17 +201,17 @@ def test_effort_of_a_constant_and_of_a_sinusoid() -> None:
 def test_saturation_is_the_share_of_limited_ticks() -> None:
     """200 N m is the limit of a scenario that names none; -200 counts as well."""
     log = make_pair_log(lambda _, t_s: {"tau": [0.0, -200.0 if t_s < 1.0 else 199.9]})
-    assert compute_log_metrics(log).sites["s"]["saturated_share"].value == pytest.approx(0.25)
+    assert LogMetrics.of_log(log).sites["s"]["saturated_share"].value == pytest.approx(0.25)
 
 
 def test_chatter_is_the_mean_step_of_the_torque() -> None:
     """A torque that changes sides every tick, and one that never does."""
     log = make_pair_log(lambda _, t_s: {"tau": [0.5 * (-1.0) ** round(1000.0 * t_s), 3.0]})
-    assert compute_log_metrics(log).sites["m"]["chatter_nm"].value == pytest.approx(
+    assert LogMetrics.of_log(log).sites["m"]["chatter_nm"].value == pytest.approx(
         1.0, rel=1e-12
     )
     still = make_pair_log(lambda _, __: {"tau": [7.0, 3.0]})
-    assert compute_log_metrics(still).sites["m"]["chatter_nm"].value == 0.0
+    assert LogMetrics.of_log(still).sites["m"]["chatter_nm"].value == 0.0
 
 
 ANCHORED = {
@@ -228,7 +227,7 @@ ANCHORED = {
 
 def test_learnt_gravity_is_a_spring_to_pose() -> None:
     """Gamma g^2 cos^2 (1 + Lambda T) = 115.5 N m/rad a robot; the hand moves all three."""
-    metrics = compute_log_metrics(make_run("paper", ANCHORED).log)
+    metrics = LogMetrics.of_log(make_run("paper", ANCHORED).log)
     assert [stiffness.site for stiffness in metrics.stiffness] == ["m1", "m1"]
     second = metrics.stiffness[1]
     assert second.joint == 2
@@ -243,7 +242,7 @@ def test_no_stiffness_is_given_under_changing_shares() -> None:
     """In `training` the shares change and the hands do not: no stiffness is stated, in
     particular not their 200 N m/rad.
     """
-    metrics = compute_log_metrics(make_run("training", {"rate_hz": 50}).log)
+    metrics = LogMetrics.of_log(make_run("training", {"rate_hz": 50}).log)
     assert metrics.static_windows.value == 2.0
     assert metrics.stiffness == []
 
@@ -253,7 +252,7 @@ SLOW = {"rate_hz": 50}
 
 def test_the_felt_stiffness_follows_the_shares() -> None:
     """5 N m on the slave: 4.79 N m at the expert, 16.4 N m at the trainee, 5.00 with equal shares."""
-    metrics = compute_log_metrics(make_run("force_sharing", SLOW).log)
+    metrics = LogMetrics.of_log(make_run("force_sharing", SLOW).log)
     assert [pair.pushed + pair.holds for pair in metrics.sharing_ratios] == [
         "sm1",
         "sm2",
@@ -276,14 +275,14 @@ def test_the_felt_stiffness_follows_the_shares() -> None:
 def test_three_loaded_sites_balance() -> None:
     """Stiffer sites count less: K_i enters, not the shares alone."""
     settings = {"sites.m1.control.Kp": 60.0, "duration_s": 15.0, **SLOW}
-    metrics = compute_log_metrics(make_run("force_sharing", settings).log)
+    metrics = LogMetrics.of_log(make_run("force_sharing", settings).log)
     assert metrics.sharing_ratios[0].expected_nm.value == pytest.approx(3.0 * 4.79, rel=0.02)
     assert metrics.sharing_ratios[0].off <= 0.01
     assert metrics.joint_loads[0].imbalance.value <= 0.01
 
 
 def test_with_learnt_gravity_no_sharing_is_expected() -> None:
-    metrics = compute_log_metrics(make_run("windup", {"duration_s": 40.0, "rate_hz": 50}).log)
+    metrics = LogMetrics.of_log(make_run("windup", {"duration_s": 40.0, "rate_hz": 50}).log)
     assert metrics.sharing_ratios
     for ratio in metrics.sharing_ratios:
         assert ratio.pushed == "s"
@@ -295,7 +294,7 @@ def test_with_learnt_gravity_no_sharing_is_expected() -> None:
 
 
 def test_moving_arms_have_no_force_sharing() -> None:
-    metrics = compute_log_metrics(make_run("contact", {"duration_s": 1.0, "rate_hz": 100}).log)
+    metrics = LogMetrics.of_log(make_run("contact", {"duration_s": 1.0, "rate_hz": 100}).log)
     assert metrics.static_windows.value is None
     assert (
         metrics.run["sharing_off"].why
@@ -316,7 +315,7 @@ def test_straight_estimates_have_distance_energy_and_slope() -> None:
         learnt = [THETA[n] + off[n] + rate[n] * t_s for n in range(3)]
         return {"theta_hat": [*learnt, 7.0, 8.0]}
 
-    measured = compute_log_metrics(make_pair_log(motion, seconds=6.0, more=LEARNS))
+    measured = LogMetrics.of_log(make_pair_log(motion, seconds=6.0, more=LEARNS))
     figures_of_slave = measured.sites["s"]
     learnt = measured.estimates["s"]
     assert figures_of_slave["theta_error_first"].value == pytest.approx(13.0)
@@ -333,7 +332,7 @@ def test_straight_estimates_have_distance_energy_and_slope() -> None:
 
 
 def test_a_law_without_estimates_is_reported() -> None:
-    figure = compute_log_metrics(make_pair_log(lambda _, __: {})).sites["m"]["theta_error_last"]
+    figure = LogMetrics.of_log(make_pair_log(lambda _, __: {})).sites["m"]["theta_error_last"]
     assert figure.value is None
     assert figure.why == "nothing is learnt"
     assert not figure.applies
@@ -346,7 +345,7 @@ def test_without_truth_estimates_have_no_error() -> None:
         "sites.s.arm.known": False,
         "sites.s.control.theta_hat0": THETA,
     }
-    measured = compute_log_metrics(replace_scenario(log, changes))
+    measured = LogMetrics.of_log(replace_scenario(log, changes))
     assert measured.estimates["s"].theta is None
     assert measured.estimates["s"].last == log["s"].theta_hat[-1].tolist()
     assert measured.sites["s"]["theta_error_last"].why == "theta of the arm is not known"

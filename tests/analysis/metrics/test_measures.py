@@ -9,8 +9,8 @@ import pytest
 import trilat_net
 from tests import metric_labels
 from tests.dropped_files import run_in_folder
-from trilat_net.analysis.metrics.log_metrics import find_quantity
-from trilat_net.analysis.metrics.measures import list_measures, measures
+from trilat_net.analysis.metrics.log_metrics import LogMetrics
+from trilat_net.analysis.metrics.measures import Measure, measures
 from trilat_net.analysis.run_view import RunView
 
 METRIC = """
@@ -61,13 +61,13 @@ def test_duplicate_keys_are_refused_with_both_files() -> None:
     with pytest.raises(
         ValueError, match=r"rms_error_rad has two definitions, in .*motion_metrics and .*test"
     ):
-        measures("site", "twice", find_quantity("rms_error_rad"))(measure_again)  # type: ignore[arg-type]
+        measures("site", "twice", LogMetrics.find_quantity("rms_error_rad"))(measure_again)  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize("name", ["free", "contact"])
 def test_a_measure_gives_its_declared_quantities(name: str) -> None:
     view = RunView(trilat_net.simulate(name, {"duration_s": 0.2}))
-    for measure in list_measures():
+    for measure in Measure.list_all():
         for subject in view.list_subjects(measure.of):
             assert set(measure.measure(view, subject)) == {
                 quantity.key for quantity in measure.quantities

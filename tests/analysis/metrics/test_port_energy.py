@@ -11,7 +11,7 @@ import pytest
 from tests.analysis.builders import make_pair_log, make_run
 from tests.log.builders import replace_scenario, rewrite_log
 from tests.theory.delay_equations import inertia, regressor, theta_of
-from trilat_net.analysis.metrics.log_metrics import compute_log_metrics
+from trilat_net.analysis.metrics.log_metrics import LogMetrics
 from trilat_net.analysis.metrics.port_energy import held_work, trapezoid_work
 from trilat_net.scenario.arms import build_arm
 
@@ -36,7 +36,7 @@ def test_ports_balance_mechanical_energy_to_second_order(scheme: str) -> None:
     rests = []
     for rate_hz in (100, 200):
         log = make_run("paper", {"duration_s": 3.0, "rate_hz": rate_hz, "scheme": scheme}).log
-        sites = compute_log_metrics(log).sites
+        sites = LogMetrics.of_log(log).sites
         for site in log.sites:
             change = _mechanical(log, site)
             assert sites[site]["mechanical_j"].value == pytest.approx(
@@ -58,7 +58,7 @@ def _mechanical(log, site: str):
 
 
 def test_lossless_walls_return_at_most_their_energy() -> None:
-    metrics = compute_log_metrics(
+    metrics = LogMetrics.of_log(
         make_run("contact", {"duration_s": 6.0, "link.delay_ms": 20.0, "rate_hz": 250}).log
     ).sites["s"]
     assert metrics["walls_j"].value <= 0.0
@@ -81,7 +81,7 @@ def test_a_damper_dissipates_by_the_formula() -> None:
     more = 'environment = [{ kind = "viscous", damping_nm_s_rad = 4.0 }]'
     log = make_pair_log(motion, more=more)
     spent = B * A**2 * w**2 / 2.0 * log["s"].t_s[-1]
-    figures = compute_log_metrics(log).sites["s"]
+    figures = LogMetrics.of_log(log).sites["s"]
     assert figures["walls_j"].value == pytest.approx(-spent, rel=2e-3)
     assert figures["walls_most_j"].value == 0.0
     assert figures["hands_j"].value == pytest.approx(0.0, abs=1e-9)
@@ -93,10 +93,10 @@ def test_periods_without_both_records_are_left_out() -> None:
 
     whole = make_pair_log(motion)
     torn = rewrite_log(whole, lambda state: not (state.site == "m" and 100 <= state.tick < 200))
-    assert compute_log_metrics(whole).sites["m"]["controller_j"].value == pytest.approx(
+    assert LogMetrics.of_log(whole).sites["m"]["controller_j"].value == pytest.approx(
         2.0 * 799 / 200
     )
-    assert compute_log_metrics(torn).sites["m"]["controller_j"].value == pytest.approx(
+    assert LogMetrics.of_log(torn).sites["m"]["controller_j"].value == pytest.approx(
         2.0 * (799 - 101) / 200
     )
 
@@ -106,7 +106,7 @@ def test_an_unknown_arm_has_no_mechanical_energy() -> None:
     log = make_run("free", {"duration_s": 1.0, "rate_hz": 100}).log
     outside = replace_scenario(log, {"sites.s.plant": "external", "sites.s.arm.known": False})
     outside_figures, before = (
-        compute_log_metrics(measured_log).sites["s"] for measured_log in (outside, log)
+        LogMetrics.of_log(measured_log).sites["s"] for measured_log in (outside, log)
     )
     assert outside_figures["mechanical_j"].value is None
     assert outside_figures["mechanical_j"].why == "theta of the arm is not known"
@@ -136,7 +136,7 @@ def test_the_energy_of_a_delay_between_sinusoids(distance: float) -> None:
         return {**wave, "tau": [0.0, 0.0], "tau_x": [0.0, 0.0]}
 
     seconds = 10.0
-    figures = compute_log_metrics(make_pair_log(motion, seconds=seconds)).links["m->s"]
+    figures = LogMetrics.of_log(make_pair_log(motion, seconds=seconds)).links["m->s"]
     # until the first sample comes the peer is at its start pose
     begun = 0.5 * w * delay_s / math.pi
     expected = -distance * K * A**2 * math.pi * math.sin(w * delay_s) * (seconds - begun)
@@ -147,7 +147,7 @@ def test_the_energy_of_a_delay_between_sinusoids(distance: float) -> None:
 def test_delay_energy_is_the_ports_excess(law: str) -> None:
     """The controller's energy less that of all delays is that of the same law fed with present peers."""
     log = make_run("asymmetric", {"duration_s": 2.0, "rate_hz": 250, "control.law": law}).log
-    metrics = compute_log_metrics(log)
+    metrics = LogMetrics.of_log(log)
     largest = 0.0
     for site in log.sites:
         part = log[site]
@@ -196,15 +196,15 @@ def test_force_reflection_counts_only_late_force() -> None:
     calm = make_run(
         "contact", {"duration_s": 3.0, "rate_hz": 200, "sites.s.environment": []}
     ).log
-    assert compute_log_metrics(calm).links["s->m"]["delay_j"].value == 0.0
+    assert LogMetrics.of_log(calm).links["s->m"]["delay_j"].value == 0.0
     pushed = make_run("contact", {"duration_s": 3.0, "rate_hz": 200}).log
-    assert compute_log_metrics(pushed).links["s->m"]["delay_most_j"].value > 0.0
+    assert LogMetrics.of_log(pushed).links["s->m"]["delay_most_j"].value > 0.0
 
 
 def test_a_users_own_law_is_not_judged() -> None:
     log = make_run(
         "free", {"duration_s": 0.2, "rate_hz": 100, "control.law": "tests.laws:Adaptive"}
     ).log
-    said = compute_log_metrics(log).links["m1->s"]["delay_j"]
+    said = LogMetrics.of_log(log).links["m1->s"]["delay_j"]
     assert said.value is None
     assert "tests.laws:Adaptive does not say which part" in said.why

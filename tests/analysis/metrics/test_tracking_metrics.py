@@ -7,9 +7,9 @@ import pytest
 
 from tests.analysis.builders import make_pair_log, make_short_log
 from tests.log.builders import rewrite_log
-from trilat_net.analysis.aligned import align_records, find_latest_rows
-from trilat_net.analysis.dominance_history import trace_dominance
-from trilat_net.analysis.metrics.log_metrics import compute_log_metrics
+from trilat_net.analysis.aligned import AlignedRecords
+from trilat_net.analysis.dominance_history import DominanceHistory
+from trilat_net.analysis.metrics.log_metrics import LogMetrics
 from trilat_net.analysis.metrics.motion_metrics import measure_undelayed_error
 from trilat_net.analysis.run_view import RunView
 
@@ -24,7 +24,7 @@ def test_rms_and_peak_of_a_sinusoid() -> None:
         wave = size * math.sin(2.0 * math.pi * t_s)
         return {"q": [1.0 + wave, 2.0 + 0.5 * wave], "q_des": [1.0, 2.0]}
 
-    sites = compute_log_metrics(make_pair_log(motion)).sites
+    sites = LogMetrics.of_log(make_pair_log(motion)).sites
     assert sites["s"]["rms_error_rad"].value == pytest.approx(0.3 / math.sqrt(2.0), rel=1e-9)
     assert sites["m"]["rms_error_rad"].value == pytest.approx(0.1 / math.sqrt(2.0), rel=1e-9)
     assert sites["s"]["max_error_rad"].value == pytest.approx(0.3, rel=1e-12)
@@ -35,7 +35,7 @@ def test_settling_is_the_last_time_above_the_limit() -> None:
     log = make_pair_log(
         lambda _, t_s: {"q": [math.exp(-t_s), 0.0], "q_des": [0.0, 0.0]}, seconds=6.0
     )
-    figures = compute_log_metrics(log).sites["m"]
+    figures = LogMetrics.of_log(log).sites["m"]
     assert figures["settle_s"].value == pytest.approx(math.log(100.0), abs=1.0 / RATE_HZ)
     assert figures["max_error_end_rad"].value == pytest.approx(
         math.exp(-5.0), rel=2.0 / RATE_HZ
@@ -43,7 +43,7 @@ def test_settling_is_the_last_time_above_the_limit() -> None:
 
 
 def test_an_unsettled_run_is_reported() -> None:
-    metrics = compute_log_metrics(
+    metrics = LogMetrics.of_log(
         make_pair_log(lambda _, __: {"q": [0.5, 0.0], "q_des": [0.0, 0.0]})
     )
     settled = metrics.sites["m"]["settle_s"]
@@ -60,7 +60,7 @@ def test_following_allows_for_delay_unlike_spread() -> None:
         past = t_s if site == "m" else max(0.0, t_s - delay_s)
         return {"q": [speed * past, -0.5 * speed * past]}
 
-    metrics = compute_log_metrics(make_pair_log(motion))
+    metrics = LogMetrics.of_log(make_pair_log(motion))
     assert metrics.links["m->s"]["following_max_rad"].value == pytest.approx(0.0, abs=1e-12)
     assert metrics.run["spread_max_rad"].value == pytest.approx(speed * delay_s, rel=1e-9)
     assert metrics.run["spread_end_rad"].value == pytest.approx(speed * delay_s, rel=1e-9)
@@ -78,7 +78,7 @@ def test_undelayed_error_includes_what_the_delay_costs() -> None:
         angles = [speed * past, -0.5 * speed * past]
         return {"q": angles, "q_des": angles}
 
-    sites = compute_log_metrics(make_pair_log(motion)).sites
+    sites = LogMetrics.of_log(make_pair_log(motion)).sites
     assert sites["s"]["max_error_rad"].value == 0.0
     for site in ("m", "s"):
         assert sites[site]["undelayed_max_rad"].value == pytest.approx(
@@ -93,8 +93,8 @@ def test_undelayed_error_includes_what_the_delay_costs() -> None:
 def test_undelayed_error_weighs_peers_by_dominance() -> None:
     """During a handover, the slave's undelayed error is q_s - sum_j alpha_sj(t) q_j, at every tick."""
     log = make_short_log("handover")
-    sites = compute_log_metrics(log).sites
-    alpha = trace_dominance(log, "s", log["s"].t_s).alpha
+    sites = LogMetrics.of_log(log).sites
+    alpha = DominanceHistory.of_log(log, "s", log["s"].t_s).alpha
     peers = log.scenario.peers("s")
     mean = sum(alpha[:, n, np.newaxis] * log[peer].q for n, peer in enumerate(peers))
     error = np.abs(log["s"].q - mean)
@@ -125,7 +125,7 @@ def test_following_uses_the_delay_in_use() -> None:
         used = {"m": max(-1, tick - 37)} if site == "s" else {"s": max(-1, tick - 10)}
         return {"q": [t_s, 0.0], "used": used}
 
-    figures = compute_log_metrics(make_pair_log(motion)).links["m->s"]
+    figures = LogMetrics.of_log(make_pair_log(motion)).links["m->s"]
     assert figures["following_rms_rad"].value == pytest.approx(37 / RATE_HZ, rel=1e-9)
     assert figures["age_mean_ms"].value == pytest.approx(37 / RATE_HZ * 1e3, rel=1e-9)
 
@@ -137,12 +137,12 @@ def test_instants_with_a_missing_record_do_not_count() -> None:
 
     whole = make_pair_log(motion)
     torn = rewrite_log(whole, lambda state: not (state.site == "m" and 200 <= state.tick < 300))
-    assert compute_log_metrics(whole).run["spread_max_rad"].value == 5.0
-    assert compute_log_metrics(torn).run["spread_max_rad"].value == 0.25
+    assert LogMetrics.of_log(whole).run["spread_max_rad"].value == 5.0
+    assert LogMetrics.of_log(torn).run["spread_max_rad"].value == 0.25
 
 
 def test_the_latest_record_is_the_last_tick() -> None:
-    track = align_records(make_pair_log(lambda _, __: {}))["m"]
-    row, exists = find_latest_rows(track, np.array([0.0, 0.0049, 0.005, 3.995, 4.0, -0.1]))
+    track = AlignedRecords.by_site(make_pair_log(lambda _, __: {}))["m"]
+    row, exists = track.find_latest_rows(np.array([0.0, 0.0049, 0.005, 3.995, 4.0, -0.1]))
     assert row.tolist() == [0, 0, 1, 799, 799, 0]
     assert exists.tolist() == [True, True, True, True, False, False]

@@ -9,7 +9,7 @@ import pytest
 
 import trilat_net
 from tests.log.builders import rewrite_log
-from trilat_net.analysis.metrics.log_metrics import compute_log_metrics, measure_run
+from trilat_net.analysis.metrics.log_metrics import LogMetrics
 from trilat_net.log.log_reader import Log
 from trilat_net.net.messages import Event
 from trilat_net.scenario import parse_scenario
@@ -67,7 +67,7 @@ def make_pushed_log(ramp_s: float = 0.5, steps: Mapping[int, float] | None = Non
 
 def test_effort_of_a_hand_counts_by_its_share() -> None:
     """|tau|^2 is 13 and 2; the shares of m1 add up to 200 x 0.75 + (75 - 0.5 x 49.5) + 100 x 0.25."""
-    metrics = compute_log_metrics(make_pushed_log())
+    metrics = LogMetrics.of_log(make_pushed_log())
     shares = 150.0 + 50.25 + 25.0
     assert metrics.sites["m1"]["authority_effort_nm2_s"].value == pytest.approx(
         13.0 * shares / 200.0
@@ -80,7 +80,7 @@ def test_effort_of_a_hand_counts_by_its_share() -> None:
 
 def test_the_smaller_of_opposed_torques_cancels() -> None:
     """Joint 1 has 3 against -1, joint 2 has 2 and 1: 1 N m of joint 1 cancels on both sides, of 7 in all."""
-    figures = compute_log_metrics(make_pushed_log()).run
+    figures = LogMetrics.of_log(make_pushed_log()).run
     assert figures["internal_rms_nm"].value == pytest.approx(1.0)
     assert figures["internal_share"].value == pytest.approx(2.0 / 7.0)
     assert not figures["internal_rms_n"].applies
@@ -92,14 +92,16 @@ def test_three_users_cancel_except_the_remaining_torque() -> None:
         "RAMP", "0.5"
     )
     text = text.replace("[[timeline]]", "m3 = { s = 1.0 }\n[[timeline]]")
-    figures = compute_log_metrics(push_users(trilat_net.simulate(parse_scenario(text)))).run
+    figures = LogMetrics.of_log(push_users(trilat_net.simulate(parse_scenario(text)))).run
     assert figures["internal_rms_nm"].value == pytest.approx(3.0)
     assert figures["internal_share"].value == pytest.approx(8.0 / 12.0)
 
 
 def test_a_takeover_lasts_until_the_larger_share() -> None:
     """The ramp of 0.5 s passes 1/2 at 1.25 s: ticks 0 to 249 of 400 are m1's; at equal shares m2 leads."""
-    run = measure_run(make_pushed_log(), ["intervention_share", "takeovers", "takeover_s"])
+    run = LogMetrics.measure_run(
+        make_pushed_log(), ["intervention_share", "takeovers", "takeover_s"]
+    )
     assert {key: figure.value for key, figure in run.items()} == {
         "intervention_share": pytest.approx(250.0 / 400.0),
         "takeovers": 1.0,
@@ -111,12 +113,12 @@ def test_the_log_names_the_program_as_user() -> None:
     """m1 leads for ticks 0 to 249, and at tick 250, with equal shares, if m1 is the program."""
     event = Event(member="m1", boot=1, kind="hand", text="m1: policy takes hold at t = 0.000 s")
     log = rewrite_log(make_pushed_log(), others=[event])
-    figure = measure_run(log, ["intervention_share"])["intervention_share"]
+    figure = LogMetrics.measure_run(log, ["intervention_share"])["intervention_share"]
     assert figure.value == pytest.approx(149.0 / 400.0)
 
 
 def test_a_step_of_shares_takes_over_at_once() -> None:
-    assert compute_log_metrics(make_pushed_log(ramp_s=0.0)).run[
+    assert LogMetrics.of_log(make_pushed_log(ramp_s=0.0)).run[
         "takeover_s"
     ].value == pytest.approx(0.0, abs=1e-9)
 
@@ -126,12 +128,12 @@ def test_a_step_of_shares_takes_over_at_once() -> None:
 )
 def test_a_jump_counts_while_shares_change(tick: int, jump: float) -> None:
     """A step of 4 mrad among those of 1 mrad: of the ramp from tick 200 to 300, or of the rest."""
-    figure = compute_log_metrics(make_pushed_log(steps={tick: 4e-3})).run["lead_jump"]
+    figure = LogMetrics.of_log(make_pushed_log(steps={tick: 4e-3})).run["lead_jump"]
     assert figure.value == pytest.approx(jump, rel=1e-6)
 
 
 def test_two_sites_have_no_users_who_share() -> None:
-    figures = compute_log_metrics(trilat_net.simulate("two_sites", {"duration_s": 0.1})).run
+    figures = LogMetrics.of_log(trilat_net.simulate("two_sites", {"duration_s": 0.1})).run
     assert {figures[key].applies for key in ("internal_share", "takeovers", "lead_jump")} == {
         False
     }
@@ -153,7 +155,7 @@ def test_shares_are_identified_from_motion() -> None:
         first, second = (np.array(rates[peer](state.used[peer])) for peer in ("m1", "m2"))
         return msgspec.structs.replace(state, qd=(0.6 * first + 0.4 * second).tolist())
 
-    metrics = compute_log_metrics(rewrite_log(make_pushed_log(), change=change))
+    metrics = LogMetrics.of_log(rewrite_log(make_pushed_log(), change=change))
     assert metrics.sites["m1"]["motion_share"].value == pytest.approx(0.6)
     assert metrics.sites["m2"]["motion_share"].value == pytest.approx(0.4)
     assert not metrics.sites["s"]["motion_share"].applies
@@ -163,7 +165,7 @@ def test_users_moving_alike_are_not_separated() -> None:
     log = rewrite_log(
         make_pushed_log(), change=lambda state: msgspec.structs.replace(state, qd=[1.0, 0.5])
     )
-    assert "not independent" in compute_log_metrics(log).sites["m1"]["motion_share"].why
+    assert "not independent" in LogMetrics.of_log(log).sites["m1"]["motion_share"].why
 
 
 def test_contradictory_motion_of_the_slave_has_no_shares() -> None:
@@ -174,5 +176,5 @@ def test_contradictory_motion_of_the_slave_has_no_shares() -> None:
         moves = {"m1": [1.0, 0.0], "m2": [0.0, 1.0], "s": [5.0 * sign, 0.0]}
         return msgspec.structs.replace(state, qd=moves[state.site])
 
-    metrics = compute_log_metrics(rewrite_log(make_pushed_log(), change=change))
+    metrics = LogMetrics.of_log(rewrite_log(make_pushed_log(), change=change))
     assert "does not determine" in metrics.sites["m1"]["motion_share"].why

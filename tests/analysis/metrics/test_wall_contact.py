@@ -6,10 +6,10 @@ import pytest
 
 from tests.analysis.builders import make_pair_log, make_run
 from tests.log.builders import rewrite_log
-from trilat_net.analysis.aligned import align_records
+from trilat_net.analysis.aligned import AlignedRecords
 from trilat_net.analysis.arm_rows import build_arm_rows
-from trilat_net.analysis.metrics.log_metrics import compute_log_metrics
-from trilat_net.analysis.torque_sources import wall_force
+from trilat_net.analysis.metrics.log_metrics import LogMetrics
+from trilat_net.analysis.torque_sources import VirtualWall
 from trilat_net.core.arms.two_link_arm import JOINTS
 
 WALL = """
@@ -31,7 +31,7 @@ def swing_arm(_: str, t_s: float) -> dict[str, list[float]]:
 def test_force_depth_and_hits_of_a_swing() -> None:
     """2 cos q > 1.9 m twice a period; K depth - B outward speed, never pulling."""
     log = make_pair_log(swing_arm, more=WALL)
-    figures = compute_log_metrics(log).walls["s/1"]
+    figures = LogMetrics.of_log(log).walls["s/1"]
     force = []
     for t_s in log["s"].t_s.tolist():
         pose = swing_arm("s", t_s)
@@ -51,7 +51,7 @@ def test_force_depth_and_hits_of_a_swing() -> None:
 
 
 def test_contact_from_the_first_record_is_no_hit() -> None:
-    metrics = compute_log_metrics(
+    metrics = LogMetrics.of_log(
         make_pair_log(lambda _, __: {"q": [0.0] * JOINTS, "qd": [0.0] * JOINTS}, more=WALL)
     ).walls["s/1"]
     assert metrics["hits"].value == 0.0
@@ -65,15 +65,13 @@ def test_contact_that_began_in_gaps_is_no_hit() -> None:
     torn = rewrite_log(
         whole, lambda state: not (state.site == "s" and 120 <= state.tick % 200 < 140)
     )
-    before, after = (
-        compute_log_metrics(log).walls["s/1"]["hits"].value for log in (whole, torn)
-    )
+    before, after = (LogMetrics.of_log(log).walls["s/1"]["hits"].value for log in (whole, torn))
     assert (before, after) == (8.0, 4.0)
 
 
 def test_contact_matches_the_scenario_text() -> None:
     """20 ms: one hit, then 3.3 N."""
-    metrics = compute_log_metrics(
+    metrics = LogMetrics.of_log(
         make_run("contact", {"link.delay_ms": 20.0, "duration_s": 11.0, "rate_hz": 200}).log
     ).walls["s/1"]
     assert metrics["hits"].value == 1.0
@@ -83,7 +81,7 @@ def test_contact_matches_the_scenario_text() -> None:
 
 def test_contact_at_200_ms_hammers() -> None:
     """8 +- 14 N, peak 52 N."""
-    figures = compute_log_metrics(make_run("contact", {"rate_hz": 200}).log).walls["s/1"]
+    figures = LogMetrics.of_log(make_run("contact", {"rate_hz": 200}).log).walls["s/1"]
     assert figures["force_peak_n"].value == pytest.approx(52.0, abs=0.5)
     assert figures["end_force_mean_n"].value == pytest.approx(8.0, rel=0.15)
     assert figures["end_force_deviation_n"].value == pytest.approx(14.0, rel=0.05)
@@ -94,8 +92,9 @@ def test_the_force_of_windup_creeps() -> None:
     """4.3 and 8.5 N at 10 and 20 s."""
     log = make_run("windup", {"duration_s": 40.0, "rate_hz": 50}).log
     spec = log.scenario.sites["s"]
-    track = align_records(log)["s"]
+    track = AlignedRecords.by_site(log)["s"]
     end_effector = build_arm_rows(log.scenario, "s").place_end_effector(track.q, track.qd)
-    force = wall_force(spec.environment[0].actor, track.nominal_s, end_effector)
+    (wall,) = VirtualWall.list_of_site(spec)
+    force = wall.find_force(track.nominal_s, end_effector)
     assert force[50 * 10] == pytest.approx(4.3, abs=0.05)
     assert force[50 * 20] == pytest.approx(8.5, abs=0.1)

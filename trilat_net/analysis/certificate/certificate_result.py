@@ -26,7 +26,6 @@ from ..twins.twin_growth import TwinGrowth
 from .energy_balance import EnergyBalance, SiteEnergy
 from .observed_energy import ObservedEnergy, ObservedFinding
 from .premise_quantities import Premise
-from .premises import find_unjudged_spans
 from .verdict_facts import Evidence, FunctionalRise, StabilityFinding, StabilityVerdict
 
 _REFUTING_FINDINGS = (ObservedFinding.NEGATIVE, ObservedFinding.BROKEN)
@@ -329,7 +328,7 @@ def _functional_to_json(certificate: Certificate, balance: EnergyBalance) -> Jso
         "sites_unexplained_max_j": {
             site: _largest(energy.unexplained) for site, energy in sites.items()
         },
-        "not_judged_s": find_unjudged_spans(balance),
+        "not_judged_s": balance.unjudged_spans,
         "ones": paper_json,
     }
 

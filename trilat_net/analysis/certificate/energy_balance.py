@@ -30,19 +30,11 @@ import numpy as np
 from ...core import Array, Scheme
 from ...log import Log
 from ...scenario import Scenario
-from ..aligned import (
-    AlignedRecords,
-    Bools,
-    DelayedPeer,
-    PeerTrajectory,
-    align_records,
-    view_delayed_peer,
-)
-from ..dominance_history import DominanceHistory, compute_lyapunov_weights, trace_dominance
+from ..aligned import AlignedRecords, Bools, DelayedPeer, PeerTrajectory
+from ..dominance_history import DominanceHistory, compute_lyapunov_weights
 from ..row_reductions import any_in_rows, sum_rows
 from ..torque_sources import TorqueSplit
-from . import energy_terms
-from .energy_terms import FunctionalParts, Increment, SiteMotion
+from .energy_terms import FunctionalParts, Increment, SiteConstants, SiteMotion
 from .verdict_facts import FunctionalRise, UnsuppliedGrowth
 
 MIN_PERIODS = 10
@@ -230,6 +222,94 @@ class SiteEnergy:
             error_j += 2.0 * largest_energy
         return error_j
 
+    @classmethod
+    def by_site(cls, log: Log) -> "dict[str, SiteEnergy]":
+        """Computes from a log the energy of each arm that the stability proof uses.
+
+        An energy function must exist for the control law of every arm.
+
+        Args:
+            log: The log of the run.
+
+        Returns:
+            The energies, by name of the site. Empty if there are no two ticks at which the
+            energies of all sites can be computed.
+
+        Raises:
+            LogError: A recorded change of the settings, such as of a dominance factor, is not
+                valid.
+        """
+        records = AlignedRecords.by_site(log, common=True)
+        pasts = {}
+        for site, site_records in records.items():
+            pasts[site] = PeerTrajectory(site_records)
+        dominance = partial(DominanceHistory.of_log, log)
+        energies = SiteEnergy.derive_all(log.scenario, records, pasts, dominance)
+        if not energies or len(find_common_times(energies)) < 2:
+            return {}
+        return energies
+
+    @classmethod
+    def derive_all(
+        cls,
+        scenario: Scenario,
+        records: Mapping[str, AlignedRecords],
+        pasts: Mapping[str, PeerTrajectory],
+        dominance: Callable[[str, Array], DominanceHistory],
+    ) -> "dict[str, SiteEnergy]":
+        """Computes the energy of each arm in the stability proof, and all that changes it.
+
+        An energy function must exist for the control law of every arm.
+
+        Args:
+            scenario: The description of the experiment.
+            records: Records of every site, by name.
+            pasts: Motion of every site over time, by name. It must reach back to the time at
+                which the oldest state that a site uses was sent.
+            dominance: Function that returns the dominance factors of a site, the weights with
+                which it follows its peers, at given times in s.
+
+        Returns:
+            The energies, by name of the site.
+        """
+        energies = {}
+        constants = {}
+        followed_axes = []
+        for site in records:
+            site_constants = SiteConstants.derive(scenario, site)
+            constants[site] = site_constants
+            if site_constants.axes:
+                followed_axes.append(site_constants.axes)
+        common_axes: tuple[float, ...] = ()
+        if followed_axes:
+            # 1 along the axes that all sites follow
+            products = np.prod(followed_axes, axis=0)
+            common_axes = tuple(products.tolist())
+        transferred_axes = np.array(common_axes or 1.0)
+
+        for site, site_records in records.items():
+            peers = {}
+            for peer in site_records.used:
+                peers[peer] = site_records.view_delayed_peer(pasts[peer])
+            motion = SiteMotion(
+                records=site_records,
+                constants=constants[site],
+                dominance=dominance(site, site_records.t_s),
+                peers=peers,
+                torque=TorqueSplit.of_records(site_records, scenario),
+                scheme=Scheme[scenario.scheme.upper()],
+                common=common_axes,
+            )
+            energies[site] = SiteEnergy(
+                motion=motion,
+                parts=motion.evaluate_functional(),
+                dissipation=motion.compute_dissipation(),
+                transfer=motion.compute_transfer(transferred_axes),
+                work=motion.compute_work(),
+                sampling=motion.compute_sampling_work(),
+            )
+        return energies
+
 
 def _accumulate(amounts: Array, judged: Bools | None = None) -> Array:
     """Returns the cumulative sum of amounts, such as energies per period, shape (K,), from 0.
@@ -242,93 +322,6 @@ def _accumulate(amounts: Array, judged: Bools | None = None) -> Array:
         amounts = np.where(judged, amounts, 0.0)
     sums = np.cumsum(amounts)
     return np.concatenate([[0.0], sums])
-
-
-def compute_site_energies(log: Log) -> dict[str, SiteEnergy]:
-    """Computes from a log the energy of each arm that the stability proof uses.
-
-    An energy function must exist for the control law of every arm.
-
-    Args:
-        log: The log of the run.
-
-    Returns:
-        The energies, by name of the site. Empty if there are no two ticks at which the energies
-        of all sites can be computed.
-
-    Raises:
-        LogError: A recorded change of the settings, such as of a dominance factor, is not
-            valid.
-    """
-    records = align_records(log, common=True)
-    pasts = {}
-    for site, site_records in records.items():
-        pasts[site] = PeerTrajectory(site_records)
-    dominance = partial(trace_dominance, log)
-    energies = derive_site_energies(log.scenario, records, pasts, dominance)
-    if not energies or len(find_common_times(energies)) < 2:
-        return {}
-    return energies
-
-
-def derive_site_energies(
-    scenario: Scenario,
-    records: Mapping[str, AlignedRecords],
-    pasts: Mapping[str, PeerTrajectory],
-    dominance: Callable[[str, Array], DominanceHistory],
-) -> dict[str, SiteEnergy]:
-    """Computes the energy of each arm in the stability proof, and everything that changes it.
-
-    An energy function must exist for the control law of every arm.
-
-    Args:
-        scenario: The description of the experiment.
-        records: Records of every site, by name.
-        pasts: Motion of every site over time, by name. It must reach back to the time at which
-            the oldest state that a site uses was sent.
-        dominance: Function that returns the dominance factors of a site, the weights with which
-            it follows its peers, at given times in s.
-
-    Returns:
-        The energies, by name of the site.
-    """
-    energies = {}
-    constants = {}
-    followed_axes = []
-    for site in records:
-        site_constants = energy_terms.derive_site_constants(scenario, site)
-        constants[site] = site_constants
-        if site_constants.axes:
-            followed_axes.append(site_constants.axes)
-    common_axes: tuple[float, ...] = ()
-    if followed_axes:
-        # 1 along the axes that all sites follow
-        products = np.prod(followed_axes, axis=0)
-        common_axes = tuple(products.tolist())
-    transferred_axes = np.array(common_axes or 1.0)
-
-    for site, site_records in records.items():
-        peers = {}
-        for peer in site_records.used:
-            peers[peer] = view_delayed_peer(site_records, pasts[peer])
-        motion = SiteMotion(
-            records=site_records,
-            constants=constants[site],
-            dominance=dominance(site, site_records.t_s),
-            peers=peers,
-            torque=TorqueSplit.of_records(site_records, scenario),
-            scheme=Scheme[scenario.scheme.upper()],
-            common=common_axes,
-        )
-        energies[site] = SiteEnergy(
-            motion=motion,
-            parts=energy_terms.evaluate_functional(motion),
-            dissipation=energy_terms.compute_dissipation(motion),
-            transfer=energy_terms.compute_transfer(motion, transferred_axes),
-            work=energy_terms.compute_work(motion),
-            sampling=energy_terms.compute_sampling_work(motion),
-        )
-    return energies
 
 
 def find_common_times(energies: Mapping[str, SiteEnergy]) -> Array:
@@ -380,6 +373,20 @@ class EnergyBalance:
     sampling: Array
     transfer: Array
     judged: Bools
+
+    @cached_property
+    def unjudged_spans(self) -> list[tuple[float, float]]:
+        """The spans of time in which V cannot be judged because records are missing.
+
+        Each has a start and an end, in s. The list is empty if V can be judged all the time.
+        """
+        # Judged periods before and after the run give each span a start and an end.
+        padded = np.concatenate([[True], self.judged, [True]])
+        edges = np.flatnonzero(np.diff(padded.astype(np.int8)))
+        times = self.t_s[edges]
+        starts_s = times[::2].tolist()
+        ends_s = times[1::2].tolist()
+        return list(zip(starts_s, ends_s, strict=True))
 
     @cached_property
     def V(self) -> Array:  # noqa: N802 - the paper's symbol
@@ -554,94 +561,94 @@ class EnergyBalance:
             )
         return growths
 
+    @classmethod
+    def of_energies(
+        cls, energies: Mapping[str, SiteEnergy], *, paper_weights: bool = False
+    ) -> "EnergyBalance":
+        """Adds up the energies of several sites to the energy balance of the group.
 
-def compute_energy_balance(
-    energies: Mapping[str, SiteEnergy], *, paper_weights: bool = False
-) -> EnergyBalance:
-    """Adds up the energies of several sites to the energy balance of the group.
-
-    The sites are weighted such that the energies that they transfer to each other cancel in the
-    sum.
-
-    Args:
-        energies: Energies of the sites in scenario order. No site may follow a site outside the
-            group.
-        paper_weights: True to give all sites the same weight, as in the paper on which the
-            control law is based. The transferred energies may then fail to cancel, in which
-            case the balance does not close.
-    """
-    times = find_common_times(energies)
-    weights_by_grid = {}
-    beta_columns = []
-    sites = {}
-    unjudged = np.zeros(len(times))
-    sums: dict[_EnergyKey, Array] = {}
-    for n, (site, energy) in enumerate(energies.items()):
-        records = energy.motion.records
-        t_s = records.t_s
-        # sites with the same ticks share their weights
-        count = len(records.known)
-        grid = (records.first, count, records.rate_hz)
-        if grid not in weights_by_grid:
-            weights_by_grid[grid] = _trace_weights(
-                energies, records, paper_weights=paper_weights
-            )
-
-        beta_left, beta_right = weights_by_grid[grid]
-        left = beta_left[:, n]
-        right = beta_right[:, n]
-        weighted = _weigh_site(energy, left, right)
-        for key, amounts in weighted.items():
-            resampled = _resample(times, t_s, amounts)
-            if key in sums:
-                resampled = sums[key] + resampled
-            sums[key] = resampled
-        beta_columns.append(_resample(times, t_s, left))
-        weighted_V = left * energy.parts.total
-        sites[site] = _resample(times, t_s, weighted_V)
-
-        is_unjudged = (~energy.judged).astype(np.float64)
-        unjudged_periods = _accumulate(is_unjudged)
-        resampled_periods = _resample(times, t_s, unjudged_periods)
-        unjudged += np.abs(resampled_periods)
-
-    judged: Bools = np.diff(unjudged) == 0.0
-    all_judged = bool(judged.all())
-
-    def select(kind: str) -> dict[str, Array]:
-        """Returns the accumulated energies of one kind, such as dissipation.
+        The sites are weighted such that the energies that they transfer to each other cancel in
+        the sum.
 
         Args:
-            kind: The kind, such as "dissipation" or "work".
-
-        Returns:
-            The energies over the judged periods, in J, by name, such as "damping". Each starts
-            with 0.
+            energies: Energies of the sites in scenario order. No site may follow a site outside
+                the group.
+            paper_weights: True to give all sites the same weight, as in the paper on which the
+                control law is based. The transferred energies may then fail to cancel, in which
+                case the balance does not close.
         """
-        selected = {}
-        for (group, name), energy in sums.items():
-            if group != kind:
-                continue
-            if all_judged:
-                selected[name] = energy - energy[0]
-            else:
-                selected[name] = _accumulate(np.diff(energy), judged)
-        return selected
+        times = find_common_times(energies)
+        weights_by_grid = {}
+        beta_columns = []
+        sites = {}
+        unjudged = np.zeros(len(times))
+        sums: dict[_EnergyKey, Array] = {}
+        for n, (site, energy) in enumerate(energies.items()):
+            records = energy.motion.records
+            t_s = records.t_s
+            # sites with the same ticks share their weights
+            count = len(records.known)
+            grid = (records.first, count, records.rate_hz)
+            if grid not in weights_by_grid:
+                weights_by_grid[grid] = _trace_weights(
+                    energies, records, paper_weights=paper_weights
+                )
 
-    parts = {}
-    for name in FunctionalParts._fields:
-        parts[name] = sums["parts", name]
-    return EnergyBalance(
-        t_s=times,
-        beta=np.stack(beta_columns, axis=1),
-        sites=sites,
-        parts=parts,
-        dissipation=select("dissipation"),
-        work=select("work"),
-        sampling=select("sampling")[""],
-        transfer=select("transfer")[""],
-        judged=judged,
-    )
+            beta_left, beta_right = weights_by_grid[grid]
+            left = beta_left[:, n]
+            right = beta_right[:, n]
+            weighted = _weigh_site(energy, left, right)
+            for key, amounts in weighted.items():
+                resampled = _resample(times, t_s, amounts)
+                if key in sums:
+                    resampled = sums[key] + resampled
+                sums[key] = resampled
+            beta_columns.append(_resample(times, t_s, left))
+            weighted_V = left * energy.parts.total
+            sites[site] = _resample(times, t_s, weighted_V)
+
+            is_unjudged = (~energy.judged).astype(np.float64)
+            unjudged_periods = _accumulate(is_unjudged)
+            resampled_periods = _resample(times, t_s, unjudged_periods)
+            unjudged += np.abs(resampled_periods)
+
+        judged: Bools = np.diff(unjudged) == 0.0
+        all_judged = bool(judged.all())
+
+        def select(kind: str) -> dict[str, Array]:
+            """Returns energies of one kind, such as dissipation, summed over judged periods.
+
+            Args:
+                kind: The kind, such as "dissipation" or "work".
+
+            Returns:
+                The energies over the judged periods, in J, by name, such as "damping". Each
+                starts with 0.
+            """
+            selected = {}
+            for (group, name), energy in sums.items():
+                if group != kind:
+                    continue
+                if all_judged:
+                    selected[name] = energy - energy[0]
+                else:
+                    selected[name] = _accumulate(np.diff(energy), judged)
+            return selected
+
+        parts = {}
+        for name in FunctionalParts._fields:
+            parts[name] = sums["parts", name]
+        return cls(
+            t_s=times,
+            beta=np.stack(beta_columns, axis=1),
+            sites=sites,
+            parts=parts,
+            dissipation=select("dissipation"),
+            work=select("work"),
+            sampling=select("sampling")[""],
+            transfer=select("transfer")[""],
+            judged=judged,
+        )
 
 
 def _weigh_site(

@@ -168,37 +168,37 @@ class SiteConstants(NamedTuple):
         """
         return self.Gamma > 0.0
 
+    @classmethod
+    def derive(cls, scenario: Scenario, site: str) -> "SiteConstants":
+        """Collects the gains, limits and arm parameters of one arm from the scenario.
 
-def derive_site_constants(scenario: Scenario, site: str) -> SiteConstants:
-    """Collects the gains, limits and arm parameters of one arm from the scenario.
+        The arm must have the adaptive control law, and its parameters must be known.
 
-    The arm must have the adaptive control law, and its parameters must be known.
+        Args:
+            scenario: The description of the experiment, which defines the gains.
+            site: Name of the site, the process that runs one arm.
+        """
+        arm = build_arm_rows(scenario, site)
+        gains = scenario.gains(site)
+        limits = scenario.sites[site].limits
+        gain_arrays = {}
+        for name in _GAIN_NAMES:
+            gain = getattr(gains, name)
+            gain_arrays[name] = np.array(gain)
 
-    Args:
-        scenario: The description of the experiment, which defines the gains.
-        site: Name of the site, the process that runs one arm.
-    """
-    arm = build_arm_rows(scenario, site)
-    gains = scenario.gains(site)
-    limits = scenario.sites[site].limits
-    gain_arrays = {}
-    for name in _GAIN_NAMES:
-        gain = getattr(gains, name)
-        gain_arrays[name] = np.array(gain)
-
-    axes: tuple[float, ...] = ()
-    if arm.task is not None:
-        axes = arm.task.axes
-        followed_axes = np.array(axes)
-        for name in ("Lambda", "Kd"):
-            gain_arrays[name] = followed_axes * gain_arrays[name]
-    return SiteConstants(
-        **gain_arrays,
-        arm=arm,
-        axes=axes,
-        tau_limit=np.asarray(limits.tau_limit_nm, dtype=np.float64),
-        tau_rate=np.asarray(limits.motion.tau_rate, dtype=np.float64),
-    )
+        axes: tuple[float, ...] = ()
+        if arm.task is not None:
+            axes = arm.task.axes
+            followed_axes = np.array(axes)
+            for name in ("Lambda", "Kd"):
+                gain_arrays[name] = followed_axes * gain_arrays[name]
+        return cls(
+            **gain_arrays,
+            arm=arm,
+            axes=axes,
+            tau_limit=np.asarray(limits.tau_limit_nm, dtype=np.float64),
+            tau_rate=np.asarray(limits.motion.tau_rate, dtype=np.float64),
+        )
 
 
 class _PeriodEnds(NamedTuple):
@@ -514,6 +514,317 @@ class SiteMotion:
             qd_des_right=qd_des_right,
         )
 
+    def evaluate_functional(self) -> "FunctionalParts":
+        """Computes the energy V_i of a site in the stability proof at each of its K records.
+
+        The module's docstring has the equation. The parts are returned separately, because
+        figures and the certificate show them.
+
+        Returns:
+            Four parts of the energy: of the filtered error, of the parameter estimates, of the
+            synchronisation error, and of the delay.
+        """
+        records = self.records
+        c = self.constants
+        r = self.r
+        momentum = c.arm.multiply_inertia(records.q, r)
+        r_M_r = _dot_rows(r, momentum)
+
+        parameter_error = records.theta_hat - c.theta
+        adapted_error = parameter_error[:, c.adapts]
+        adapted_Gamma = c.Gamma[c.adapts]
+        scaled_squares = adapted_error**2 / adapted_Gamma
+        stiffness = c.Lambda * c.Kd
+        squared_e = records.e**2
+        e_K_e = _dot_rows(stiffness, squared_e)
+
+        delay_terms = []
+        for j, peer_motion in enumerate(self.peers.values()):
+            alpha = self.dominance.alpha[:, j]
+            delay_terms.append(alpha * _energy_in_transit(c, peer_motion))
+        return FunctionalParts(
+            kinetic=0.5 * r_M_r,
+            parameter=0.5 * sum_rows(scaled_squares),
+            position=0.5 * e_K_e,
+            delay=np.sum(delay_terms, axis=0),
+        )
+
+    def compute_dissipation(self) -> "dict[str, Increment]":
+        """Computes the energy that the controller of a site dissipates in each tick period.
+
+        The result has these kinds of energy:
+
+        - damping: the work of the damping and of the robust torque, which both act against the
+          filtered error r.
+        - disagreement: half the squared difference between the velocity of the site and the
+        delayed
+          velocity of each peer, weighted with the dominance factor of the peer and the gain Kd.
+        - friction, if the joints have any: the work r'(friction(qd) - friction(qd - r)), with
+        the
+          joint velocities qd.
+        - open axes: the energy that the site gives to others along the axes of space that not
+        all
+          sites follow. It is missing if all sites follow along all axes.
+
+        Returns:
+            The energies, by kind.
+        """
+        records = self.records
+        c = self.constants
+        ends = self.ends
+        dominance = self.dominance
+        rate = records.shared_rate
+        rate_left = rate[:-1]
+        rate_right = rate[1:]
+        periods = len(records.known) - 1
+        left = np.zeros(periods)
+        right = left
+        for j, peer_motion in enumerate(self.peers.values()):
+            difference_left = rate_left - peer_motion.delayed.qd[:-1]
+            difference_right = rate_right - peer_motion.delayed_end.qd
+            squared_left = _weighted_square(c, difference_left)
+            squared_right = _weighted_square(c, difference_right)
+            half_alpha_left = 0.5 * dominance.alpha[:-1, j]
+            half_alpha_right = 0.5 * dominance.before[:, j]
+            left = left + half_alpha_left * squared_left
+            right = right + half_alpha_right * squared_right
+
+        def damping_power(r: Array) -> Array:
+            """Returns the power that the damping of the control law dissipates, in W."""
+            torque = c.Kp * r + c.robust_torque(r)
+            return _dot_rows(r, torque)
+
+        def friction_power(r: Array, qd: Array) -> Array:
+            """Returns the power that uncompensated friction dissipates, in W."""
+            friction = c.arm.friction(qd)
+            torque = friction - c.arm.friction(qd - r)
+            return _dot_rows(r, torque)
+
+        damping_left = damping_power(ends.r_left)
+        damping_right = damping_power(ends.r_right)
+        dissipation = {
+            "damping": _trapezoid(self, damping_left, damping_right),
+            "disagreement": _trapezoid(self, left, right),
+        }
+        if not all(self.common):
+            open_axes = 1.0 - np.array(self.common)
+            dissipation["open axes"] = self.compute_transfer(open_axes)
+
+        qd_left = records.qd[:-1]
+        qd_right = records.qd[1:]
+        friction_left = friction_power(ends.r_left, qd_left)
+        friction_right = friction_power(ends.r_right, qd_right)
+        if friction_left.any() or friction_right.any():
+            dissipation["friction"] = _trapezoid(self, friction_left, friction_right)
+        return dissipation
+
+    def compute_transfer(self, axes: Array) -> "Increment":
+        """Computes the energy that a site gives to sites which follow it, minus what it gets.
+
+        It is the given energy minus the received energy: in each tick period the integral of
+        1/2 qd_i'Kd qd_i - 1/2 sum_j alpha_ij qd_j'Kd qd_j. Here qd_i is the velocity of the
+        site and qd_j of its peer j, Kd is the damping gain, and alpha_ij is the dominance
+        factor: the weight with which site i follows peer j. In the weighted sum over all sites
+        these energies cancel.
+
+        Args:
+            axes: 1 for each of the m coordinates to include, and 0 for each other coordinate,
+                shape (m,). The shape () applies to all coordinates.
+        """
+        dominance = self.dominance
+        Kd_of_axes = axes * self.constants.Kd
+        c = self.constants._replace(Kd=Kd_of_axes)
+
+        site_power = 0.5 * _weighted_square(c, self.records.shared_rate)
+        left = site_power[:-1]
+        right = site_power[1:]
+        for j, peer_motion in enumerate(self.peers.values()):
+            alpha_left = dominance.alpha[:-1, j]
+            alpha_right = dominance.before[:, j]
+            peer_power = 0.5 * _weighted_square(c, peer_motion.now.qd)
+            left = left - alpha_left * peer_power[:-1]
+            right = right - alpha_right * peer_power[1:]
+        return _trapezoid(self, left, right)
+
+    def compute_work(self) -> "dict[str, Increment]":
+        """Computes the work on a site in each tick period, by source.
+
+        The sources are all effects that may raise the site's energy function V_i, except the
+        transfer between sites: operators, environments, links, changes and limits.
+        """
+        torque = self.torque
+        records = self.records
+        c = self.constants
+        stops = c.arm.stop_torque(records.q, records.qd)
+        work = {
+            "hands": self.compute_torque_work(torque.operator_now, torque.operator_held),
+            "walls": self.compute_torque_work(torque.environment_now, torque.environment_held),
+        }
+        if stops.any():
+            no_torque = np.zeros_like(stops)
+            work["stops"] = self.compute_torque_work(stops, no_torque)
+
+        for j, peer in enumerate(self.peers):
+            work[f"{peer}->{records.site}"] = self.compute_link_work(j)
+        work["shares"] = self.compute_dominance_work()
+        work["rule"] = _stale_rule_work(self)
+        work["torque limit"] = _torque_limit_work(self)
+        work["estimates"] = _estimate_work(self)
+
+        if c.unknown_friction.any():
+            work["friction"] = _unknown_friction_work(self)
+        if c.axes:
+            work["singular poses"] = _singular_pose_work(self)
+        return work
+
+    def compute_torque_work(self, now: Array, held: Array) -> "Increment":
+        """Computes the work of an external torque on the arm in each tick period.
+
+        In the stability proof, a torque does work on the filtered error r instead of the joint
+        velocity. The work is the integral of r' times the torque.
+
+        Args:
+            now: Part of the torque that follows the motion continuously, shape (K, n), in N m.
+            held: Part of the torque that is computed once per tick and held, shape (K, n), in N
+                m.
+        """
+        torque_left = now[:-1] + held[:-1]
+        torque_right = now[1:] + held[:-1]
+        power_left = _dot_rows(self.ends.r_left, torque_left)
+        power_right = _dot_rows(self.ends.r_right, torque_right)
+        return _trapezoid(self, power_left, power_right)
+
+    def compute_link_work(self, j: int) -> "Increment":
+        """Returns the work of the link from peer j: the change of V_i as the age jumps.
+
+        At the end of a period the sample in use is replaced. The time of the old sample, sent
+        at s, has advanced to s + h, and the new sample was sent at s'. With r and e half-way
+        through the jump, and de the jump of e by this link, the work is exactly
+
+            (Lambda M r + Lambda Kd e)' de - 1/2 alpha_ij int qd_j' Kd qd_j ds from s + h to s'.
+
+        For an age that varies smoothly this is the integral of the term with dT/dt that the
+        theorem leaves out.
+
+        Args:
+            j: Index of the peer.
+        """
+        peer_motion = list(self.peers.values())[j]
+        squares_before_jump = peer_motion.delayed_end.squares
+        squares_after_jump = peer_motion.delayed.squares[1:]
+        integral_of_squares = squares_before_jump - squares_after_jump
+        energy_in_transit = 0.5 * integral_of_squares @ self.constants.Kd
+        jump = _energy_of_jump(self, self.ends.link[j])
+        alpha = self.dominance.before[:, j]
+        return _jump_alone(jump + alpha * energy_in_transit)
+
+    def compute_dominance_work(self) -> "Increment":
+        """Computes the energy that a change of dominance factors adds to V_i of a site.
+
+        The dominance factor alpha_ij is the weight with which site i follows its peer j. Along
+        a ramp, the power of the change is
+
+            1/2 sum_j w_j int qd_j' Kd qd_j ds + qd_i' Kd sum_j w_j q_j(t - T_ij)
+
+        with w_j the time derivative of alpha_ij, T_ij the delay, Kd the damping gain, and q and
+        qd positions and velocities. The integral covers the last T_ij seconds. The second term
+        arises because the velocity error of the site contains w_j. A sudden change adds the
+        energy of the jump. The effect on the weights of the sites in the total energy is not
+        included.
+        """
+        records = self.records
+        c = self.constants
+        dominance = self.dominance
+        ends = self.ends
+        if dominance.constant:
+            return _zero_increment(self)
+        periods = len(records.known) - 1
+        left = np.zeros(periods)
+        right = left
+        jump = _energy_of_jump(self, ends.dominance)
+        qd_left = records.shared_rate[:-1]
+        qd_right = records.shared_rate[1:]
+
+        for j, peer_motion in enumerate(self.peers.values()):
+            energy_in_transit = _energy_in_transit(c, peer_motion)
+            squares_at_end = peer_motion.now.squares[1:]
+            integral_at_end = squares_at_end - peer_motion.delayed_end.squares
+            energy_in_transit_at_end = 0.5 * integral_at_end @ c.Kd
+            alpha_rate = dominance.rate[:-1, j]
+            followed_rate = np.where(ends.following, alpha_rate, 0.0)
+            q_left = peer_motion.delayed.q[:-1]
+            q_right = peer_motion.delayed_end.q
+            ramp_left = _dot_rows(qd_left * c.Kd, q_left)
+            ramp_right = _dot_rows(qd_right * c.Kd, q_right)
+            # the two terms of the power in the docstring, at both ends of every period
+            left = left + alpha_rate * energy_in_transit[:-1]
+            left = left + followed_rate * ramp_left
+            right = right + alpha_rate * energy_in_transit_at_end
+            right = right + followed_rate * ramp_right
+            alpha_next = dominance.alpha[1:, j]
+            alpha_right = dominance.before[:, j]
+            alpha_step = alpha_next - alpha_right
+            jump = jump + alpha_step * energy_in_transit[1:]
+        return _trapezoid(self, left, right, jump)
+
+    def measure_torque_error(self) -> Array:
+        """Computes how much the recorded torques differ from those that the law demands.
+
+        The law is evaluated again from the recorded motion. A large error means that the log
+        was changed, or that the arm ran a different law than the scenario states.
+
+        Returns:
+            The largest difference of all joints, shape (K,), in N m. It is 0 for interpolated
+            records, and while the arm comes to rest.
+        """
+        records = self.records
+        low, high = self.torque_bounds
+        all_rows = np.arange(len(records.known))
+        law_torque = self.law_torque(all_rows)
+        limited_torque = np.clip(law_torque, low, high)
+        errors = np.abs(records.tau - limited_torque)
+        largest = max_rows(errors)
+        is_comparable = records.known & ~self.rests
+        return np.where(is_comparable, largest, 0.0)
+
+    def compute_sampling_work(self) -> "Increment":
+        """Returns the work that arises because the continuous control law is executed in ticks.
+
+        With the filtered error r, the work has two parts:
+
+        - Torque: the integral of r'(u - tau). The torque u is constant within a period, while
+        the
+          torque tau of the continuous law changes linearly until the end of the period.
+        - Parameter estimates: their recorded step, compared with the trapezoid rule for the
+          adaptive law.
+
+        This work is not part of the energy balance. It explains part of the balance's residual.
+        """
+        records = self.records
+        c = self.constants
+        ends = self.ends
+        digital = self.scheme is Scheme.DIGITAL
+        held_torque = hold_torque(records.tau, c.tau_limit, digital=digital)
+        applied_torque = held_torque[:-1]
+        tau_right, Yr_right = _evaluate_before_jump(self)
+
+        # torque: what acted minus the linear course that the trapezoid rule assumes
+        tau_left = records.tau[:-1]
+        mean_tau = 0.5 * (tau_left + tau_right)
+        torque_error = applied_torque - mean_tau
+        mean_r = 0.5 * (ends.r_left + ends.r_right)
+        torque_power = _dot_rows(mean_r, torque_error)
+        torque_part = records.h_s * torque_power
+
+        # estimates: the trapezoid rule of the adaptive law minus its recorded step
+        parameter_error = (records.theta_hat - c.theta) * c.adapts
+        error_sum = parameter_error[1:] + parameter_error[:-1]
+        trapezoid_Yr = 0.5 * (self.Yr[:-1] + Yr_right)
+        Yr_error = trapezoid_Yr - self.mean_Yr
+        half_s = 0.5 * records.h_s
+        estimate_part = half_s * _dot_rows(error_sum, Yr_error)
+        return _jump_alone(torque_part + estimate_part)
+
 
 class FunctionalParts(NamedTuple):
     """Energy of one arm in the stability proof, split into its four parts, in J.
@@ -540,45 +851,6 @@ class FunctionalParts(NamedTuple):
         The shape is (K,), with one entry per record.
         """
         return self.kinetic + self.parameter + self.position + self.delay
-
-
-def evaluate_functional(site: SiteMotion) -> FunctionalParts:
-    """Computes the energy V_i of a site in the stability proof at each of its K records.
-
-    The module's docstring has the equation. The parts are returned separately, because figures
-    and the certificate show them.
-
-    Args:
-        site: Motion of the site.
-
-    Returns:
-        Four parts of the energy: of the filtered error, of the parameter estimates, of the
-        synchronisation error, and of the delay.
-    """
-    records = site.records
-    c = site.constants
-    r = site.r
-    momentum = c.arm.multiply_inertia(records.q, r)
-    r_M_r = _dot_rows(r, momentum)
-
-    parameter_error = records.theta_hat - c.theta
-    adapted_error = parameter_error[:, c.adapts]
-    adapted_Gamma = c.Gamma[c.adapts]
-    scaled_squares = adapted_error**2 / adapted_Gamma
-    stiffness = c.Lambda * c.Kd
-    squared_e = records.e**2
-    e_K_e = _dot_rows(stiffness, squared_e)
-
-    delay_terms = []
-    for j, peer_motion in enumerate(site.peers.values()):
-        alpha = site.dominance.alpha[:, j]
-        delay_terms.append(alpha * _energy_in_transit(c, peer_motion))
-    return FunctionalParts(
-        kinetic=0.5 * r_M_r,
-        parameter=0.5 * sum_rows(scaled_squares),
-        position=0.5 * e_K_e,
-        delay=np.sum(delay_terms, axis=0),
-    )
 
 
 def _dot_rows(x: Array, y: Array) -> Array:
@@ -686,240 +958,10 @@ def _zero_increment(site: SiteMotion) -> Increment:
     return _jump_alone(np.zeros(periods))
 
 
-def compute_dissipation(site: SiteMotion) -> dict[str, Increment]:
-    """Computes the energy that the controller of a site dissipates in each tick period.
-
-    The result has these kinds of energy:
-
-    - damping: the work of the damping and of the robust torque, which both act against the
-      filtered error r.
-    - disagreement: half the squared difference between the velocity of the site and the delayed
-      velocity of each peer, weighted with the dominance factor of the peer and the gain Kd.
-    - friction, if the joints have any: the work r'(friction(qd) - friction(qd - r)), with the
-      joint velocities qd.
-    - open axes: the energy that the site gives to others along the axes of space that not all
-      sites follow. It is missing if all sites follow along all axes.
-
-    Args:
-        site: Motion of the site.
-
-    Returns:
-        The energies, by kind.
-    """
-    records = site.records
-    c = site.constants
-    ends = site.ends
-    dominance = site.dominance
-    rate = records.shared_rate
-    rate_left = rate[:-1]
-    rate_right = rate[1:]
-    periods = len(records.known) - 1
-    left = np.zeros(periods)
-    right = left
-    for j, peer_motion in enumerate(site.peers.values()):
-        difference_left = rate_left - peer_motion.delayed.qd[:-1]
-        difference_right = rate_right - peer_motion.delayed_end.qd
-        squared_left = _weighted_square(c, difference_left)
-        squared_right = _weighted_square(c, difference_right)
-        half_alpha_left = 0.5 * dominance.alpha[:-1, j]
-        half_alpha_right = 0.5 * dominance.before[:, j]
-        left = left + half_alpha_left * squared_left
-        right = right + half_alpha_right * squared_right
-
-    def damping_power(r: Array) -> Array:
-        """Returns the power that the damping of the control law dissipates, in W."""
-        torque = c.Kp * r + c.robust_torque(r)
-        return _dot_rows(r, torque)
-
-    def friction_power(r: Array, qd: Array) -> Array:
-        """Returns the power that uncompensated friction dissipates, in W."""
-        friction = c.arm.friction(qd)
-        torque = friction - c.arm.friction(qd - r)
-        return _dot_rows(r, torque)
-
-    damping_left = damping_power(ends.r_left)
-    damping_right = damping_power(ends.r_right)
-    dissipation = {
-        "damping": _trapezoid(site, damping_left, damping_right),
-        "disagreement": _trapezoid(site, left, right),
-    }
-    if not all(site.common):
-        open_axes = 1.0 - np.array(site.common)
-        dissipation["open axes"] = compute_transfer(site, open_axes)
-
-    qd_left = records.qd[:-1]
-    qd_right = records.qd[1:]
-    friction_left = friction_power(ends.r_left, qd_left)
-    friction_right = friction_power(ends.r_right, qd_right)
-    if friction_left.any() or friction_right.any():
-        dissipation["friction"] = _trapezoid(site, friction_left, friction_right)
-    return dissipation
-
-
-def compute_transfer(site: SiteMotion, axes: Array) -> Increment:
-    """Computes the net energy that a site gives to the sites that follow it.
-
-    It is the given energy minus the received energy: in each tick period the integral of 1/2
-    qd_i'Kd qd_i - 1/2 sum_j alpha_ij qd_j'Kd qd_j. Here qd_i is the velocity of the site and
-    qd_j of its peer j, Kd is the damping gain, and alpha_ij is the dominance factor: the weight
-    with which site i follows peer j. In the weighted sum over all sites these energies cancel.
-
-    Args:
-        site: Motion of the site.
-        axes: 1 for each of the m coordinates to include, and 0 for each other coordinate, shape
-            (m,). The shape () applies to all coordinates.
-    """
-    dominance = site.dominance
-    Kd_of_axes = axes * site.constants.Kd
-    c = site.constants._replace(Kd=Kd_of_axes)
-
-    site_power = 0.5 * _weighted_square(c, site.records.shared_rate)
-    left = site_power[:-1]
-    right = site_power[1:]
-    for j, peer_motion in enumerate(site.peers.values()):
-        alpha_left = dominance.alpha[:-1, j]
-        alpha_right = dominance.before[:, j]
-        peer_power = 0.5 * _weighted_square(c, peer_motion.now.qd)
-        left = left - alpha_left * peer_power[:-1]
-        right = right - alpha_right * peer_power[1:]
-    return _trapezoid(site, left, right)
-
-
 def _weighted_square(c: SiteConstants, x: Array) -> Array:
     """Returns |x|^2 = x'Kd x, weighted with the damping gain, of every row, shape (K,)."""
     weighted_squares = c.Kd * x**2
     return sum_rows(weighted_squares)
-
-
-def compute_work(site: SiteMotion) -> dict[str, Increment]:
-    """Computes the work on a site in each tick period, by source.
-
-    The sources are all effects that may raise the site's energy function V_i, except the
-    transfer between sites: operators, environments, links, changes and limits.
-
-    Args:
-        site: Motion of the site.
-    """
-    torque = site.torque
-    records = site.records
-    c = site.constants
-    stops = c.arm.stop_torque(records.q, records.qd)
-    work = {
-        "hands": torque_work(site, torque.operator_now, torque.operator_held),
-        "walls": torque_work(site, torque.environment_now, torque.environment_held),
-    }
-    if stops.any():
-        no_torque = np.zeros_like(stops)
-        work["stops"] = torque_work(site, stops, no_torque)
-
-    for j, peer in enumerate(site.peers):
-        work[f"{peer}->{records.site}"] = link_work(site, j)
-    work["shares"] = dominance_change_work(site)
-    work["rule"] = _stale_rule_work(site)
-    work["torque limit"] = _torque_limit_work(site)
-    work["estimates"] = _estimate_work(site)
-
-    if c.unknown_friction.any():
-        work["friction"] = _unknown_friction_work(site)
-    if c.axes:
-        work["singular poses"] = _singular_pose_work(site)
-    return work
-
-
-def torque_work(site: SiteMotion, now: Array, held: Array) -> Increment:
-    """Computes the work of an external torque on the arm in each tick period.
-
-    In the stability proof, a torque does work on the filtered error r instead of the joint
-    velocity. The work is the integral of r' times the torque.
-
-    Args:
-        site: Motion of the site.
-        now: Part of the torque that follows the motion continuously, shape (K, n), in N m.
-        held: Part of the torque that is computed once per tick and held, shape (K, n), in N m.
-    """
-    torque_left = now[:-1] + held[:-1]
-    torque_right = now[1:] + held[:-1]
-    power_left = _dot_rows(site.ends.r_left, torque_left)
-    power_right = _dot_rows(site.ends.r_right, torque_right)
-    return _trapezoid(site, power_left, power_right)
-
-
-def link_work(site: SiteMotion, j: int) -> Increment:
-    """Returns the work of the link from peer j: the change of V_i when a sample's age jumps.
-
-    At the end of a period the sample in use is replaced. The time of the old sample, sent at s,
-    has advanced to s + h, and the new sample was sent at s'. With r and e half-way through the
-    jump, and de the jump of e by this link, the work is exactly
-
-        (Lambda M r + Lambda Kd e)' de - 1/2 alpha_ij int qd_j' Kd qd_j ds from s + h to s'.
-
-    For an age that varies smoothly this is the integral of the term with dT/dt that the theorem
-    leaves out.
-
-    Args:
-        site: Motion of the site.
-        j: Index of the peer.
-    """
-    peer_motion = list(site.peers.values())[j]
-    squares_before_jump = peer_motion.delayed_end.squares
-    squares_after_jump = peer_motion.delayed.squares[1:]
-    integral_of_squares = squares_before_jump - squares_after_jump
-    energy_in_transit = 0.5 * integral_of_squares @ site.constants.Kd
-    jump = _energy_of_jump(site, site.ends.link[j])
-    alpha = site.dominance.before[:, j]
-    return _jump_alone(jump + alpha * energy_in_transit)
-
-
-def dominance_change_work(site: SiteMotion) -> Increment:
-    """Computes the energy that a change of dominance factors adds to the energy V_i of a site.
-
-    The dominance factor alpha_ij is the weight with which site i follows its peer j. Along a
-    ramp, the power of the change is
-
-        1/2 sum_j w_j int qd_j' Kd qd_j ds + qd_i' Kd sum_j w_j q_j(t - T_ij)
-
-    with w_j the time derivative of alpha_ij, T_ij the delay, Kd the damping gain, and q and qd
-    positions and velocities. The integral covers the last T_ij seconds. The second term arises
-    because the velocity error of the site contains w_j. A sudden change adds the energy of the
-    jump. The effect on the weights of the sites in the total energy is not included.
-
-    Args:
-        site: Motion of the site.
-    """
-    records = site.records
-    c = site.constants
-    dominance = site.dominance
-    ends = site.ends
-    if dominance.constant:
-        return _zero_increment(site)
-    periods = len(records.known) - 1
-    left = np.zeros(periods)
-    right = left
-    jump = _energy_of_jump(site, ends.dominance)
-    qd_left = records.shared_rate[:-1]
-    qd_right = records.shared_rate[1:]
-
-    for j, peer_motion in enumerate(site.peers.values()):
-        energy_in_transit = _energy_in_transit(c, peer_motion)
-        squares_at_end = peer_motion.now.squares[1:]
-        integral_at_end = squares_at_end - peer_motion.delayed_end.squares
-        energy_in_transit_at_end = 0.5 * integral_at_end @ c.Kd
-        alpha_rate = dominance.rate[:-1, j]
-        followed_rate = np.where(ends.following, alpha_rate, 0.0)
-        q_left = peer_motion.delayed.q[:-1]
-        q_right = peer_motion.delayed_end.q
-        ramp_left = _dot_rows(qd_left * c.Kd, q_left)
-        ramp_right = _dot_rows(qd_right * c.Kd, q_right)
-        # the two terms of the power in the docstring, at both ends of every period
-        left = left + alpha_rate * energy_in_transit[:-1]
-        left = left + followed_rate * ramp_left
-        right = right + alpha_rate * energy_in_transit_at_end
-        right = right + followed_rate * ramp_right
-        alpha_next = dominance.alpha[1:, j]
-        alpha_right = dominance.before[:, j]
-        alpha_step = alpha_next - alpha_right
-        jump = jump + alpha_step * energy_in_transit[1:]
-    return _trapezoid(site, left, right, jump)
 
 
 def _stale_rule_work(site: SiteMotion) -> Increment:
@@ -1084,30 +1126,6 @@ def _singular_pose_power(
     return power
 
 
-def measure_torque_error(site: SiteMotion) -> Array:
-    """Computes how much the recorded torques differ from those that the control law demands.
-
-    The law is evaluated again from the recorded motion. A large error means that the log was
-    changed, or that the arm ran a different law than the scenario states.
-
-    Args:
-        site: Motion of the site, with K records.
-
-    Returns:
-        The largest difference of all joints, shape (K,), in N m. It is 0 for interpolated
-        records, and while the arm comes to rest.
-    """
-    records = site.records
-    low, high = site.torque_bounds
-    all_rows = np.arange(len(records.known))
-    law_torque = site.law_torque(all_rows)
-    limited_torque = np.clip(law_torque, low, high)
-    errors = np.abs(records.tau - limited_torque)
-    largest = max_rows(errors)
-    is_comparable = records.known & ~site.rests
-    return np.where(is_comparable, largest, 0.0)
-
-
 def _estimate_work(site: SiteMotion) -> Increment:
     """Computes the work of parameter estimates that do not follow the adaptive law.
 
@@ -1158,47 +1176,6 @@ def _estimate_work(site: SiteMotion) -> Increment:
     fixed_power = np.where(is_fixed, error_power, 0.0)
     power = sum_rows(fixed_power)
     return _integrate_power(site, power, jump)
-
-
-def compute_sampling_work(site: SiteMotion) -> Increment:
-    """Returns the work that arises because the continuous control law is executed in ticks.
-
-    With the filtered error r, the work has two parts:
-
-    - Torque: the integral of r'(u - tau). The torque u is constant within a period, while the
-      torque tau of the continuous law changes linearly until the end of the period.
-    - Parameter estimates: their recorded step, compared with the trapezoid rule for the
-      adaptive law.
-
-    This work is not part of the energy balance. It explains part of the balance's residual.
-
-    Args:
-        site: Motion of the site.
-    """
-    records = site.records
-    c = site.constants
-    ends = site.ends
-    digital = site.scheme is Scheme.DIGITAL
-    held_torque = hold_torque(records.tau, c.tau_limit, digital=digital)
-    applied_torque = held_torque[:-1]
-    tau_right, Yr_right = _evaluate_before_jump(site)
-
-    # torque: the acting torque minus the linear change that the trapezoid rule assumes
-    tau_left = records.tau[:-1]
-    mean_tau = 0.5 * (tau_left + tau_right)
-    torque_error = applied_torque - mean_tau
-    mean_r = 0.5 * (ends.r_left + ends.r_right)
-    torque_power = _dot_rows(mean_r, torque_error)
-    torque_part = records.h_s * torque_power
-
-    # estimates: the trapezoid rule of the adaptive law minus its recorded step
-    parameter_error = (records.theta_hat - c.theta) * c.adapts
-    error_sum = parameter_error[1:] + parameter_error[:-1]
-    trapezoid_Yr = 0.5 * (site.Yr[:-1] + Yr_right)
-    Yr_error = trapezoid_Yr - site.mean_Yr
-    half_s = 0.5 * records.h_s
-    estimate_part = half_s * _dot_rows(error_sum, Yr_error)
-    return _jump_alone(torque_part + estimate_part)
 
 
 def _evaluate_before_jump(site: SiteMotion) -> tuple[Array, Array]:

@@ -23,7 +23,7 @@ from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
-from ...core import Array, LawEnergies, LawRecords, PeerRecords, Scheme, StaleAction, sum_work
+from ...core import Array, LawEnergies, LawRecords, PeerRecords, Scheme, StaleAction
 from ...hooks import find_hook
 from ...log import Log
 from ...own_code import ImportedLaw
@@ -313,7 +313,7 @@ def _read_books(log: Log, site: str, law: Any) -> _SiteBooks:
     digital = site_setup.scheme is Scheme.DIGITAL
     held_torque = hold_torque(records.tau, limit_nm, digital=digital)
 
-    arm_gave = -sum_work(held_torque, records.q)
+    arm_gave = -records.sum_work(held_torque)
     if site_setup.theta_known:
         # the torque that holds the arm against gravity is not counted as work of the law
         potential = build_arm_rows(log.scenario, site).potential_energy(records.q)

@@ -17,6 +17,7 @@ from typing import NamedTuple
 
 from ...hooks import find_hook
 from ...results import JsonObject
+from ...scenario import Scenario
 from ..dominance_history import PeerLoss
 from ..torque_sources import WallEnergy
 
@@ -50,6 +51,39 @@ class MissingFunctional(NamedTuple):
     obstacle: FunctionalObstacle
     law: str
     sites: tuple[str, ...]
+
+    @classmethod
+    def list_of_scenario(cls, scenario: Scenario) -> list["MissingFunctional"]:
+        """Finds the arms of a scenario for which the energy function does not exist.
+
+        The energy exists only for certain control laws. It requires the true dynamic parameters
+        of the arm. It is not defined if the end effector also follows the orientation of other
+        arms.
+
+        Args:
+            scenario: The description of the experiment.
+
+        Returns:
+            The sites of these arms, grouped by the reason. Empty if the energy exists for every
+            arm.
+        """
+        sites_by_reason: dict[tuple[FunctionalObstacle, str], list[str]] = {}
+        for site, spec in scenario.sites.items():
+            law = ""
+            if not spec.arm.known:
+                obstacle = FunctionalObstacle.UNKNOWN_PARAMETERS
+            elif not spec.control.has_functional:
+                obstacle = FunctionalObstacle.LAW
+                law = spec.control.tag
+            elif spec.task.space == "pose":
+                obstacle = FunctionalObstacle.ORIENTATIONS
+            else:
+                continue
+            sites_by_reason.setdefault((obstacle, law), []).append(site)
+        return [
+            cls(obstacle, law, tuple(sites))
+            for (obstacle, law), sites in sites_by_reason.items()
+        ]
 
 
 class LawQuantities(NamedTuple):

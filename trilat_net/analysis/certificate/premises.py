@@ -28,28 +28,25 @@ import numpy as np
 
 from ...log import Coverage, Log, judge_integrity
 from ...net import HALTED_MODES
-from ...scenario import Scenario
 from ..aligned import Bools
 from ..dominance_history import (
+    PeerLoss,
     compute_lyapunov_weights,
     find_closed_groups,
     find_kd_scales,
-    list_losses,
 )
 from ..following import TaskFollowing
 from ..row_reductions import any_in_rows
-from ..timeline import find_mode_intervals, recorded_end_s
-from ..torque_sources import find_wall_energies, list_sampled_walls
+from ..timeline import Timeline
+from ..torque_sources import WallEnergy
 from .energy_balance import (
     ZERO_ENERGY_J,
     EnergyBalance,
     SiteEnergy,
-    compute_energy_balance,
-    compute_site_energies,
     find_dominance_matrices,
     rise_above_minimum,
 )
-from .energy_terms import SiteConstants, derive_site_constants
+from .energy_terms import SiteConstants
 from .premise_quantities import (
     AbsentSpan,
     AgeRange,
@@ -58,7 +55,6 @@ from .premise_quantities import (
     DelayQuantities,
     DominanceQuantities,
     FollowingQuantities,
-    FunctionalObstacle,
     GainQuantities,
     Interruption,
     LawQuantities,
@@ -167,15 +163,15 @@ def gather_facts(log: Log) -> _RunFacts:
         LogError: A recorded change of the settings, such as of a dominance factor, is not
             valid.
     """
-    missing = find_missing_functionals(log.scenario)
+    missing = MissingFunctional.list_of_scenario(log.scenario)
     if missing:
         return _RunFacts(log, {}, unknown=NoFunctional(tuple(missing)))
 
-    constants = {site: derive_site_constants(log.scenario, site) for site in log.sites}
-    energies = compute_site_energies(log)
+    constants = {site: SiteConstants.derive(log.scenario, site) for site in log.sites}
+    energies = SiteEnergy.by_site(log)
     if not energies:
         return _RunFacts(log, constants, unknown=RecordGap.NO_COMMON_TIME)
-    balance = compute_energy_balance(energies)
+    balance = EnergyBalance.of_energies(energies)
     absent = find_absent_spans(log)
     if not balance.judged.any():
         return _RunFacts(log, constants, unknown=RecordGap.NO_PERIOD)
@@ -187,7 +183,7 @@ def gather_facts(log: Log) -> _RunFacts:
         tuple(log.sites[index] for index in group) for group in ambiguous_groups
     )
     unjudged_while_present = []
-    for from_s, to_s in find_unjudged_spans(balance):
+    for from_s, to_s in balance.unjudged_spans:
         if not any(span.from_s < to_s and from_s < span.to_s for span in absent):
             unjudged_while_present.append((from_s, to_s))
 
@@ -204,38 +200,6 @@ def gather_facts(log: Log) -> _RunFacts:
     return _RunFacts(log, constants, facts)
 
 
-def find_missing_functionals(scenario: Scenario) -> list[MissingFunctional]:
-    """Finds the arms for which the energy function of the stability proof does not exist.
-
-    The energy exists only for certain control laws. It requires the true dynamic parameters of
-    the arm. It is not defined if the end effector also follows the orientation of other arms.
-
-    Args:
-        scenario: The description of the experiment.
-
-    Returns:
-        The sites of these arms, grouped by the reason. Empty if the energy exists for every
-        arm.
-    """
-    sites_by_reason: dict[tuple[FunctionalObstacle, str], list[str]] = {}
-    for site, spec in scenario.sites.items():
-        law = ""
-        if not spec.arm.known:
-            obstacle = FunctionalObstacle.UNKNOWN_PARAMETERS
-        elif not spec.control.has_functional:
-            obstacle = FunctionalObstacle.LAW
-            law = spec.control.tag
-        elif spec.task.space == "pose":
-            obstacle = FunctionalObstacle.ORIENTATIONS
-        else:
-            continue
-        sites_by_reason.setdefault((obstacle, law), []).append(site)
-    return [
-        MissingFunctional(obstacle, law, tuple(sites))
-        for (obstacle, law), sites in sites_by_reason.items()
-    ]
-
-
 def check_premises(run: _RunFacts) -> list[Premise]:
     """Checks whether a run meets the conditions (premises) of the stability theorem.
 
@@ -249,7 +213,7 @@ def check_premises(run: _RunFacts) -> list[Premise]:
     Returns:
         The premises that concern this run, in the order in which a certificate lists them.
     """
-    missing = find_missing_functionals(run.log.scenario)
+    missing = MissingFunctional.list_of_scenario(run.log.scenario)
     law = Premise("law", bool(run.constants), LawQuantities(tuple(missing)))
     premises: list[Premise | None] = [law]
 
@@ -319,9 +283,9 @@ def _check_walls(log: Log) -> Premise | None:
     Returns:
         The premise. `None` if the scenario contains no such wall.
     """
-    if not any(map(list_sampled_walls, log.scenario.sites.values())):
+    if not WallEnergy.count_walls(log.scenario):
         return None
-    quantities = WallQuantities(tuple(find_wall_energies(log)))
+    quantities = WallQuantities(tuple(WallEnergy.list_of_log(log)))
     return Premise("walls", not quantities.active, quantities)
 
 
@@ -338,7 +302,7 @@ def _check_dominance(run: FunctionalFacts) -> Premise:
         site for site, energy in energies.items() if not energy.motion.dominance.constant
     ]
     if changing:
-        losses = tuple(list_losses(run.log))
+        losses = tuple(PeerLoss.list_of_log(run.log))
         quantities = DominanceQuantities(changing=tuple(changing), losses=losses)
         return Premise("shares", False, quantities)
 
@@ -400,10 +364,11 @@ def _check_following(run: FunctionalFacts) -> Premise:
     stopped. Nor does it follow them while the velocity of its reference is limited.
     """
     log = run.log
+    timeline = Timeline(log)
     interruptions = []
     is_halted = False
     for site in log.sites:
-        intervals = find_mode_intervals(log[site])
+        intervals = timeline.find_mode_intervals(site)
         if intervals:
             from_s = intervals[0].from_s
             to_s = intervals[-1].to_s
@@ -591,7 +556,7 @@ def find_absent_spans(log: Log) -> list[AbsentSpan]:
     Returns:
         The spans, sorted by their start. Empty if no site was absent.
     """
-    run_end_s = recorded_end_s(log)
+    run_end_s = Timeline(log).end_s
     absent = []
     for site in log.sites:
         site_log = log[site]
@@ -619,7 +584,7 @@ def _check_presence(run: FunctionalFacts) -> Premise | None:
     if not run.absent:
         return None
     stretch_start_s = max(energy.begin_s for energy in run.energies.values())
-    end_s = recorded_end_s(run.log)
+    end_s = Timeline(run.log).end_s
 
     # Empty absences at the start and at the end let the loop treat all stretches alike.
     absences = [(stretch_start_s, stretch_start_s)]
@@ -706,26 +671,6 @@ def _examine_stretch(
     return PresentStretch(from_s, to_s, all_follow_s, tuple(varying))
 
 
-def find_unjudged_spans(balance: EnergyBalance) -> list[tuple[float, float]]:
-    """Finds the spans of time in which V cannot be judged because records are missing.
-
-    V is the energy function of the stability proof.
-
-    Args:
-        balance: Energy balance of all sites.
-
-    Returns:
-        The (start, end) of each span, in s. Empty if V can be judged all the time.
-    """
-    # Imaginary judged periods before and after the run give each span a start and an end.
-    padded = np.concatenate([[True], balance.judged, [True]])
-    edges = np.flatnonzero(np.diff(padded.astype(np.int8)))
-    times = balance.t_s[edges]
-    starts_s = times[::2].tolist()
-    ends_s = times[1::2].tolist()
-    return list(zip(starts_s, ends_s, strict=True))
-
-
 def collect_evidence(run: _RunFacts, min_coverage: float) -> Evidence:
     """Collects evidence on how complete a run's records are and whether its log was changed.
 
@@ -743,8 +688,8 @@ def collect_evidence(run: _RunFacts, min_coverage: float) -> Evidence:
     if facts is not None and not facts.groups:
         t_s = facts.balance.t_s
         judged = facts.balance.judged
-        # Spans that are unjudged because a site was absent do not reduce the share.
-        unjudged_in_absence = set(find_unjudged_spans(facts.balance)) - set(facts.unjudged)
+        # Spans that are unjudged because a site was absent do not count against the share.
+        unjudged_in_absence = set(facts.balance.unjudged_spans) - set(facts.unjudged)
         all_present = np.ones(len(judged), dtype=np.bool_)
         for from_s, to_s in unjudged_in_absence:
             all_present &= (t_s[:-1] < from_s) | (t_s[:-1] >= to_s)

@@ -20,7 +20,6 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ...core import Array, CoreChange
-from ...hooks import find_hook
 from ...net import RESTING_MODES, TASK_VECTORS, State
 from ...scenario import Scenario
 from ..aligned import (
@@ -29,21 +28,14 @@ from ..aligned import (
     AlignedRecords,
     PeerTrajectory,
 )
-from ..dominance_history import (
-    DominanceHistory,
-    drop_finished_ramps,
-    evaluate_ramps,
-    find_closed_groups,
-    list_scripted_ramps,
-)
+from ..dominance_history import DominanceHistory, DominancePlan, find_closed_groups
 from .energy_balance import (
+    EnergyBalance,
     SiteEnergy,
-    compute_energy_balance,
-    derive_site_energies,
     find_common_times,
     find_dominance_matrices,
 )
-from .premises import find_missing_functionals
+from .premise_quantities import MissingFunctional
 
 STEP_S = 0.25
 """Shortest span of time over which V is computed in one call, in s."""
@@ -266,29 +258,28 @@ class RunningEnergy:
 
     Args:
         scenario: The description of the experiment.
-        windows: The newest records of every site, by name. Their owner updates them during the
-            session.
+        kept_s: Least time that the windows reach back, in s.
 
     Attributes:
-        reason: The reason why V cannot be computed. Empty if it can.
+        windows: The newest records of every site, by name. Whoever receives records stores them
+            there during the session.
+        missing: Sites for which the law or the arm has no functional, grouped by the reason.
+            V cannot be computed then.
+        degrades: True if shares change when a peer is lost, in which case V is not computed.
+        closed_groups: Names of the sites in two groups that do not follow each other, in which
+            case V is not defined. Empty as long as there are none.
     """
 
-    def __init__(self, scenario: Scenario, windows: Mapping[str, RecordWindow]) -> None:
-        self.reason = ""
-        missing = find_missing_functionals(scenario)
-        if missing:
-            self.reason = str(find_hook("describe missing functionals")(missing))
-
+    def __init__(self, scenario: Scenario, kept_s: float = KEPT_S) -> None:
+        names = scenario.names
+        self.windows = {site: RecordWindow(scenario, site, kept_s) for site in names}
+        self.missing = MissingFunctional.list_of_scenario(scenario)
         rules = [spec.on_stale.rule for spec in scenario.sites.values()]
-        degrades = any(rule.degrades for rule in rules)
-        if degrades and not self.reason:
-            self.reason = (
-                "the shares may change because a peer is lost: `trilat certify` computes V"
-            )
+        self.degrades = any(rule.degrades for rule in rules)
+        self.closed_groups: list[list[str]] = []
 
         self._scenario = scenario
-        self._windows = windows
-        self._dominance = {site: list_scripted_ramps(scenario, site) for site in windows}
+        self._dominance = {site: DominancePlan.of_scenario(scenario, site) for site in names}
         self._computed_until_s: float | None = None
         self._supplied = 0.0
 
@@ -302,10 +293,8 @@ class RunningEnergy:
             site: Name of the site, the process that runs one arm.
             changes: The changes that the site carried out.
         """
-        _, ramps = self._dominance[site]
-        for change in changes:
-            if change.ramp is not None:
-                ramps.append(change.ramp)
+        ramps = self._dominance[site].ramps
+        ramps.extend(change.ramp for change in changes if change.ramp is not None)
 
     def compute_next(self, complete: Mapping[str, int]) -> EnergyCourse | None:
         """Computes the energy V of all arms since the last call, if all records have arrived.
@@ -321,12 +310,13 @@ class RunningEnergy:
             V over the new span of time. `None` if the span is too short yet, or if V cannot be
             computed in it.
         """
-        if self.reason or min(complete.values()) < 1:
+        has_no_energy = bool(self.missing or self.degrades or self.closed_groups)
+        if has_no_energy or min(complete.values()) < 1:
             return None
 
         complete_times_s = []
         oldest_times_s = []
-        for site, window in self._windows.items():
+        for site, window in self.windows.items():
             complete_times_s.append(complete[site] / window.rate_hz)
             oldest_times_s.append(window.first / window.rate_hz)
         complete_s = min(complete_times_s)
@@ -353,7 +343,7 @@ class RunningEnergy:
             end_s: End of the span, in s.
         """
         tick_spans = {}
-        for site, window in self._windows.items():
+        for site, window in self.windows.items():
             begin_ticks = begin_s * window.rate_hz
             end_ticks = end_s * window.rate_hz
             first = int(np.ceil(begin_ticks - 1e-6))
@@ -367,16 +357,15 @@ class RunningEnergy:
             groups = find_closed_groups(alpha)
             if len(groups) > 1:
                 sites = list(energies)
-                names = [[sites[n] for n in group] for group in groups[:2]]
-                self.reason = str(find_hook("describe closed groups")(names))
+                self.closed_groups = [[sites[n] for n in group] for group in groups[:2]]
                 return None
 
         is_known = len(find_common_times(energies)) > 1
-        balance = compute_energy_balance(energies) if is_known else None
+        balance = EnergyBalance.of_energies(energies) if is_known else None
 
         ramps_from_s = begin_s - _RAMP_MARGIN_S
-        for site, (start, ramps) in self._dominance.items():
-            self._dominance[site] = drop_finished_ramps(start, ramps, ramps_from_s)
+        for site, plan in self._dominance.items():
+            self._dominance[site] = plan.drop_finished(ramps_from_s)
         # in a session that was joined late, the oldest samples in use are unknown at first
         if balance is None:
             return None
@@ -404,7 +393,7 @@ class RunningEnergy:
         # for each site, the first tick whose sample a peer may still use
         oldest_used = {}
         for site, (first, last) in tick_spans.items():
-            window = self._windows[site]
+            window = self.windows[site]
             records[site] = window.rows(first, last)
             oldest_used[site] = first
 
@@ -415,15 +404,13 @@ class RunningEnergy:
                 oldest_used[peer] = min(oldest_used[peer], oldest)
 
         pasts = {}
-        for site, window in self._windows.items():
+        for site, window in self.windows.items():
             first = max(oldest_used[site], window.first)
             _, last = tick_spans[site]
             past_records = window.rows(first, last)
             pasts[site] = PeerTrajectory(past_records)
-        return derive_site_energies(self._scenario, records, pasts, self._trace_dominance)
+        return SiteEnergy.derive_all(self._scenario, records, pasts, self._trace_dominance)
 
     def _trace_dominance(self, site: str, t_s: Array) -> DominanceHistory:
         """Returns the dominance factors with which a site follows its peers, over time."""
-        start, ramps = self._dominance[site]
-        h_s = 1.0 / self._windows[site].rate_hz
-        return evaluate_ramps(start, ramps, t_s, h_s)
+        return self._dominance[site].evaluate(t_s)

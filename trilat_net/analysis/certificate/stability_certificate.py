@@ -27,9 +27,8 @@ import numpy as np
 from ...log import MIN_COVERAGE, Log
 from ..row_reductions import max_rows
 from ..run_end import RunEnd
-from . import energy_terms
 from .certificate_result import Certificate
-from .energy_balance import ZERO_ENERGY_J, compute_energy_balance
+from .energy_balance import ZERO_ENERGY_J, EnergyBalance
 from .observed_energy import ObservedEnergy
 from .premise_quantities import Premise
 from .premises import FunctionalFacts, check_premises, collect_evidence, gather_facts
@@ -108,7 +107,7 @@ def certify_log(
 
     paper_balance = None
     if not np.allclose(facts.balance.beta, 1.0):
-        paper_balance = compute_energy_balance(facts.energies, paper_weights=True)
+        paper_balance = EnergyBalance.of_energies(facts.energies, paper_weights=True)
     return replace(
         certificate,
         balance=facts.balance,
@@ -173,7 +172,7 @@ def _judge_torques(run: FunctionalFacts, _: Sequence[Premise]) -> StabilityVerdi
     """
     for site, energy in run.energies.items():
         records = energy.motion.records
-        error_nm = energy_terms.measure_torque_error(energy.motion)
+        error_nm = energy.motion.measure_torque_error()
         largest_nm = max_rows(np.abs(records.tau))
         is_wrong = error_nm > TORQUE_TOLERANCE * (1.0 + largest_nm)
         if is_wrong.any():

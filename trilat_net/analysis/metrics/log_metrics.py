@@ -29,9 +29,9 @@ from ...scenario import TASK_AXES, Scenario
 from ..run_view import RunView
 from ..site_signals import follows_in_task_space
 from . import static_windows
-from .measured_impedance import FrequencyResponse, ImpedanceEstimate, estimate_impedances
-from .measures import Measure, Metric, MetricValues, Quantity, list_measures, quantities
-from .motion_metrics import ParameterEstimates, read_all_estimates
+from .measured_impedance import FrequencyResponse, ImpedanceEstimate
+from .measures import Measure, Metric, MetricValues, Quantity
+from .motion_metrics import ParameterEstimates
 from .static_windows import JointLoad, SharingRatio, StiffnessEstimate
 
 # every file of this folder declares its metrics when it is imported
@@ -59,7 +59,7 @@ METRICS_JSON_VERSION = 1
 class LogMetrics(Result):
     """All metrics of a run, such as the largest error of each arm and the delay of each link.
 
-    A metric is a number with a name and a unit. `compute_log_metrics` computes all metrics.
+    A metric is a number with a name and a unit. `LogMetrics.of_log` computes all metrics.
 
     Attributes:
         log: Name of the file of the log.
@@ -98,6 +98,112 @@ class LogMetrics(Result):
     responses: list[ImpedanceEstimate]
     axes: tuple[str, ...] = ()
     joint_names: tuple[str, ...] = ()
+
+    # overflow and NaN do not warn: a metric that is not finite becomes a reason
+    @classmethod
+    @np.errstate(over="ignore", invalid="ignore", divide="ignore")
+    def of_log(cls, log: Log) -> "LogMetrics":
+        """Computes all metrics of a recorded run, such as the largest error of each arm.
+
+        The log may be torn, short or empty. A number that the log does not determine is
+        replaced by the reason.
+
+        Args:
+            log: The log of the run.
+
+        Raises:
+            LogError: A record cannot be read, or names a change that is not valid.
+        """
+        view = RunView(log)
+        scenario = log.scenario
+        values = _measure_subjects(view, Measure.list_all())
+
+        axes: tuple[str, ...] = ()
+        if follows_in_task_space(log):
+            first_site = log.sites[0]
+            axis_count = scenario.arms[first_site].counts.shared
+            axes = TASK_AXES[:axis_count]
+
+        return cls(
+            log=Path(log.source).name,
+            scenario=scenario.name,
+            driver=log.driver,
+            complete=log.complete,
+            run=values["run"][""],
+            sites=values["site"],
+            links=values["link"],
+            walls=values["wall"],
+            estimates=view.compute_once(ParameterEstimates.by_site),
+            static_windows=static_windows.count_static_windows(view),
+            joint_loads=view.compute_once(static_windows.JointLoad.list_of_run),
+            sharing_ratios=view.compute_once(static_windows.SharingRatio.list_of_run),
+            stiffness=static_windows.StiffnessEstimate.list_of_run(view),
+            responses=ImpedanceEstimate.list_of_run(view),
+            axes=axes,
+            joint_names=_find_common_joint_names(scenario),
+        )
+
+    @staticmethod
+    def list_quantities() -> list[Quantity]:
+        """Returns name, unit and meaning of all metrics of a run, such as the largest error.
+
+        Tables and docs/reference/metrics.md list them in this order.
+        """
+        return [quantity for measure in Measure.list_all() for quantity in measure.quantities]
+
+    @classmethod
+    def find_quantity(cls, key: str) -> Quantity:
+        """Returns name, unit and meaning of the metric with a key such as "rms_error_rad".
+
+        Args:
+            key: Key of the metric, under which JSON output and tables contain it.
+
+        Raises:
+            KeyError: No metric has this key. The message names the most similar key.
+        """
+        known = {quantity.key: quantity for quantity in cls.list_quantities()}
+        if key not in known:
+            nearest = suggest_nearest(key, list(known))
+            raise KeyError(
+                f"there is no metric {key!r}{nearest}; docs/reference/metrics.md lists all "
+                "metrics"
+            )
+        return known[key]
+
+    @staticmethod
+    @np.errstate(over="ignore", invalid="ignore", divide="ignore")  # as in of_log
+    def measure_run(log: Log, keys: Iterable[str]) -> dict[str, Metric]:
+        """Computes only some quantities of a whole run, which is faster than all of them.
+
+        Other commands need a few quantities of many runs, for example to compare the points of
+        a sweep.
+
+        Args:
+            log: The log of the run.
+            keys: Keys of the quantities.
+
+        Returns:
+            The metrics of the run, by key.
+
+        Raises:
+            KeyError: No quantity has one of the keys.
+            LogError: A record cannot be read, or names a change that is not valid.
+        """
+        requested = {key: LogMetrics.find_quantity(key) for key in keys}
+        needed_measures = []
+        for measure in Measure.list_all():
+            measured_keys = {quantity.key for quantity in measure.quantities}
+            if not measured_keys.isdisjoint(requested):
+                needed_measures.append(measure)
+
+        values = _measure_subjects(RunView(log), needed_measures)
+        run_values = {}
+        for key, quantity in requested.items():
+            values_by_subject = {}
+            for subject, metrics in values[quantity.of].items():
+                values_by_subject[subject] = metrics[key]
+            run_values[key] = _reduce_to_run(quantity, values_by_subject)
+        return run_values
 
     def label(self, number: int) -> str:
         """Returns the name of a joint or an axis for a table, such as "1", "3 elbow" or "x".
@@ -212,7 +318,7 @@ class LogMetrics(Result):
 
     def _list_values(self) -> Iterator[tuple[dict[str, str], Metric]]:
         """Yields each metric with a description of its quantity and its subject."""
-        for quantity in quantities():
+        for quantity in self.list_quantities():
             values_by_subject = self.values_of(quantity)
             for subject, metric in values_by_subject.items():
                 description = {
@@ -285,50 +391,6 @@ def _reduce_to_run(quantity: Quantity, values_by_subject: Mapping[str, Metric]) 
     return Metric(max(numbers))
 
 
-# overflow and NaN do not warn: a metric that is not finite becomes a reason
-@np.errstate(over="ignore", invalid="ignore", divide="ignore")
-def compute_log_metrics(log: Log) -> LogMetrics:
-    """Computes all metrics of a recorded run, such as the largest error of each arm.
-
-    The log may be torn, short or empty. A number that the log does not determine is replaced by
-    the reason.
-
-    Args:
-        log: The log of the run.
-
-    Raises:
-        LogError: A record cannot be read, or names a change that is not valid.
-    """
-    view = RunView(log)
-    scenario = log.scenario
-    values = _measure_subjects(view, list_measures())
-
-    axes: tuple[str, ...] = ()
-    if follows_in_task_space(log):
-        first_site = log.sites[0]
-        axis_count = scenario.arms[first_site].counts.shared
-        axes = TASK_AXES[:axis_count]
-
-    return LogMetrics(
-        log=Path(log.source).name,
-        scenario=scenario.name,
-        driver=log.driver,
-        complete=log.complete,
-        run=values["run"][""],
-        sites=values["site"],
-        links=values["link"],
-        walls=values["wall"],
-        estimates=view.compute_once(read_all_estimates),
-        static_windows=static_windows.count_static_windows(view),
-        joint_loads=view.compute_once(static_windows.find_joint_loads),
-        sharing_ratios=view.compute_once(static_windows.find_sharing_ratios),
-        stiffness=static_windows.estimate_stiffness(view),
-        responses=estimate_impedances(view),
-        axes=axes,
-        joint_names=_find_common_joint_names(scenario),
-    )
-
-
 def _find_common_joint_names(scenario: Scenario) -> tuple[str, ...]:
     """Returns the joints' names if the files of all arms have the same names, otherwise ()."""
     all_names: set[tuple[str, ...]] = set()
@@ -364,59 +426,6 @@ def _measure_subjects(
             measured = measure.measure(view, name)
             metrics.update(measured)
     return values
-
-
-def find_quantity(key: str) -> Quantity:
-    """Returns name, unit and meaning of the metric with a key such as "rms_error_rad".
-
-    Args:
-        key: Key of the metric, under which JSON output and tables contain it.
-
-    Raises:
-        KeyError: No metric has this key. The message names the most similar key.
-    """
-    known = {quantity.key: quantity for quantity in quantities()}
-    if key not in known:
-        nearest = suggest_nearest(key, list(known))
-        raise KeyError(
-            f"there is no metric {key!r}{nearest}; docs/reference/metrics.md lists all metrics"
-        )
-    return known[key]
-
-
-@np.errstate(over="ignore", invalid="ignore", divide="ignore")  # as in compute_log_metrics
-def measure_run(log: Log, keys: Iterable[str]) -> dict[str, Metric]:
-    """Computes selected quantities of a whole run, which is faster than computing all of them.
-
-    Other commands need a few quantities of many runs, for example to compare the points of a
-    sweep.
-
-    Args:
-        log: The log of the run.
-        keys: Keys of the quantities.
-
-    Returns:
-        The metrics of the run, by key.
-
-    Raises:
-        KeyError: No quantity has one of the keys.
-        LogError: A record cannot be read, or names a change that is not valid.
-    """
-    requested = {key: find_quantity(key) for key in keys}
-    needed_measures = []
-    for measure in list_measures():
-        measured_keys = {quantity.key for quantity in measure.quantities}
-        if not measured_keys.isdisjoint(requested):
-            needed_measures.append(measure)
-
-    values = _measure_subjects(RunView(log), needed_measures)
-    run_values = {}
-    for key, quantity in requested.items():
-        values_by_subject = {}
-        for subject, metrics in values[quantity.of].items():
-            values_by_subject[subject] = metrics[key]
-        run_values[key] = _reduce_to_run(quantity, values_by_subject)
-    return run_values
 
 
 def _details_to_json(metrics: LogMetrics) -> dict[str, Any]:

@@ -27,7 +27,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...core import Array
-from ..aligned import Bools, find_latest_rows
+from ..aligned import Bools
 from ..run_view import RunView, SiteRun
 
 Complex = NDArray[np.complex128]
@@ -85,65 +85,66 @@ class FrequencyResponse(NamedTuple):
     error: float | None = None
     why: str = ""
 
+    @classmethod
+    def estimate(
+        cls,
+        drive: Array,
+        put_in: Array,
+        came_out: Array,
+        usable: Bools,
+        rate_hz: int,
+        least: float,
+    ) -> "list[FrequencyResponse]":
+        """Estimates the ratio of an output to an input at every frequency that is driven.
 
-def estimate_responses(
-    drive: Array,
-    put_in: Array,
-    came_out: Array,
-    usable: Bools,
-    rate_hz: int,
-    least: float,
-) -> list[FrequencyResponse]:
-    """Estimates the ratio of an output to an input at every frequency that is driven.
+        Both signals are caused by a third one, the drive, and are compared through their cross
+        spectra with it. `scipy.signal.csd` is not used, because it cannot leave out segments
+        with unusable rows.
 
-    Both signals are caused by a third one, the drive, and are compared through their cross
-    spectra with it. `scipy.signal.csd` is not used, because it cannot leave out segments with
-    unusable rows.
+        Args:
+            drive: The signal that causes both and depends on no other signal, shape (K,).
+            put_in: The input signal, shape (K,).
+            came_out: The output signal, shape (K,).
+            usable: True for rows that are recorded while no other drive is active, shape (K,).
+            rate_hz: Rows per second.
+            least: Least amplitude of the drive at which a frequency counts as driven.
 
-    Args:
-        drive: The signal that causes both and depends on no other signal, shape (K,).
-        put_in: The input signal, shape (K,).
-        came_out: The output signal, shape (K,).
-        usable: True for rows that are recorded while no other drive is active, shape (K,).
-        rate_hz: Rows per second.
-        least: Least amplitude of the drive at which a frequency counts as driven.
+        Returns:
+            The responses, the one with the strongest drive first. If no frequency is driven, a
+            single response that contains the reason.
+        """
+        length = round(SEGMENT_S * rate_hz)
+        starts = _find_segments(usable, length)
+        if not starts:
+            reason = f"the log has no stretch of {SEGMENT_S:g} s in which nobody else drives"
+            return [FrequencyResponse(why=reason)]
 
-    Returns:
-        The responses, the one with the strongest drive first. If no frequency is driven, a
-        single response that contains the reason.
-    """
-    length = round(SEGMENT_S * rate_hz)
-    starts = _find_segments(usable, length)
-    if not starts:
-        reason = f"the log has no interval of {SEGMENT_S:g} s without another drive"
-        return [FrequencyResponse(why=reason)]
+        D = _compute_spectra(drive, starts, length)
+        drive_power = (np.abs(D) ** 2).mean(axis=0)
+        if not np.isfinite(drive_power).all():
+            return [FrequencyResponse(why="the numbers of the drive are too large")]
 
-    D = _compute_spectra(drive, starts, length)
-    drive_power = (np.abs(D) ** 2).mean(axis=0)
-    if not np.isfinite(drive_power).all():
-        return [FrequencyResponse(why="the values of the drive are too large")]
+        strongest = int(drive_power.argmax())
+        if math.sqrt(2.0 * drive_power[strongest]) < least:
+            return [FrequencyResponse(why="the drive is too weak at every frequency")]
+        # a sinusoid of amplitude a has the mean square a^2 / 2
+        least_power = max(0.5 * least**2, _DRIVEN_SHARE**2 * drive_power[strongest])
+        driven_lines = np.flatnonzero(drive_power >= least_power)
 
-    strongest = int(drive_power.argmax())
-    if math.sqrt(2.0 * drive_power[strongest]) < least:
-        return [FrequencyResponse(why="the drive is too weak at every frequency")]
-    # a sinusoid of amplitude a has the mean square a^2 / 2
-    least_power = max(0.5 * least**2, _DRIVEN_SHARE**2 * drive_power[strongest])
-    driven_lines = np.flatnonzero(drive_power >= least_power)
+        X = _compute_spectra(put_in, starts, length)
+        Y = _compute_spectra(came_out, starts, length)
 
-    X = _compute_spectra(put_in, starts, length)
-    Y = _compute_spectra(came_out, starts, length)
-
-    responses = []
-    for line in (strongest, *driven_lines[driven_lines != strongest].tolist()):
-        frequency_hz = (line + _LOWEST_LINE) / SEGMENT_S
-        response = _estimate_at_line(
-            frequency_hz=frequency_hz,
-            D=D[:, line],
-            X=X[:, line],
-            Y=Y[:, line],
-        )
-        responses.append(response)
-    return responses
+        responses = []
+        for line in (strongest, *driven_lines[driven_lines != strongest].tolist()):
+            frequency_hz = (line + _LOWEST_LINE) / SEGMENT_S
+            response = _estimate_at_line(
+                frequency_hz=frequency_hz,
+                D=D[:, line],
+                X=X[:, line],
+                Y=Y[:, line],
+            )
+            responses.append(response)
+        return responses
 
 
 def _find_segments(usable: Bools, length: int) -> list[int]:
@@ -299,28 +300,28 @@ class ImpedanceEstimate(NamedTuple):
         """
         return "" if self.kind == "reflection" else "N m s/rad"
 
+    @classmethod
+    def list_of_run(cls, view: RunView) -> "list[ImpedanceEstimate]":
+        """Estimates what each operator feels over frequency, from a recorded run.
 
-def estimate_impedances(view: RunView) -> list[ImpedanceEstimate]:
-    """Estimates what each operator feels over frequency, from a recorded run.
+        For each operator the impedance is estimated, the operator's torque over the velocity of
+        the joint. For each environment at another arm the reflection is estimated, the torque
+        that the operator feels over the torque of the environment.
 
-    For each operator the impedance is estimated, the operator's torque over the velocity of the
-    joint. For each environment at another arm the reflection is estimated, the torque that the
-    operator feels over the torque of the environment.
-
-    Args:
-        view: The run.
-    """
-    runs = view.shared
-    operators = [site for site, run in runs.items() if run.torque.operator.any()]
-    environments = [site for site, run in runs.items() if run.torque.environment.any()]
-    estimates: list[ImpedanceEstimate] = []
-    for site in operators:
-        estimates += _estimate_joints(runs, site, "")
-    for environment in environments:
+        Args:
+            view: The run.
+        """
+        runs = view.shared
+        operators = [site for site, run in runs.items() if run.torque.operator.any()]
+        environments = [site for site, run in runs.items() if run.torque.environment.any()]
+        estimates: list[ImpedanceEstimate] = []
         for site in operators:
-            if site != environment:
-                estimates += _estimate_joints(runs, site, environment)
-    return estimates
+            estimates += _estimate_joints(runs, site, "")
+        for environment in environments:
+            for site in operators:
+                if site != environment:
+                    estimates += _estimate_joints(runs, site, environment)
+        return estimates
 
 
 def _estimate_joints(
@@ -340,7 +341,7 @@ def _estimate_joints(
     records = runs[site].records
     torque = runs[site].torque
     is_usable = _find_still_rows(runs, site, alone=not environment)
-    rows, is_recorded = find_latest_rows(runs[environment or site].records, records.t_s)
+    rows, is_recorded = runs[environment or site].records.find_latest_rows(records.t_s)
 
     for joint in range(records.qd.shape[1]):
         responses = [FrequencyResponse(why=NO_SCRIPT_TEXT)]
@@ -349,7 +350,7 @@ def _estimate_joints(
             operator = torque.operator[:, joint]
             if environment:
                 wall_torque = runs[environment].torque.environment[rows, joint]
-                responses = estimate_responses(
+                responses = FrequencyResponse.estimate(
                     drive=wall_torque,
                     put_in=wall_torque,
                     came_out=-operator,
@@ -358,7 +359,7 @@ def _estimate_joints(
                     least=MIN_DRIVE_TORQUE_NM,
                 )
             else:
-                responses = estimate_responses(
+                responses = FrequencyResponse.estimate(
                     drive=torque.script[:, joint],
                     put_in=records.qd[:, joint],
                     came_out=operator,
@@ -407,7 +408,7 @@ def _find_still_rows(
         if plan is None:
             return None
         if len(plan) > 1:
-            rows, _ = find_latest_rows(run.records, t_s)
+            rows, _ = run.records.find_latest_rows(t_s)
             changes_nm = np.abs(np.gradient(plan, axis=0))
             rate_nm_s = changes_nm.max(axis=1) * run.records.rate_hz
             is_still &= rate_nm_s[rows] < STILL_SCRIPT_NM_S

@@ -81,7 +81,8 @@ def unavailable(
     """
     return {
         quantity.key: Metric(None, why, applies)
-        for quantity in quantities()
+        for measure in Measure.list_all()
+        for quantity in measure.quantities
         if quantity.group == group and of in ("", quantity.of)
     }
 
@@ -185,26 +186,26 @@ class Quantity(NamedTuple):
     of: str = ""
     group: str = ""
 
+    @classmethod
+    def list_shared(cls, names: Mapping[str, str]) -> list["Quantity"]:
+        """Defines quantities of the coordinates that arms share, for angles and for positions.
 
-def list_shared_quantities(names: Mapping[str, str]) -> list[Quantity]:
-    """Defines quantities of the coordinates that arms share, for angles and for positions.
+        Arms share either their joint angles, in rad, or the positions of their end effectors,
+        in m. Each quantity is therefore defined twice.
 
-    Arms share either their joint angles, in rad, or the positions of their end effectors, in m.
-    Each quantity is therefore defined twice.
+        Args:
+            names: Names that the user reads, by key. The unit is appended to each key. "{0}" in
+                a name is replaced by the symbol q for angles or x for positions.
 
-    Args:
-        names: Names that the user reads, by key. The unit is appended to each key. "{0}" in a
-            name is replaced by the symbol q for angles or x for positions.
-
-    Returns:
-        The quantities of angles, and then the quantities of positions.
-    """
-    symbols = {"rad": "q", "m": "x"}
-    return [
-        Quantity(f"{key}_{unit}", name.format(symbol), unit)
-        for unit, symbol in symbols.items()
-        for key, name in names.items()
-    ]
+        Returns:
+            The quantities of angles, and then the quantities of positions.
+        """
+        symbols = {"rad": "q", "m": "x"}
+        return [
+            cls(f"{key}_{unit}", name.format(symbol), unit)
+            for unit, symbol in symbols.items()
+            for key, name in names.items()
+        ]
 
 
 Measuring = Callable[[RunView, str], MetricValues]
@@ -228,6 +229,16 @@ class Measure(NamedTuple):
     group: str
     quantities: tuple[Quantity, ...]
     measure: Measuring
+
+    @classmethod
+    def list_all(cls) -> "list[Measure]":
+        """Returns all registered functions that measure quantities, ordered by group.
+
+        The groups have the order in which they are shown to the user. Groups that are not in
+        this order, such as those of a new file, are last.
+        """
+        rank = {group: n for n, group in enumerate(_GROUP_ORDER)}
+        return sorted(_MEASURES, key=lambda measure: rank.get(measure.group, len(rank)))
 
 
 _MEASURES: list[Measure] = []
@@ -293,21 +304,3 @@ def measures(
         return measure
 
     return declare
-
-
-def list_measures() -> list[Measure]:
-    """Returns all registered functions that measure quantities, ordered by group.
-
-    The groups have the order in which they are shown to the user. Groups that are not in this
-    order, such as those of a new file, are last.
-    """
-    rank = {group: n for n, group in enumerate(_GROUP_ORDER)}
-    return sorted(_MEASURES, key=lambda measure: rank.get(measure.group, len(rank)))
-
-
-def quantities() -> list[Quantity]:
-    """Returns name, unit and meaning of all metrics of a run, such as the largest error.
-
-    Tables and docs/reference/metrics.md list them in this order.
-    """
-    return [quantity for measure in list_measures() for quantity in measure.quantities]

@@ -37,7 +37,6 @@ from ..arm_rows import (
 )
 from ..file_overview import describe_site_health
 from ..run_view import RunView
-from ..torque_sources import wall_depth, wall_force
 from .measures import (
     CONTACT,
     EFFORT,
@@ -51,7 +50,6 @@ from .measures import (
     Metric,
     MetricValues,
     Quantity,
-    list_shared_quantities,
     measure_shared,
     measures,
     metric,
@@ -85,7 +83,7 @@ _ERROR_UNITS = {"joints": "rad", "position": "m", "pose": "m or rad"}
     "site",
     TRACKING,
     Quantity("settle_s", "settling time", "s"),
-    *list_shared_quantities(_ERRORS),
+    *Quantity.list_shared(_ERRORS),
 )
 def _measure_tracking(view: RunView, site: str) -> MetricValues:
     """Measures how well an arm tracks its reference: settling time, RMS and peak of the error.
@@ -116,7 +114,7 @@ def _measure_tracking(view: RunView, site: str) -> MetricValues:
     return metrics
 
 
-@measures("site", UNDELAYED, *list_shared_quantities(_UNDELAYED_ERRORS))
+@measures("site", UNDELAYED, *Quantity.list_shared(_UNDELAYED_ERRORS))
 def measure_undelayed_error(
     view: RunView, site: str, other: RunView | None = None
 ) -> MetricValues:
@@ -213,7 +211,7 @@ def _list_followed_peers(view: RunView, site: str) -> dict[str, Array]:
     }
 
 
-@measures("run", SPREAD, *list_shared_quantities(_SPREADS))
+@measures("run", SPREAD, *Quantity.list_shared(_SPREADS))
 def _measure_spread(view: RunView, _run: str) -> MetricValues:
     """Measures the spread of a run: how far the sites are apart at the same instant.
 
@@ -260,7 +258,7 @@ def _measure_spread(view: RunView, _run: str) -> MetricValues:
     )
 
 
-@measures("link", FOLLOWING, *list_shared_quantities(_DELAYED_DISTANCES))
+@measures("link", FOLLOWING, *Quantity.list_shared(_DELAYED_DISTANCES))
 def _measure_following(view: RunView, link: str) -> MetricValues:
     """Measures how far a slave is from the delayed motion of its master.
 
@@ -386,13 +384,13 @@ def _measure_wall_contact(view: RunView, name: str) -> MetricValues:
     t_s = run.records.nominal_s
     known = run.records.known
     end_effector = run.torque.end_effector
-    force = wall_force(wall, t_s, end_effector)
+    force = wall.find_force(t_s, end_effector)
     touches = force > 0.0
 
     is_known_free = known & ~touches
     was_known_free = np.concatenate([[False], is_known_free[:-1]])
     is_hit = touches & was_known_free
-    depth = wall_depth(wall, end_effector)[known]
+    depth = wall.find_depth(end_effector)[known]
 
     # depths are negative outside the wall
     metrics = {
@@ -467,6 +465,23 @@ class ParameterEstimates(NamedTuple):
             content["base"] = self.base._asdict()
         return content
 
+    @classmethod
+    def by_site(cls, view: RunView) -> "dict[str, ParameterEstimates]":
+        """Reads the parameter estimates that adaptive control laws learnt during a run.
+
+        The result contains the first, the last and the true values of masses and inertias.
+
+        Args:
+            view: The run.
+
+        Returns:
+            The estimates, by name of the site. Sites without records are missing.
+        """
+        return {
+            site: _read_parameter_estimates(view.scenario, run.records)
+            for site, run in view.sites.items()
+        }
+
 
 def _read_parameter_estimates(
     scenario: Scenario, records: AlignedRecords
@@ -513,23 +528,6 @@ def _read_parameter_estimates(
         slope_per_s=slopes,
         base=base,
     )
-
-
-def read_all_estimates(view: RunView) -> dict[str, ParameterEstimates]:
-    """Reads the parameter estimates that adaptive control laws learnt during a run.
-
-    The result contains the first, the last and the true values of masses and inertias.
-
-    Args:
-        view: The run.
-
-    Returns:
-        The estimates, by name of the site. Sites without records are missing.
-    """
-    return {
-        site: _read_parameter_estimates(view.scenario, run.records)
-        for site, run in view.sites.items()
-    }
 
 
 def _estimate_base_parameters(
@@ -592,7 +590,7 @@ def _measure_parameter_error(view: RunView, site: str) -> MetricValues:
         parameters that no rigid body can have. A metric without a value contains the reason.
     """
     scenario = view.scenario
-    estimates = view.compute_once(read_all_estimates).get(site)
+    estimates = view.compute_once(ParameterEstimates.by_site).get(site)
     if estimates is None:
         return unavailable(LEARNING, "no records of the site")
 

@@ -22,13 +22,7 @@ import numpy as np
 
 from ...core import Array, Gains, Law, Scheme
 from ...scenario import Scenario
-from ..aligned import (
-    AlignedRecords,
-    DelayedPeer,
-    PeerTrajectory,
-    hold_torque,
-    view_delayed_peer,
-)
+from ..aligned import AlignedRecords, DelayedPeer, PeerTrajectory, hold_torque
 from ..arm_rows import ArmRows, build_arm_rows
 from ..following import build_following
 from ..run_view import RunView
@@ -254,7 +248,7 @@ def _measure_delay_energy(view: RunView, link: str) -> MetricValues:
     if min(len(records.known), len(peer_records.known)) < 2:
         return unavailable(ENERGY, "no two records in a row", of="link")
 
-    peer_view = view_delayed_peer(records, PeerTrajectory(peer_records))
+    peer_view = records.view_delayed_peer(PeerTrajectory(peer_records))
     is_peer_known = peer_view.delayed.known & peer_view.now.known
     is_known = is_peer_known & records.follows
     is_judged = records.known_periods & is_known[:-1] & is_known[1:]

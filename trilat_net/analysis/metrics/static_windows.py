@@ -29,7 +29,7 @@ import numpy as np
 from ...core import Array, Law, TorqueKind
 from ...log import Ints
 from ...scenario import Scenario
-from ..aligned import Bools, find_latest_rows
+from ..aligned import Bools
 from ..arm_rows import build_arm_rows
 from ..dominance_history import find_closed_groups, left_perron_vector
 from ..row_reductions import any_in_rows, max_rows
@@ -100,7 +100,7 @@ def _find_static_windows(run_view: RunView) -> list[_StaticWindow]:
     rows_by_site = {}
     is_still = first_records.known.copy()
     for site, run in runs.items():
-        row, recorded = find_latest_rows(run.records, first_records.t_s)
+        row, recorded = run.records.find_latest_rows(first_records.t_s)
         rows_by_site[site] = row
         is_still &= recorded & _find_resting_rows(run)[row]
 
@@ -224,46 +224,46 @@ class StiffnessEstimate(NamedTuple):
     angle_rad: float
     stiffness_nm_rad: float | None
 
+    @classmethod
+    def list_of_run(cls, view: RunView) -> "list[StiffnessEstimate]":
+        """Estimates how stiff the teleoperator feels to an operator who moved it slowly.
 
-def estimate_stiffness(view: RunView) -> list[StiffnessEstimate]:
-    """Estimates how stiff the teleoperator feels to an operator who moved it slowly.
+        Two successive static windows are compared, in which all arms rest. The stiffness is the
+        change of the operator's torque over the change of the angle. It is estimated only if a
+        single operator moved between the windows.
 
-    Two successive static windows are compared, in which all arms rest. The stiffness is the
-    change of the operator's torque over the change of the angle. It is estimated only if a
-    single operator moved between the windows.
-
-    Args:
-        view: The run.
-    """
-    estimates = []
-    for before, after in pairwise(view.compute_once(_find_static_windows)):
-        site = _find_single_mover(before, after)
-        if not site or (before.alpha != after.alpha).any():
-            continue
-
-        torque_before = before.torque[site] - before.environment[site]
-        torque_after = after.torque[site] - after.environment[site]
-        torque_changes = (torque_after - torque_before).tolist()
-        angle_changes = (after.q[site] - before.q[site]).tolist()
-        for joint, torque_nm in enumerate(torque_changes):
-            # negated, so that NaN is left out too
-            if not abs(torque_nm) >= MIN_TORQUE_CHANGE_NM:
+        Args:
+            view: The run.
+        """
+        estimates = []
+        for before, after in pairwise(view.compute_once(_find_static_windows)):
+            site = _find_single_mover(before, after)
+            if not site or (before.alpha != after.alpha).any():
                 continue
-            angle_rad = angle_changes[joint]
-            stiffness = None
-            if abs(angle_rad) >= MIN_ANGLE_CHANGE_RAD:
-                stiffness = torque_nm / angle_rad
-            estimate = StiffnessEstimate(
-                from_s=before.to_s,
-                to_s=after.to_s,
-                site=site,
-                joint=joint + 1,
-                torque_nm=torque_nm,
-                angle_rad=angle_rad,
-                stiffness_nm_rad=stiffness,
-            )
-            estimates.append(estimate)
-    return estimates
+
+            torque_before = before.torque[site] - before.environment[site]
+            torque_after = after.torque[site] - after.environment[site]
+            torque_changes = (torque_after - torque_before).tolist()
+            angle_changes = (after.q[site] - before.q[site]).tolist()
+            for joint, torque_nm in enumerate(torque_changes):
+                # negated, so that NaN is left out too
+                if not abs(torque_nm) >= MIN_TORQUE_CHANGE_NM:
+                    continue
+                angle_rad = angle_changes[joint]
+                stiffness = None
+                if abs(angle_rad) >= MIN_ANGLE_CHANGE_RAD:
+                    stiffness = torque_nm / angle_rad
+                estimate = StiffnessEstimate(
+                    from_s=before.to_s,
+                    to_s=after.to_s,
+                    site=site,
+                    joint=joint + 1,
+                    torque_nm=torque_nm,
+                    angle_rad=angle_rad,
+                    stiffness_nm_rad=stiffness,
+                )
+                estimates.append(estimate)
+        return estimates
 
 
 def _find_single_mover(before: _StaticWindow, after: _StaticWindow) -> str:
@@ -325,6 +325,61 @@ class SharingRatio(NamedTuple):
         ratio = self.felt_nm / expected
         return abs(ratio - 1.0)
 
+    @classmethod
+    def list_of_run(cls, view: RunView) -> "list[SharingRatio]":
+        """Compares the torque that an operator feels with the torque that another arm receives.
+
+        The comparison is made at every joint at which exactly two arms carry a torque, while
+        all arms rest. The operator who feels the torque is the one who holds an arm like a
+        spring. If both operators do so, or neither of them, it is the operator of the master.
+        The torque on the other arm is the cause.
+
+        Args:
+            view: The recorded run.
+
+        Returns:
+            The comparisons by time. Empty if there is no joint of this kind.
+        """
+        static_windows = view.compute_once(_find_static_windows)
+        window_by_start = {window.from_s: window for window in static_windows}
+        ratios = []
+        for load in view.compute_once(JointLoad.list_of_run):
+            if len(load.torque_nm) != 2:
+                continue
+
+            # the site that is more likely held by a feeling operator comes last
+            ranks = {}
+            for site in load.torque_nm:
+                ranks[site] = _rank_as_holder(view.scenario, site, load.to_s)
+            pushed, holds = sorted(load.torque_nm, key=ranks.__getitem__)
+
+            torque = load.torque_nm[pushed]
+            environment = window_by_start[load.from_s].environment[pushed]
+            wall_torque = float(environment[load.joint - 1])
+
+            pushed_weight = load.weight[pushed]
+            holds_weight = load.weight[holds]
+            if pushed_weight.value is None or holds_weight.value is None:
+                expected = Metric(None, pushed_weight.why)
+            elif holds_weight.value == 0.0:
+                expected = Metric(None, f"no site follows {holds} in the end")
+            else:
+                expected = metric(torque * pushed_weight.value / holds_weight.value)
+
+            ratio = SharingRatio(
+                from_s=load.from_s,
+                to_s=load.to_s,
+                joint=load.joint,
+                pushed=pushed,
+                pushed_nm=torque,
+                by_wall=abs(wall_torque) > 0.5 * abs(torque),
+                holds=holds,
+                felt_nm=-load.torque_nm[holds],
+                expected_nm=expected,
+            )
+            ratios.append(ratio)
+        return ratios
+
 
 class JointLoad(NamedTuple):
     """External torques on all arms at one joint, while all arms rest.
@@ -350,34 +405,34 @@ class JointLoad(NamedTuple):
     weight: dict[str, Metric]
     imbalance: Metric
 
+    @classmethod
+    def list_of_run(cls, view: RunView) -> "list[JointLoad]":
+        """Finds the joints that carry an external torque while all arms rest, with the torques.
 
-def find_joint_loads(view: RunView) -> list[JointLoad]:
-    """Finds the joints that carry an external torque while all arms rest, with these torques.
+        At a joint, an arm counts as loaded if the external torque on it is neither small nor
+        much smaller than the torque on another arm.
 
-    At a joint, an arm counts as loaded if the external torque on it is neither small nor much
-    smaller than the torque on another arm.
+        Args:
+            view: The recorded run.
 
-    Args:
-        view: The recorded run.
-
-    Returns:
-        The loads, by window and joint. Joints without a load are left out.
-    """
-    loads = []
-    for window in view.compute_once(_find_static_windows):
-        weights = _compute_torque_weights(view.scenario, window.alpha)
-        common_joints = min(map(len, window.torque.values()))
-        for joint in range(common_joints):
-            torque = {site: float(values[joint]) for site, values in window.torque.items()}
-            largest_torque_nm = max(map(abs, torque.values()))
-            least_load_nm = max(MIN_LOAD_NM, MIN_LOAD_SHARE * largest_torque_nm)
-            loaded = {
-                site: value for site, value in torque.items() if abs(value) >= least_load_nm
-            }
-            if loaded:
-                load = _weigh_load(window, joint, loaded, weights)
-                loads.append(load)
-    return loads
+        Returns:
+            The loads, by window and joint. Joints without a load are left out.
+        """
+        loads = []
+        for window in view.compute_once(_find_static_windows):
+            weights = _compute_torque_weights(view.scenario, window.alpha)
+            common_joints = min(map(len, window.torque.values()))
+            for joint in range(common_joints):
+                torque = {site: float(values[joint]) for site, values in window.torque.items()}
+                largest_torque_nm = max(map(abs, torque.values()))
+                least_load_nm = max(MIN_LOAD_NM, MIN_LOAD_SHARE * largest_torque_nm)
+                loaded = {
+                    site: value for site, value in torque.items() if abs(value) >= least_load_nm
+                }
+                if loaded:
+                    load = _weigh_load(window, joint, loaded, weights)
+                    loads.append(load)
+        return loads
 
 
 def count_static_windows(view: RunView) -> Metric:
@@ -417,7 +472,7 @@ def _measure_force_sharing(view: RunView, _run: str) -> MetricValues:
         The largest relative difference between the felt and the predicted torque, as a metric
         by its key. Without a prediction the metric contains the reason.
     """
-    ratios = view.compute_once(find_sharing_ratios)
+    ratios = view.compute_once(SharingRatio.list_of_run)
     deviations = [ratio.off for ratio in ratios if ratio.off is not None]
     if deviations:
         return {"sharing_off": metric(max(deviations))}
@@ -475,63 +530,6 @@ def _weigh_load(
         weight=weight_metrics,
         imbalance=imbalance,
     )
-
-
-def find_sharing_ratios(view: RunView) -> list[SharingRatio]:
-    """Compares the torque that an operator feels with the torque that another arm receives.
-
-    The comparison is made at every joint at which exactly two arms carry a torque, while all
-    arms rest. The operator who feels the torque is the one who holds an arm like a spring. If
-    both operators do so, or neither of them, it is the operator of the master. The torque on
-    the other arm is the cause.
-
-    Args:
-        view: The recorded run.
-
-    Returns:
-        The comparisons by time. Empty if there is no joint of this kind.
-    """
-    static_windows = view.compute_once(_find_static_windows)
-    window_by_start = {window.from_s: window for window in static_windows}
-    ratios = []
-    for load in view.compute_once(find_joint_loads):
-        if len(load.torque_nm) != 2:
-            continue
-
-        # the site that is more likely held by a feeling operator comes last
-        ranks = {}
-        for site in load.torque_nm:
-            ranks[site] = _rank_as_holder(view.scenario, site, load.to_s)
-        pushed, holds = sorted(load.torque_nm, key=ranks.__getitem__)
-
-        torque = load.torque_nm[pushed]
-        environment = window_by_start[load.from_s].environment[pushed]
-        wall_torque = float(environment[load.joint - 1])
-
-        pushed_weight = load.weight[pushed]
-        holds_weight = load.weight[holds]
-        if pushed_weight.value is None or holds_weight.value is None:
-            expected = Metric(None, pushed_weight.why)
-        elif holds_weight.value == 0.0:
-            expected = Metric(
-                None, f"no site depends on {holds} in the end, so its weight is 0"
-            )
-        else:
-            expected = metric(torque * pushed_weight.value / holds_weight.value)
-
-        ratio = SharingRatio(
-            from_s=load.from_s,
-            to_s=load.to_s,
-            joint=load.joint,
-            pushed=pushed,
-            pushed_nm=torque,
-            by_wall=abs(wall_torque) > 0.5 * abs(torque),
-            holds=holds,
-            felt_nm=-load.torque_nm[holds],
-            expected_nm=expected,
-        )
-        ratios.append(ratio)
-    return ratios
 
 
 def _rank_as_holder(scenario: Scenario, site: str, t_s: float) -> tuple[bool, bool]:

@@ -16,16 +16,10 @@ import math
 import numpy as np
 
 from ...core import POSITION
-from ..aligned import AlignedRecords, find_common_rows, find_latest_rows
-from ..dominance_history import (
-    RAMP_TIME_TOLERANCE_S,
-    UserShares,
-    find_program,
-    find_user_shares,
-    find_users,
-    list_ramps,
-)
+from ..aligned import AlignedRecords, find_common_rows
+from ..dominance_history import RAMP_TIME_TOLERANCE_S, DominancePlan
 from ..run_view import RunView, SiteRun
+from ..shared_slave import SharedSlave, UserShares
 from .measures import (
     USERS,
     Metric,
@@ -70,14 +64,14 @@ def _read_user_shares(view: RunView) -> UserShares | Metric:
         slave, or records are missing, the result is a metric without a value, which contains
         the reason.
     """
-    slave, users = find_users(view.scenario)
-    if not slave or len(users) < 2:
+    slave = SharedSlave(view.log)
+    if not slave.name or len(slave.users) < 2:
         return _not_applicable("no two users share a slave")
-    missing = [site for site in (*users, slave) if site not in view.sites]
+    missing = [site for site in (*slave.users, slave.name) if site not in view.sites]
     if missing:
         return Metric(None, f"no records of {', '.join(missing)}")
-    alpha = view.sites[slave].dominance.alpha
-    return find_user_shares(view.scenario, alpha, find_program(view.log))
+    alpha = view.sites[slave.name].dominance.alpha
+    return slave.find_shares(alpha, slave.program)
 
 
 @measures(
@@ -102,17 +96,17 @@ def _measure_authority(view: RunView, site: str) -> MetricValues:
         The metrics, by key. A metric without a value contains the reason.
     """
     shared = view.compute_once(_read_user_shares)
-    slave, users = find_users(view.scenario)
+    slave = SharedSlave(view.log)
     if isinstance(shared, Metric):
         return unavailable(USERS, shared.why, of="site", applies=shared.applies)
-    if site not in users:
+    if site not in slave.users:
         why = "the arm of this site is not the master arm of a user"
         return unavailable(USERS, why, of="site", applies=False)
 
     records = view.sites[site].records
     torque = view.sites[site].torque
-    user = users.index(site)
-    slave_row, is_slave_recorded = find_latest_rows(view.sites[slave].records, records.t_s)
+    user = slave.users.index(site)
+    slave_row, is_slave_recorded = view.sites[slave.name].records.find_latest_rows(records.t_s)
 
     share = shared.shares[slave_row, user]
     squared_torque = np.square(torque.operator).sum(axis=1)
@@ -148,11 +142,11 @@ def _identify_shares(view: RunView) -> list[float] | Metric:
         The shares in the order of the users. A metric with the reason if the motion does not
         determine them.
     """
-    slave, users = find_users(view.scenario)
-    slave_records = view.sites[slave].records
+    slave = SharedSlave(view.log)
+    slave_records = view.sites[slave.name].records
     is_valid = slave_records.known & slave_records.follows
     user_rates = []
-    for user in users:
+    for user in slave.users:
         records = view.sites[user].records
         used_row = slave_records.used[user] - records.first
         clipped_row = used_row.clip(0, len(records.known) - 1)
@@ -219,13 +213,13 @@ def _measure_sharing(view: RunView, _run: str) -> MetricValues:
         The metrics, by key. A metric without a value contains the reason.
     """
     shared = view.compute_once(_read_user_shares)
-    slave, users = find_users(view.scenario)
+    slave = SharedSlave(view.log)
     if isinstance(shared, Metric):
         return unavailable(USERS, shared.why, of="run", applies=shared.applies)
 
-    records = view.sites[slave].records
+    records = view.sites[slave.name].records
     intervenes = shared.leader[records.known] != shared.program
-    _, ramps = list_ramps(view.log, slave)
+    ramps = DominancePlan.of_log(view.log, slave.name).ramps
     ramp_spans_s = sorted((ramp.start_ns * 1e-9, ramp.end_ns * 1e-9) for ramp in ramps)
 
     leader_changes = np.diff(shared.leader) != 0
@@ -238,7 +232,7 @@ def _measure_sharing(view: RunView, _run: str) -> MetricValues:
     if durations_s:
         longest_s = metric(max(durations_s))
 
-    user_runs = [view.shared[user] for user in users]
+    user_runs = [view.shared[user] for user in slave.users]
     return {
         **_measure_disagreement(user_runs),
         "intervention_share": metric(float(intervenes.mean())),

@@ -177,6 +177,92 @@ class Pencil(NamedTuple):
         effects = np.abs(self.Ad).sum(axis=(0, 1))
         return np.flatnonzero(effects)
 
+    def extract_moving_part(self, names: Sequence[str]) -> "MovingPart":
+        """Removes the states of a linear loop that do not change or act on no other state.
+
+        For example, a parameter estimate may act on no motion. These states do not influence
+        the other modes of the loop. Each of them only adds a characteristic root at zero.
+
+        Args:
+            names: Names of the states.
+
+        Returns:
+            The matrices of the remaining states, the names of these states, and the number of
+            removed states.
+        """
+        # entry (i, j): effect of state j on the rate of state i
+        delayed_effects = np.abs(self.Ad).sum(axis=0)
+        effects = np.abs(self.A) + delayed_effects
+
+        kept = list(range(len(names)))
+        while True:
+            inner = effects[np.ix_(kept, kept)]
+            is_constant = ~inner.any(axis=1)
+            has_no_effect = ~inner.any(axis=0)
+            idle = np.flatnonzero(is_constant | has_no_effect)
+            if not len(idle):
+                break
+            # one state at a time: its removal may leave others without an effect
+            del kept[int(idle[0])]
+
+        rows, columns = np.ix_(kept, kept)
+        Ad = self.Ad[:, rows, columns]
+        is_used = Ad.any(axis=(1, 2))
+        moving = self._replace(
+            A=self.A[rows, columns],
+            delays=self.delays[is_used],
+            Ad=Ad[is_used],
+            E=None if self.E is None else self.E[kept],
+        )
+        kept_names = tuple(names[n] for n in kept)
+        omitted = len(names) - len(kept)
+        return moving, kept_names, omitted
+
+    def refine_roots(
+        self,
+        candidates: Complex,
+        names: Sequence[str],
+        wanted: int,
+    ) -> "tuple[list[CharacteristicRoot], int]":
+        """Refines guesses of the rightmost roots by Newton's method.
+
+        Two more roots than wanted are refined, because the method may change their order. The
+        remaining guesses are skipped.
+
+        Args:
+            candidates: Guesses of nonzero roots, shape (K,), by falling real part.
+            names: Names of the states.
+            wanted: Number of roots. A conjugate pair counts once.
+
+        Returns:
+            The `wanted` rightmost roots, or fewer if the loop does not have so many. The number
+            of guesses from which no root was reached.
+        """
+        roots: list[CharacteristicRoot] = []
+        dropped = 0
+        for guess in candidates:
+            # the conjugate of another guess
+            if guess.imag < -SAME_ROOT_TOLERANCE * (1.0 + abs(guess)):
+                continue
+
+            if len(roots) >= wanted + 2:
+                break
+            root = _solve_for_root(self, complex(guess), names)
+            if root is None or abs(root.s) < SAME_ROOT_TOLERANCE:
+                dropped += 1
+                continue
+
+            tolerance = SAME_ROOT_TOLERANCE * (1.0 + abs(root.s))
+            distances = [abs(root.s - known.s) for known in roots]
+            if min(distances, default=math.inf) >= tolerance:
+                roots.append(root)
+
+        def rank(root: CharacteristicRoot) -> tuple[float, float]:
+            return -round(root.s.real, 9), root.s.imag
+
+        roots.sort(key=rank)
+        return roots[:wanted], dropped
+
 
 MovingPart = tuple[Pencil, tuple[str, ...], int]
 """A loop without its constant states and without its states that have no effect.
@@ -184,49 +270,6 @@ MovingPart = tuple[Pencil, tuple[str, ...], int]
 The entries are the matrices of the loop, the names of its states, and the number of omitted
 states, each of which has a root at zero.
 """
-
-
-def extract_moving_part(pencil: Pencil, names: Sequence[str]) -> MovingPart:
-    """Removes the states of a linear loop that do not change or act on no other state.
-
-    For example, a parameter estimate may act on no motion. These states do not influence the
-    other modes of the loop. Each of them only adds a characteristic root at zero.
-
-    Args:
-        pencil: Matrices and delays of the loop.
-        names: Names of the states.
-
-    Returns:
-        The matrices of the remaining states, the names of these states, and the number of
-        removed states.
-    """
-    # entry (i, j): effect of state j on the rate of state i
-    delayed_effects = np.abs(pencil.Ad).sum(axis=0)
-    effects = np.abs(pencil.A) + delayed_effects
-
-    kept = list(range(len(names)))
-    while True:
-        inner = effects[np.ix_(kept, kept)]
-        is_constant = ~inner.any(axis=1)
-        has_no_effect = ~inner.any(axis=0)
-        idle = np.flatnonzero(is_constant | has_no_effect)
-        if not len(idle):
-            break
-        # one state at a time: its removal may leave others without an effect
-        del kept[int(idle[0])]
-
-    rows, columns = np.ix_(kept, kept)
-    Ad = pencil.Ad[:, rows, columns]
-    is_used = Ad.any(axis=(1, 2))
-    moving = pencil._replace(
-        A=pencil.A[rows, columns],
-        delays=pencil.delays[is_used],
-        Ad=Ad[is_used],
-        E=None if pencil.E is None else pencil.E[kept],
-    )
-    kept_names = tuple(names[n] for n in kept)
-    omitted = len(names) - len(kept)
-    return moving, kept_names, omitted
 
 
 class CharacteristicRoot(NamedTuple):
@@ -254,23 +297,6 @@ class CharacteristicRoot(NamedTuple):
         and negative if the motion grows.
         """
         return -self.s.real / abs(self.s)
-
-    @property
-    def description(self) -> str:
-        """Names of the states that move most in this mode, for the user.
-
-        A state of a site (a process that runs one arm) is called "m1.q2", for example. Sites
-        with the same state are grouped: "q2 of m1, m2, s" stands for the second joint angle of
-        three sites.
-        """
-        sites: dict[str, list[str]] = {}
-        for state in self.states:
-            site, _, name = state.partition(".")
-            sites.setdefault(name, []).append(site)
-        phrases = []
-        for name, owners in sites.items():
-            phrases.append(f"{name} of {', '.join(sorted(owners))}")
-        return "; ".join(phrases)
 
 
 class Spectrum(NamedTuple):
@@ -304,23 +330,6 @@ class Spectrum(NamedTuple):
     is_exact: bool = True
 
     @property
-    def basis(self) -> str:
-        """A phrase for the user that names the span of time for which the roots were computed.
-
-        If the controllers compute in ticks (periods of the control loop) that are not all
-        alike, the roots belong to a span of several ticks. The phrase is empty if the roots do
-        not belong to such a span.
-        """
-        if self.span_s is None:
-            return ""
-        if self.is_exact:
-            return f", over the period of {self.span_s:.6g} s"
-        if self.deviation_per_s is None:
-            return f", over {self.span_s:.6g} s, after which the delays nearly repeat"
-        deviation = f"+- {self.deviation_per_s:.1g} /s"
-        return f", over {self.span_s:.4g} s of the delays in use, {deviation}"
-
-    @property
     def rightmost(self) -> CharacteristicRoot | None:
         """The characteristic root with the largest real part, which determines stability.
 
@@ -348,6 +357,49 @@ class Spectrum(NamedTuple):
         if rightmost_per_s >= -edge_per_s or self.drifting:
             return "at the edge"
         return "stable"
+
+    @classmethod
+    def of_loop(cls, loop: LinearLoop, wanted: int = 6) -> "Spectrum":
+        """Computes the rightmost roots of a loop with delays, in continuous time.
+
+        The loop is stable if all roots have a negative real part. The order of the
+        discretisation that supplies the guesses is doubled, until the roots of two orders agree
+        or the matrix is too large.
+
+        Args:
+            loop: The loop.
+            wanted: Number of roots. A conjugate pair or a multiple root counts once.
+        """
+        with limit_blas_threads():
+            pencil, names, idle_count = find_moving_part(loop)
+            zeros, drifting = _count_zero_roots(pencil)
+            if not len(names):
+                return cls(
+                    roots=(),
+                    zeros=idle_count + zeros,
+                    drifting=drifting,
+                    dropped=0,
+                    order=0,
+                )
+
+            has_delays = len(pencil.delays) > 0
+            order = _INITIAL_ORDER if has_delays else 0
+            previous_roots = None
+            while True:
+                guesses = _guess_roots(pencil, order, zeros)
+                roots, dropped = pencil.refine_roots(guesses, names, wanted)
+                next_size = len(names) + 2 * order * len(pencil.delayed_states)
+                is_converged = previous_roots is not None and _agree(previous_roots, roots)
+                if not has_delays or next_size > MAX_GENERATOR_SIZE or is_converged:
+                    return cls(
+                        roots=tuple(roots),
+                        zeros=idle_count + zeros,
+                        drifting=drifting,
+                        dropped=dropped,
+                        order=order,
+                    )
+                previous_roots = roots
+                order = 2 * order
 
 
 def _solve_for_root(
@@ -508,53 +560,6 @@ def _count_zero_roots(pencil: Pencil) -> tuple[int, int]:
     return zeros, zeros - vectors
 
 
-def refine_roots(
-    pencil: Pencil,
-    candidates: Complex,
-    names: Sequence[str],
-    wanted: int,
-) -> tuple[list[CharacteristicRoot], int]:
-    """Refines guesses of the rightmost roots by Newton's method.
-
-    Two more roots than wanted are refined, because the method may change their order. The
-    remaining guesses are skipped.
-
-    Args:
-        pencil: Matrices of the loop.
-        candidates: Guesses of nonzero roots, shape (K,), by falling real part.
-        names: Names of the states.
-        wanted: Number of roots. A conjugate pair counts once.
-
-    Returns:
-        The `wanted` rightmost roots, or fewer if the loop does not have so many. The number of
-        guesses from which no root was reached.
-    """
-    roots: list[CharacteristicRoot] = []
-    dropped = 0
-    for guess in candidates:
-        # this guess is the conjugate of another guess
-        if guess.imag < -SAME_ROOT_TOLERANCE * (1.0 + abs(guess)):
-            continue
-
-        if len(roots) >= wanted + 2:
-            break
-        root = _solve_for_root(pencil, complex(guess), names)
-        if root is None or abs(root.s) < SAME_ROOT_TOLERANCE:
-            dropped += 1
-            continue
-
-        tolerance = SAME_ROOT_TOLERANCE * (1.0 + abs(root.s))
-        distances = [abs(root.s - known.s) for known in roots]
-        if min(distances, default=math.inf) >= tolerance:
-            roots.append(root)
-
-    def rank(root: CharacteristicRoot) -> tuple[float, float]:
-        return -round(root.s.real, 9), root.s.imag
-
-    roots.sort(key=rank)
-    return roots[:wanted], dropped
-
-
 def find_moving_part(loop: LinearLoop) -> MovingPart:
     """Reduces a linear loop to the states that can influence its stability.
 
@@ -573,51 +578,8 @@ def find_moving_part(loop: LinearLoop) -> MovingPart:
     Ad = delayed_matrices.reshape(-1, *loop.A.shape)
     delays_s = np.array([term.delay_s for term in loop.delayed])
     pencil = Pencil(loop.A, delays_s, Ad, E=loop.E)
-    moving, names, idle_count = extract_moving_part(pencil, loop.names)
+    moving, names, idle_count = pencil.extract_moving_part(loop.names)
     return moving, names, idle_count + loop.omitted_states
-
-
-def compute_delay_spectrum(loop: LinearLoop, wanted: int = 6) -> Spectrum:
-    """Computes the rightmost characteristic roots of a loop with delays, in continuous time.
-
-    The loop is stable if all roots have a negative real part. The order of the discretisation
-    that supplies the guesses is doubled, until the roots of two orders agree or the matrix is
-    too large.
-
-    Args:
-        loop: The loop.
-        wanted: Number of roots. A conjugate pair or a multiple root counts once.
-    """
-    with limit_blas_threads():
-        pencil, names, idle_count = find_moving_part(loop)
-        zeros, drifting = _count_zero_roots(pencil)
-        if not len(names):
-            return Spectrum(
-                roots=(),
-                zeros=idle_count + zeros,
-                drifting=drifting,
-                dropped=0,
-                order=0,
-            )
-
-        has_delays = len(pencil.delays) > 0
-        order = _INITIAL_ORDER if has_delays else 0
-        previous_roots = None
-        while True:
-            guesses = _guess_roots(pencil, order, zeros)
-            roots, dropped = refine_roots(pencil, guesses, names, wanted)
-            next_size = len(names) + 2 * order * len(pencil.delayed_states)
-            is_converged = previous_roots is not None and _agree(previous_roots, roots)
-            if not has_delays or next_size > MAX_GENERATOR_SIZE or is_converged:
-                return Spectrum(
-                    roots=tuple(roots),
-                    zeros=idle_count + zeros,
-                    drifting=drifting,
-                    dropped=dropped,
-                    order=order,
-                )
-            previous_roots = roots
-            order = 2 * order
 
 
 def _guess_roots(pencil: Pencil, order: int, zeros: int) -> Complex:

@@ -153,6 +153,53 @@ class DelayMargin(NamedTuple):
             more = f", and in {count}"
         return f"stable for common delays {listed}{more}"
 
+    @classmethod
+    def of_loop(cls, loop: LinearLoop) -> "DelayMargin":
+        """Finds the network delays, equal on all links, for which a control loop is stable.
+
+        The delays that the loop itself contains are replaced by this common delay. The unstable
+        characteristic roots are counted for a small delay, below the first delay at which roots
+        cross the imaginary axis. For larger delays, every crossing changes the count by the
+        number of roots that cross.
+
+        Args:
+            loop: Linear model of the coupled arms.
+
+        Returns:
+            The intervals of stable delays, and the crossings that limit them.
+        """
+        crossings, lossless = _find_axis_crossings(loop)
+        if lossless:
+            return cls((), (), lossless)
+
+        delays_s = [crossing.delay_s for crossing in crossings]
+        first_s = min(delays_s, default=0.2)
+        start_s = 0.5 * min(first_s, 0.2)
+        start_loop = set_common_delay(loop, start_s)
+        unstable_roots = _count_unstable_roots(start_loop)
+
+        # Walk through the crossings. Each one may end or begin a stable interval.
+        intervals: list[_DelayInterval] = []
+        low: _AxisCrossing | None = None
+        low_s = 0.0
+        stable = unstable_roots == 0
+        for crossing in crossings:
+            roots_per_pair = 2 if crossing.omega_rad_s else 1
+            unstable_roots += roots_per_pair * crossing.pairs
+            if stable and unstable_roots > 0:
+                interval = _DelayInterval(low_s, crossing.delay_s, low, crossing)
+                intervals.append(interval)
+                stable = False
+            elif not stable and unstable_roots == 0:
+                low = crossing
+                low_s = crossing.delay_s
+                stable = True
+
+        if stable:
+            last_interval = _DelayInterval(low_s, MAX_COMMON_DELAY_S, low, None)
+            intervals.append(last_interval)
+        return cls(tuple(intervals), tuple(crossings))
+
 
 def set_common_delay(loop: LinearLoop, delay_s: float) -> LinearLoop:
     """Returns a linear loop with one delay on all network links, for example to check a margin.
@@ -175,53 +222,6 @@ def set_common_delay(loop: LinearLoop, delay_s: float) -> LinearLoop:
     return loop._replace(delayed=(term,))
 
 
-def find_delay_margin(loop: LinearLoop) -> DelayMargin:
-    """Finds the network delays, equal on all links, for which a control loop is stable.
-
-    The delays that the loop itself contains are replaced by this common delay. The unstable
-    characteristic roots are counted for a small delay, below the first delay at which roots
-    cross the imaginary axis. For larger delays, every crossing changes the count by the number
-    of roots that cross.
-
-    Args:
-        loop: Linear model of the coupled arms.
-
-    Returns:
-        The intervals of stable delays, and the crossings that limit them.
-    """
-    crossings, lossless = _find_axis_crossings(loop)
-    if lossless:
-        return DelayMargin((), (), lossless)
-
-    delays_s = [crossing.delay_s for crossing in crossings]
-    first_s = min(delays_s, default=0.2)
-    start_s = 0.5 * min(first_s, 0.2)
-    start_loop = set_common_delay(loop, start_s)
-    unstable_roots = _count_unstable_roots(start_loop)
-
-    # Walk through the crossings. Each one may end or begin a stable interval.
-    intervals: list[_DelayInterval] = []
-    low: _AxisCrossing | None = None
-    low_s = 0.0
-    stable = unstable_roots == 0
-    for crossing in crossings:
-        roots_per_pair = 2 if crossing.omega_rad_s else 1
-        unstable_roots += roots_per_pair * crossing.pairs
-        if stable and unstable_roots > 0:
-            interval = _DelayInterval(low_s, crossing.delay_s, low, crossing)
-            intervals.append(interval)
-            stable = False
-        elif not stable and unstable_roots == 0:
-            low = crossing
-            low_s = crossing.delay_s
-            stable = True
-
-    if stable:
-        last_interval = _DelayInterval(low_s, MAX_COMMON_DELAY_S, low, None)
-        intervals.append(last_interval)
-    return DelayMargin(tuple(intervals), tuple(crossings))
-
-
 def _count_unstable_roots(loop: LinearLoop) -> int:
     """Returns the number of roots with a positive real part, which belong to growing motions.
 
@@ -229,7 +229,7 @@ def _count_unstable_roots(loop: LinearLoop) -> int:
     """
     requested_roots = 8
     while True:
-        roots = characteristic_roots.compute_delay_spectrum(loop, requested_roots).roots
+        roots = characteristic_roots.Spectrum.of_loop(loop, requested_roots).roots
         unstable = [root for root in roots if root.s.real > 0.0]
         has_stable_root = len(unstable) < len(roots)
         if has_stable_root or len(roots) < requested_roots:

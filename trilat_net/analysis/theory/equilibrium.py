@@ -29,10 +29,10 @@ from . import linear_loop
 from .numeric_law import NumericLaw
 from .operating_point import Equilibrium, OperatingConditions
 from .site_dynamics import (
+    ArgumentLayout,
     compute_following,
     describe_switching_points,
     has_estimate,
-    lay_out_arguments,
     place_arm,
 )
 from .textbook_arm import SINGULAR
@@ -207,7 +207,7 @@ def _compute_gauss_newton_step(
     Velocities stay zero. States that cannot change also stay constant, such as an estimate
     without a gain or at a limit of its range. The shape is (states,).
     """
-    loop = linear_loop.linearise_loop(conditions, rest, all_estimates=True)
+    loop = linear_loop.LinearLoop.of_conditions(conditions, rest, all_estimates=True)
     delayed_matrices = [term.A for term in loop.delayed]
     effects = np.hstack([loop.A, *delayed_matrices])
 
@@ -243,7 +243,7 @@ def _shift_equilibrium(
     q = np.array(rest.q)
     theta_hat = np.array(rest.theta_hat)
     for index, site in enumerate(conditions.sites):
-        layout = lay_out_arguments(site)
+        layout = ArgumentLayout.of_site(site)
         mask = masks[index]
         states = np.zeros(len(mask))
         states[mask] = site_steps[index]
@@ -283,7 +283,7 @@ def _refuse_singular_poses(conditions: OperatingConditions, rest: Equilibrium) -
     """
     arguments = linear_loop.gather_site_arguments(conditions, rest)
     for site, x in zip(conditions.sites, arguments, strict=True):
-        layout = lay_out_arguments(site)
+        layout = ArgumentLayout.of_site(site)
         arm = place_arm(site, x[layout.q])
         following = compute_following(site, arm, x)
         if not following.least > SINGULAR:
@@ -329,7 +329,7 @@ def _predict_from_start(conditions: OperatingConditions, scenario: Scenario) -> 
 
     for _ in range(3):
         deviation = _compute_deviation(conditions, start, rest)
-        loop = linear_loop.linearise_loop(conditions, rest, all_estimates=True)
+        loop = linear_loop.LinearLoop.of_conditions(conditions, rest, all_estimates=True)
         remaining = _project_on_zero_roots(loop, deviation)
         if remaining is None:
             break
@@ -353,7 +353,7 @@ def _compute_deviation(
     estimate_deviation = start.theta_hat - rest.theta_hat
     states = []
     for index, site in enumerate(conditions.sites):
-        layout = lay_out_arguments(site)
+        layout = ArgumentLayout.of_site(site)
         q = q_deviation[index, : layout.joints]
         estimate = estimate_deviation[index, : layout.parameters]
         velocities = np.zeros(layout.joints)
@@ -569,7 +569,7 @@ def _build_at_pose(pose: tuple[float, ...], conditions: OperatingConditions) -> 
         UsageError: The pose does not consist of as many finite numbers as expected.
     """
     first_site = conditions.sites[0]
-    coordinates = lay_out_arguments(first_site).coordinates
+    coordinates = ArgumentLayout.of_site(first_site).coordinates
     task = first_site.layout.task
     if len(pose) != coordinates or not np.isfinite(pose).all():
         expected = _describe_pose(coordinates, task=bool(task))
@@ -616,7 +616,7 @@ def _reach_pose(site: SiteSetup, pose: Array) -> Array:
     Raises:
         ScenarioError: The end effector does not reach the pose along the followed axes.
     """
-    layout = lay_out_arguments(site)
+    layout = ArgumentLayout.of_site(site)
     q = np.array(site.q0, dtype=np.float64)
     for _ in range(_GAUSS_NEWTON_STEPS):
         x = np.zeros(layout.arguments)
@@ -747,7 +747,7 @@ def _describe_limits(conditions: OperatingConditions, rest: Equilibrium) -> Iter
         if site.chain is None or site.chain.task is None:
             continue
         task = site.chain.task
-        layout = lay_out_arguments(site)
+        layout = ArgumentLayout.of_site(site)
         arm = place_arm(site, x[layout.q])
         following = compute_following(site, arm, x)
         least = following.least**0.5

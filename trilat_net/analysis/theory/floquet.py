@@ -58,15 +58,9 @@ from .characteristic_roots import (
     Complex,
     Pencil,
     Spectrum,
-    extract_moving_part,
 )
 from .characteristic_roots import STABILITY_EDGE_PER_S as _STILL_PER_S
-from .linear_loop import (
-    SiteJacobian,
-    compute_couplings,
-    differentiate_rates,
-    join_diagonal_blocks,
-)
+from .linear_loop import SiteJacobian, compute_couplings, join_diagonal_blocks
 from .operating_point import Equilibrium, OperatingConditions
 from .tick_recurrence import add_matrix_products
 
@@ -122,7 +116,7 @@ def _linearise_site_tick(site: SiteSetup, jacobian: SiteJacobian) -> _SiteTickMa
 
     Args:
         site: Setup of the site.
-        jacobian: Linear model of the site in continuous time, from `differentiate_rates`.
+        jacobian: Linear model of the site in continuous time.
 
     Returns:
         The matrices that map the states and inputs at one tick to the states at the next tick.
@@ -240,52 +234,54 @@ class CoupledTicks(NamedTuple):
     owners: NDArray[np.int64]
     constant: int
 
+    @classmethod
+    def of_conditions(
+        cls, conditions: OperatingConditions, rest: Equilibrium
+    ) -> "CoupledTicks":
+        """Builds the linear model of all coupled arms over one tick, a period of control loops.
 
-def couple_ticks(conditions: OperatingConditions, rest: Equilibrium) -> CoupledTicks:
-    """Builds the linear model of all coupled arms over one tick, a period of control loops.
+        States that are constant, and states without an effect, are left out.
 
-    States that are constant, and states without an effect, are left out.
+        Args:
+            conditions: The sites (processes that each run one arm), gains and delays.
+            rest: The pose of rest about which the sites are linearised.
 
-    Args:
-        conditions: The sites (processes that each run one arm), gains and delays.
-        rest: The pose of rest about which the sites are linearised.
+        Returns:
+            The model, with the number of omitted states.
+        """
+        jacobians = SiteJacobian.list_of_sites(conditions, rest)
+        maps = []
+        for site, jacobian in zip(conditions.sites, jacobians, strict=True):
+            maps.append(_linearise_site_tick(site, jacobian))
+        sizes = [len(tick_map.P) for tick_map in maps]
+        owners = np.repeat(np.arange(len(maps)), sizes)
+        names = [name for tick_map in maps for name in tick_map.names]
 
-    Returns:
-        The model, with the number of omitted states.
-    """
-    jacobians = differentiate_rates(conditions, rest)
-    maps = []
-    for site, jacobian in zip(conditions.sites, jacobians, strict=True):
-        maps.append(_linearise_site_tick(site, jacobian))
-    sizes = [len(tick_map.P) for tick_map in maps]
-    owners = np.repeat(np.arange(len(maps)), sizes)
-    names = [name for tick_map in maps for name in tick_map.names]
+        couplings = compute_couplings(conditions, rest, jacobians)
+        effects = np.zeros((len(couplings), len(owners), len(owners)))
+        for effect, ((i, j), coupling) in zip(effects, couplings.items(), strict=True):
+            block = np.ix_(owners == i, owners == j)
+            effect[block] = maps[i].Q @ coupling @ maps[j].output
 
-    couplings = compute_couplings(conditions, rest, jacobians)
-    effects = np.zeros((len(couplings), len(owners), len(owners)))
-    for effect, ((i, j), coupling) in zip(effects, couplings.items(), strict=True):
-        block = np.ix_(owners == i, owners == j)
-        effect[block] = maps[i].Q @ coupling @ maps[j].output
-
-    # the moving part is found as for rates; numbers of pairs stand in for their delays
-    S = join_diagonal_blocks([tick_map.P for tick_map in maps])
-    changes = S - np.eye(len(owners))
-    pair_numbers = np.arange(len(effects))
-    changes_pencil = Pencil(changes, pair_numbers, effects)
-    moving, moving_names, constant = extract_moving_part(changes_pencil, names)
-    pairs = list(couplings)
-    moving_effects = {}
-    for n, effect in zip(moving.delays, moving.Ad, strict=True):
-        moving_effects[pairs[int(n)]] = effect
-    moving_states = [names.index(name) for name in moving_names]
-    omitted = sum(jacobian.omitted_states for jacobian in jacobians)
-    return CoupledTicks(
-        S=moving.A + np.eye(len(moving_names)),
-        effects=moving_effects,
-        names=moving_names,
-        owners=owners[moving_states],
-        constant=constant + omitted,
-    )
+        # the moving part is found as for rates; numbers of pairs stand in for their delays
+        S = join_diagonal_blocks([tick_map.P for tick_map in maps])
+        changes = S - np.eye(len(owners))
+        pair_numbers = np.arange(len(effects))
+        changes_pencil = Pencil(changes, pair_numbers, effects)
+        moving, moving_names, constant = changes_pencil.extract_moving_part(names)
+        pairs = list(couplings)
+        moving_effects = {}
+        for n, effect in zip(moving.delays, moving.Ad, strict=True):
+            moving_effects[pairs[int(n)]] = effect
+        moving_states = [names.index(name) for name in moving_names]
+        omitted = sum(jacobian.omitted_states for jacobian in jacobians)
+        return cls(
+            S=moving.A + np.eye(len(moving_names)),
+            effects=moving_effects,
+            names=moving_names,
+            owners=owners[moving_states],
+            constant=constant + omitted,
+        )
 
 
 DRAWN_SPAN_S = 30.0
@@ -336,58 +332,59 @@ class SamplesInUse(NamedTuple):
     period_s: float | None = None
     is_exact: bool = False
 
+    @classmethod
+    def predict(cls, conditions: OperatingConditions) -> "SamplesInUse":
+        """Finds which samples of the other sites each site uses, in every tick of a span.
 
-def find_samples_in_use(conditions: OperatingConditions) -> SamplesInUse:
-    """Finds the samples of the other sites that each site uses, in every tick of a time span.
+        A sample is the state that a site sends in one tick (period of its control loop). The
+        pattern of used samples repeats after some time, and the span consists of whole
+        repetitions. Random delays never repeat. A span of fixed length with drawn delays is
+        used for them.
 
-    A sample is the state that a site sends in one tick (period of its control loop). The
-    pattern of used samples repeats after some time, and the span consists of whole repetitions.
-    Random delays never repeat. A span of fixed length with drawn delays is used for them.
+        Args:
+            conditions: The sites, their tick rates, and the links between them.
 
-    Args:
-        conditions: The sites, their tick rates, and the links between them.
-
-    Returns:
-        The used samples, and the length of the span.
-    """
-    rates_hz = [site.rate_hz for site in conditions.sites]
-    common_hz = math.gcd(*rates_hz)
-    links: list[LinkBase] = []
-    if conditions.varying:
-        links = [link for link, _ in conditions.links.values()]
-    period = find_delay_period(links, rates_hz)
-    period_s = period.span_s
-    delays_ms = [sum(link.moments()) + link.playout_ms for link in links]
-    reach_ms = max(delays_ms, default=0.0)
-    if period_s is not None:
-        age_s = float(conditions.age_s.max())
-        least_s = max(_LEAST_SPAN_S, 2.0 * age_s, 2e-3 * reach_ms)
-        periods = math.ceil(least_s / period_s)
-        span_s = period_s * periods
-    else:
-        is_drawn = any(link.random for link in links)
-        longest_s = DRAWN_SPAN_S if is_drawn else MAX_NEAR_PERIOD_S
-        span_s = math.ceil(longest_s * common_hz) / common_hz
-    # the span starts when samples no longer depend on the start of the run
-    settled_s = 4e-3 * reach_ms + 0.1
-    start_s = math.ceil(settled_s * common_hz) / common_hz
-
-    used = {}
-    for i, j in conditions.coupled_pairs:
-        hz = rates_hz[i]
-        peer_hz = rates_hz[j]
-        ticks = np.arange(round(span_s * hz))
+        Returns:
+            The used samples, and the length of the span.
+        """
+        rates_hz = [site.rate_hz for site in conditions.sites]
+        common_hz = math.gcd(*rates_hz)
+        links: list[LinkBase] = []
         if conditions.varying:
-            link, key = conditions.links[i, j]
-            drawn = draw_used_samples(link, key, hz, peer_hz, start_s + span_s)
-            first_tick = round(start_s * hz)
-            first_sample = round(start_s * peer_hz)
-            samples = drawn[first_tick + ticks]
-            used[i, j] = np.maximum(samples, 0) - first_sample
+            links = [link for link, _ in conditions.links.values()]
+        period = find_delay_period(links, rates_hz)
+        period_s = period.span_s
+        delays_ms = [sum(link.moments()) + link.playout_ms for link in links]
+        reach_ms = max(delays_ms, default=0.0)
+        if period_s is not None:
+            age_s = float(conditions.age_s.max())
+            least_s = max(_LEAST_SPAN_S, 2.0 * age_s, 2e-3 * reach_ms)
+            periods = math.ceil(least_s / period_s)
+            span_s = period_s * periods
         else:
-            sample_times_s = ticks / hz - conditions.age_s[i, j]
-            used[i, j] = np.rint(sample_times_s * peer_hz).astype(np.int64)
-    return SamplesInUse(span_s, used, period_s, is_exact=period.is_exact)
+            is_drawn = any(link.random for link in links)
+            longest_s = DRAWN_SPAN_S if is_drawn else MAX_NEAR_PERIOD_S
+            span_s = math.ceil(longest_s * common_hz) / common_hz
+        # the span starts when samples no longer depend on the start of the run
+        settled_s = 4e-3 * reach_ms + 0.1
+        start_s = math.ceil(settled_s * common_hz) / common_hz
+
+        used = {}
+        for i, j in conditions.coupled_pairs:
+            hz = rates_hz[i]
+            peer_hz = rates_hz[j]
+            ticks = np.arange(round(span_s * hz))
+            if conditions.varying:
+                link, key = conditions.links[i, j]
+                drawn = draw_used_samples(link, key, hz, peer_hz, start_s + span_s)
+                first_tick = round(start_s * hz)
+                first_sample = round(start_s * peer_hz)
+                samples = drawn[first_tick + ticks]
+                used[i, j] = np.maximum(samples, 0) - first_sample
+            else:
+                sample_times_s = ticks / hz - conditions.age_s[i, j]
+                used[i, j] = np.rint(sample_times_s * peer_hz).astype(np.int64)
+        return cls(span_s, used, period_s, is_exact=period.is_exact)
 
 
 class _TickRun(NamedTuple):
@@ -871,7 +868,7 @@ class SampledLoop:
         self, conditions: OperatingConditions, uses: SamplesInUse | None = None
     ) -> None:
         self._conditions = conditions
-        self._uses = uses or find_samples_in_use(conditions)
+        self._uses = uses or SamplesInUse.predict(conditions)
         self._rates_hz = [site.rate_hz for site in conditions.sites]
         # modes of the last spectrum as columns of a span map
         self._modes: Array | None = None
@@ -893,7 +890,7 @@ class SampledLoop:
             # every tick is like the previous tick
             span_s = None
 
-        loop = couple_ticks(self._conditions, rest)
+        loop = CoupledTicks.of_conditions(self._conditions, rest)
         deviation_per_s = None
         if not loop.names:
             return Spectrum(
@@ -951,7 +948,7 @@ class SampledLoop:
             The real part of the rightmost root, in 1/s. `None` if all roots are zero by
             structure.
         """
-        loop = couple_ticks(self._conditions, pose)
+        loop = CoupledTicks.of_conditions(self._conditions, pose)
         if not loop.names:
             return None
         span_s = self._uses.span_s

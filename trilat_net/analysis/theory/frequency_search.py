@@ -82,6 +82,48 @@ class Minima(NamedTuple):
         w_rad_s = self.w_rad_s[least_index]
         return float(w_rad_s / (2.0 * np.pi))
 
+    @classmethod
+    def find(
+        cls,
+        curve: FrequencyCurve,
+        w_rad_s: Array,
+        level: float = 0.0,
+        tolerance: FrequencyCurve | None = None,
+    ) -> "Minima":
+        """Evaluates a curve over frequency, and adds frequencies until its minima are resolved.
+
+        A narrow minimum between two frequencies of a fixed grid would be missed.
+
+        Args:
+            curve: Function that returns the values of the curve at given frequencies.
+            w_rad_s: First frequencies, rising, shape (F,), in rad/s.
+            level: Value of the curve below which bands of frequencies are reported.
+            tolerance: Function that returns the rounding error of the curve at given
+                frequencies. Smaller differences from the level, or between neighbouring values,
+                are ignored. `None` if there is no rounding error.
+
+        Returns:
+            The frequencies and values, and the bands in which the curve is below the level.
+        """
+
+        def find_rounding(w: Array) -> Array:
+            return tolerance(w) if tolerance is not None else np.zeros(len(w))
+
+        def evaluate(w: Array) -> Array:
+            """Returns the curve and its rounding error at given frequencies, shape (F, 2)."""
+            values = curve(w)
+            rounding = find_rounding(w)
+            return np.stack([values, rounding], axis=1)
+
+        def evaluate_upper(w: Array) -> Array:
+            return curve(w) + find_rounding(w)
+
+        w_rad_s, refined = _refine(evaluate, w_rad_s, _find_steps_at_minima)
+        values, rounding = refined.T
+        upper_values = values + rounding
+        below = _find_bands_below(evaluate_upper, w_rad_s, upper_values, level)
+        return cls(w_rad_s, values, below)
+
 
 def build_frequency_grid(low_hz: float, high_hz: float, delay_s: float) -> Array:
     """Returns frequencies that resolve the phase of a delay, in rad/s, shape (F,).
@@ -220,47 +262,6 @@ def cache_response(response: PortResponse, w_rad_s: Array) -> PortResponse:
         return cached if w is w_rad_s else response(w)
 
     return evaluate
-
-
-def find_minima(
-    curve: FrequencyCurve,
-    w_rad_s: Array,
-    level: float = 0.0,
-    tolerance: FrequencyCurve | None = None,
-) -> Minima:
-    """Evaluates a curve over frequency, and adds frequencies until its minima are resolved.
-
-    A narrow minimum between two frequencies of a fixed grid would be missed.
-
-    Args:
-        curve: Function that returns the values of the curve at given frequencies.
-        w_rad_s: First frequencies, rising, shape (F,), in rad/s.
-        level: Value of the curve below which bands of frequencies are reported.
-        tolerance: Function that returns the rounding error of the curve at given frequencies.
-            Smaller differences from the level, or between neighbouring values, are ignored.
-            `None` if there is no rounding error.
-
-    Returns:
-        The frequencies and values, and the bands in which the curve is below the level.
-    """
-
-    def find_rounding(w: Array) -> Array:
-        return tolerance(w) if tolerance is not None else np.zeros(len(w))
-
-    def evaluate(w: Array) -> Array:
-        """Returns the curve and its rounding error at given frequencies, shape (F, 2)."""
-        values = curve(w)
-        rounding = find_rounding(w)
-        return np.stack([values, rounding], axis=1)
-
-    def evaluate_upper(w: Array) -> Array:
-        return curve(w) + find_rounding(w)
-
-    w_rad_s, refined = _refine(evaluate, w_rad_s, _find_steps_at_minima)
-    values, rounding = refined.T
-    upper_values = values + rounding
-    below = _find_bands_below(evaluate_upper, w_rad_s, upper_values, level)
-    return Minima(w_rad_s, values, below)
 
 
 def _find_steps_at_minima(curve_and_rounding: Array) -> NDArray[np.bool_]:

@@ -35,16 +35,16 @@ from ...results import Result
 from ...scenario import IRREVERSIBLE_SHARES, Scenario, describe_law_conditions, load_scenario
 from ..blas_threads import limit_blas_threads
 from ..stability_decision import NEAR_REST_RAD
-from .characteristic_roots import CharacteristicRoot, Spectrum, compute_delay_spectrum
-from .delay_margin import DelayMargin, find_delay_margin
+from .characteristic_roots import CharacteristicRoot, Spectrum
+from .delay_margin import DelayMargin
 from .equilibrium import add_limit_notes, find_equilibrium
 from .floquet import SamplesInUse, compute_sampled_spectrum
 from .linear_edge import EdgeScan, iterate_linear_edges, parse_edge_range
-from .linear_loop import LinearLoop, compute_shared_poses, linearise_loop
+from .linear_loop import LinearLoop, compute_shared_poses
 from .loop_roots import find_log_loop, find_run_loop, resolve_final_scenario
 from .numeric_law import NumericLaw
 from .operating_point import Equilibrium, OperatingConditions
-from .port_analysis import PortAnalysis, analyse_ports, ports_to_json
+from .port_analysis import PortAnalysis
 from .port_passivity import HandMatrices
 
 DEFAULT_ROOTS = 6
@@ -182,7 +182,7 @@ class LinearAnalysis(Result):
             sampled = _spectrum_to_json(self.sampled)
         ports = None
         if self.ports is not None:
-            ports = ports_to_json(self.ports)
+            ports = self.ports.to_json()
         edges = {}
         for scan in self.scans:
             edges[scan.key] = [edge._asdict() for edge in scan.edges]
@@ -370,16 +370,16 @@ def analyse_linear_loop(
     scenario = analysed.scenario
     conditions = analysed.conditions
     rest = analysed.rest
-    loop = linearise_loop(conditions, rest)
+    loop = LinearLoop.of_conditions(conditions, rest)
 
     analysis = LinearAnalysis(
         scenario=scenario,
         conditions=conditions,
         rest=rest,
         loop=loop,
-        continuous=compute_delay_spectrum(loop, roots),
+        continuous=Spectrum.of_loop(loop, roots),
         sampled=compute_sampled_spectrum(conditions, rest, roots, analysed.uses),
-        margin=find_delay_margin(loop),
+        margin=DelayMargin.of_loop(loop),
         distance_rad=analysed.distance_rad,
     )
 
@@ -387,7 +387,7 @@ def analyse_linear_loop(
     for key, low, high in ranges:
         edges = iterate_linear_edges(scenario, key, low=low, high=high, rest=rest)
         scans.append(EdgeScan(key, low, high, tuple(edges)))
-    port_analysis = analyse_ports(scenario, rest, hands=hands) if ports else None
+    port_analysis = PortAnalysis.of_scenario(scenario, rest, hands=hands) if ports else None
     return replace(analysis, scans=tuple(scans), ports=port_analysis)
 
 

@@ -29,7 +29,7 @@ from ...core import Array, Law, TorqueKind
 from ...errors import ScenarioError, UsageError
 from ...scenario import Scenario, load_scenario
 from ..blas_threads import limit_blas_threads
-from .characteristic_roots import CharacteristicRoot, compute_delay_spectrum
+from .characteristic_roots import CharacteristicRoot, Spectrum
 from .equilibrium import (
     choose_equilibrium,
     find_equilibrium,
@@ -37,7 +37,7 @@ from .equilibrium import (
     follow_equilibrium,
 )
 from .floquet import compute_sampled_spectrum
-from .linear_loop import linearise_loop
+from .linear_loop import LinearLoop
 from .operating_point import Equilibrium, OperatingConditions
 from .site_dynamics import place_arm
 
@@ -87,7 +87,7 @@ def find_rightmost_root(
     """
     spectrum = compute_sampled_spectrum(conditions, rest, 1) if sampled else None
     if spectrum is None:
-        spectrum = compute_delay_spectrum(linearise_loop(conditions, rest), 1)
+        spectrum = Spectrum.of_loop(LinearLoop.of_conditions(conditions, rest), 1)
     return spectrum.rightmost
 
 

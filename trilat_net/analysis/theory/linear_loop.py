@@ -73,6 +73,57 @@ class SiteJacobian(NamedTuple):
         state_count = self.layout.states
         return samples[:, :state_count]
 
+    @classmethod
+    def list_of_sites(
+        cls,
+        conditions: OperatingConditions,
+        rest: Equilibrium,
+        *,
+        all_estimates: bool = False,
+    ) -> "list[SiteJacobian]":
+        """Builds the linear model of each site by itself about a pose of rest.
+
+        A site is a process that runs one arm. The model contains the derivatives of its rates
+        of change with respect to its own states and to its inputs.
+
+        Args:
+            conditions: The sites, gains and delays of the coupled arms.
+            rest: The pose of rest, with the parameter estimates.
+            all_estimates: True to keep every parameter estimate of a chain of joints as a
+                state. By default, only their combinations that act on small motions are states:
+                the estimated gravity torques of the joints.
+
+        Returns:
+            The models, in the order of the sites.
+        """
+        arguments = gather_site_arguments(conditions, rest)
+        references = _differentiate_references(conditions, rest)
+        jacobians = []
+        for i, (site, x) in enumerate(zip(conditions.sites, arguments, strict=True)):
+            layout = site_dynamics.ArgumentLayout.of_site(site)
+            rates = site_dynamics.SiteRates.differentiate(site, x)
+            if conditions.has_forms:
+                # the memory of such a law supplies the torque that holds the arm at rest
+                torque_columns = layout.external_torque
+                qdd = site_dynamics.SiteRates.evaluate(site, x).qdd
+                inverse_inertia = rates.qdd[:, torque_columns]
+                holding_torque = np.linalg.solve(inverse_inertia, qdd)
+                x[torque_columns] -= holding_torque
+                rates = site_dynamics.SiteRates.differentiate(site, x)
+            if (i, i) in references:
+                # chain rule: the reference depends on the site's own orientation
+                state_count = layout.states
+                pose_by_state = rates.x[:, :state_count]
+                reference_by_state = references[i, i] @ pose_by_state
+                for derivative in rates:
+                    by_reference = derivative[:, layout.q_des]
+                    indirect_effect = by_reference @ reference_by_state
+                    derivative[:, :state_count] += indirect_effect
+
+            jacobian = _select_states(site, layout, rates, all_estimates=all_estimates)
+            jacobians.append(jacobian)
+        return jacobians
+
 
 class DelayedTerm(NamedTuple):
     """Effect of all states and torques on the coupled arms after one particular delay T.
@@ -133,6 +184,87 @@ class LinearLoop(NamedTuple):
         delayed = [term.A for term in self.delayed]
         return sum(delayed, self.A)
 
+    @classmethod
+    def of_conditions(
+        cls,
+        conditions: OperatingConditions,
+        rest: Equilibrium,
+        *,
+        all_estimates: bool = False,
+    ) -> "LinearLoop":
+        """Builds the linear model of the coupled arms for small motions about a pose of rest.
+
+        The model contains all sites (processes that each run one arm) and the links between
+        them with their delays. Its inputs are the torques of operators on the joints.
+
+        Args:
+            conditions: The sites, gains and delays of the coupled arms.
+            rest: The pose of rest, with the parameter estimates.
+            all_estimates: True to keep every parameter estimate of a chain of joints as a
+                state. By default, only their combinations that act on small motions are states:
+                the estimated gravity torques of the joints.
+
+        Returns:
+            The model, a linear differential equation with delays.
+        """
+        sites = SiteJacobian.list_of_sites(conditions, rest, all_estimates=all_estimates)
+        states = _list_blocks([site.layout.states for site in sites])
+        ports = _list_blocks([site.layout.joints for site in sites])
+        state_count = states[-1].stop
+        port_count = ports[-1].stop
+        A = np.zeros((state_count, state_count))
+        B = np.zeros((state_count, port_count))
+        C = np.zeros((port_count, state_count))
+
+        input_effects = []
+        for i, site in enumerate(sites):
+            layout = site.layout
+            rates = site.rates
+            joints = layout.joints
+            site_states = states[i]
+            site_ports = ports[i]
+            first_velocity = layout.qd.start
+            position_rate = np.eye(joints, layout.arguments, first_velocity)
+            derivative = np.vstack([position_rate, rates.qdd, rates.estimate])
+            A[site_states, site_states] = derivative[:, : layout.states]
+            B[site_states, site_ports] = derivative[:, layout.external_torque]
+            C[site_ports, site_states] = np.eye(joints, layout.states, first_velocity)
+            input_effect = derivative[:, layout.inputs]
+            input_effects.append(input_effect)
+
+        terms: dict[float, tuple[Array, Array]] = {}
+        couplings = compute_couplings(conditions, rest, sites)
+        for (i, j), coupling in couplings.items():
+            delay_s = float(conditions.age_s[i, j])
+            if delay_s not in terms:
+                terms[delay_s] = (np.zeros_like(A), np.zeros_like(B))
+            late_A, late_B = terms[delay_s]
+            peer = sites[j]
+            peer_layout = peer.layout
+            effect = input_effects[i] @ coupling
+            effect_of_states = effect @ peer.output
+            late_A[states[i], states[j]] += effect_of_states
+            # the torque on the peer's joints is reflected without a state in between
+            first_torque = 2 * peer_layout.coordinates
+            effect_of_torque = effect[:, first_torque:]
+            reflected_by_port = peer.rates.reflected[:, peer_layout.external_torque]
+            effect_of_ports = effect_of_torque @ reflected_by_port
+            late_B[states[i], ports[j]] += effect_of_ports
+
+        loop = LinearLoop(
+            names=_name_states(conditions, sites),
+            inputs=_name_ports(conditions, sites, "tau"),
+            outputs=_name_ports(conditions, sites, "qd"),
+            A=A,
+            B=B,
+            C=C,
+            delayed=_sort_terms(terms),
+            omitted_states=sum(site.omitted_states for site in sites),
+        )
+        if all_estimates or not conditions.has_forms:
+            return loop
+        return _add_law_forms(conditions, sites, loop)
+
 
 def join_diagonal_blocks(blocks: Sequence[Array]) -> Array:
     """Returns a matrix with given matrices (blocks) on its diagonal, and zeros elsewhere.
@@ -168,7 +300,7 @@ def gather_site_arguments(conditions: OperatingConditions, rest: Equilibrium) ->
     Returns:
         A vector for each site, with the length that its `ArgumentLayout` states.
     """
-    layouts = [site_dynamics.lay_out_arguments(site) for site in conditions.sites]
+    layouts = [site_dynamics.ArgumentLayout.of_site(site) for site in conditions.sites]
     arguments = [np.zeros(layout.arguments) for layout in layouts]
     references = compute_references(conditions, rest)
     site_arguments = list(zip(layouts, arguments, strict=True))
@@ -345,61 +477,11 @@ def mask_loop_states(conditions: OperatingConditions) -> list[NDArray[np.bool_]]
     """
     masks = []
     for site in conditions.sites:
-        layout = site_dynamics.lay_out_arguments(site)
+        layout = site_dynamics.ArgumentLayout.of_site(site)
         mask = np.ones(layout.states, dtype=bool)
         mask[layout.estimate] = site_dynamics.has_estimate(site)
         masks.append(mask)
     return masks
-
-
-def differentiate_rates(
-    conditions: OperatingConditions,
-    rest: Equilibrium,
-    *,
-    all_estimates: bool = False,
-) -> list[SiteJacobian]:
-    """Builds the linear model of each site by itself about a pose of rest.
-
-    A site is a process that runs one arm. The model contains the derivatives of its rates of
-    change with respect to its own states and to its inputs.
-
-    Args:
-        conditions: The sites, gains and delays of the coupled arms.
-        rest: The pose of rest, with the parameter estimates.
-        all_estimates: True to keep every parameter estimate of a chain of joints as a state. By
-            default, only their combinations that act on small motions are states: the estimated
-            gravity torques of the joints.
-
-    Returns:
-        The models, in the order of the sites.
-    """
-    arguments = gather_site_arguments(conditions, rest)
-    references = _differentiate_references(conditions, rest)
-    jacobians = []
-    for i, (site, x) in enumerate(zip(conditions.sites, arguments, strict=True)):
-        layout = site_dynamics.lay_out_arguments(site)
-        rates = site_dynamics.differentiate_site_rates(site, x)
-        if conditions.has_forms:
-            # the memory of such a law supplies the torque that holds the arm at rest
-            torque_columns = layout.external_torque
-            qdd = site_dynamics.evaluate_site_rates(site, x).qdd
-            inverse_inertia = rates.qdd[:, torque_columns]
-            holding_torque = np.linalg.solve(inverse_inertia, qdd)
-            x[torque_columns] -= holding_torque
-            rates = site_dynamics.differentiate_site_rates(site, x)
-        if (i, i) in references:
-            # chain rule: the reference depends on the site's own orientation
-            state_count = layout.states
-            pose_by_state = rates.x[:, :state_count]
-            reference_by_state = references[i, i] @ pose_by_state
-            for derivative in rates:
-                by_reference = derivative[:, layout.q_des]
-                indirect_effect = by_reference @ reference_by_state
-                derivative[:, :state_count] += indirect_effect
-
-        jacobian = _select_states(site, layout, rates, all_estimates=all_estimates)
-        jacobians.append(jacobian)
-    return jacobians
 
 
 def _select_states(
@@ -494,86 +576,6 @@ def _list_blocks(lengths: Sequence[int]) -> list[slice]:
     """Returns consecutive slices of the given lengths, for the blocks of a joint vector."""
     bounds = np.cumsum([0, *lengths]).tolist()
     return [slice(start, stop) for start, stop in pairwise(bounds)]
-
-
-def linearise_loop(
-    conditions: OperatingConditions,
-    rest: Equilibrium,
-    *,
-    all_estimates: bool = False,
-) -> LinearLoop:
-    """Builds the linear model of the coupled arms for small motions about a pose of rest.
-
-    The model contains all sites (processes that each run one arm) and the links between them
-    with their delays. Its inputs are the torques of operators on the joints.
-
-    Args:
-        conditions: The sites, gains and delays of the coupled arms.
-        rest: The pose of rest, with the parameter estimates.
-        all_estimates: True to keep every parameter estimate of a chain of joints as a state. By
-            default, only their combinations that act on small motions are states: the estimated
-            gravity torques of the joints.
-
-    Returns:
-        The model, a linear differential equation with delays.
-    """
-    sites = differentiate_rates(conditions, rest, all_estimates=all_estimates)
-    states = _list_blocks([site.layout.states for site in sites])
-    ports = _list_blocks([site.layout.joints for site in sites])
-    state_count = states[-1].stop
-    port_count = ports[-1].stop
-    A = np.zeros((state_count, state_count))
-    B = np.zeros((state_count, port_count))
-    C = np.zeros((port_count, state_count))
-
-    input_effects = []
-    for i, site in enumerate(sites):
-        layout = site.layout
-        rates = site.rates
-        joints = layout.joints
-        site_states = states[i]
-        site_ports = ports[i]
-        first_velocity = layout.qd.start
-        position_rate = np.eye(joints, layout.arguments, first_velocity)
-        derivative = np.vstack([position_rate, rates.qdd, rates.estimate])
-        A[site_states, site_states] = derivative[:, : layout.states]
-        B[site_states, site_ports] = derivative[:, layout.external_torque]
-        C[site_ports, site_states] = np.eye(joints, layout.states, first_velocity)
-        input_effect = derivative[:, layout.inputs]
-        input_effects.append(input_effect)
-
-    terms: dict[float, tuple[Array, Array]] = {}
-    couplings = compute_couplings(conditions, rest, sites)
-    for (i, j), coupling in couplings.items():
-        delay_s = float(conditions.age_s[i, j])
-        if delay_s not in terms:
-            terms[delay_s] = (np.zeros_like(A), np.zeros_like(B))
-        late_A, late_B = terms[delay_s]
-        peer = sites[j]
-        peer_layout = peer.layout
-        effect = input_effects[i] @ coupling
-        effect_of_states = effect @ peer.output
-        late_A[states[i], states[j]] += effect_of_states
-        # the torque on the peer's joints is reflected without a state in between
-        first_torque = 2 * peer_layout.coordinates
-        effect_of_torque = effect[:, first_torque:]
-        reflected_by_port = peer.rates.reflected[:, peer_layout.external_torque]
-        effect_of_ports = effect_of_torque @ reflected_by_port
-        late_B[states[i], ports[j]] += effect_of_ports
-
-    loop = LinearLoop(
-        names=_name_states(conditions, sites),
-        inputs=_name_ports(conditions, sites, "tau"),
-        outputs=_name_ports(conditions, sites, "qd"),
-        A=A,
-        B=B,
-        C=C,
-        delayed=_sort_terms(terms),
-        omitted_states=sum(site.omitted_states for site in sites),
-    )
-    if all_estimates or not conditions.has_forms:
-        return loop
-    return _add_law_forms(conditions, sites, loop)
 
 
 def _name_states(

@@ -32,7 +32,7 @@ import msgspec
 import numpy as np
 
 from ...core import BUCKETS_PER_S, Array
-from ...errors import ScenarioError, join_words
+from ...errors import ScenarioError
 from ...execution import FusedRun
 from ...log import Ints, Log
 from ...own_code import ImportedLaw
@@ -41,14 +41,14 @@ from ...scenario import ConstantDelay, LinkBase, Scenario
 from ..blas_threads import limit_blas_threads
 from ..decision_facts import LoopRoots
 from ..delay_period import find_final_link, is_ending_trace
-from ..dominance_history import list_program_sites
-from ..run_end import SETTLED_SPEED_RAD_S, RunTrace, trace_log
-from ..timeline import list_effective_commands, recorded_end_s
-from .characteristic_roots import Spectrum, compute_delay_spectrum
+from ..run_end import SETTLED_SPEED_RAD_S, RunTrace
+from ..shared_slave import list_program_sites
+from ..timeline import Timeline
+from .characteristic_roots import Spectrum
 from .equilibrium import follow_equilibrium, pad_rows, settle_memories
 from .floquet import DRAWN_SPAN_S, SampledLoop, SamplesInUse
 from .linear_edge import find_deepest_contact
-from .linear_loop import linearise_loop
+from .linear_loop import LinearLoop
 from .operating_point import Equilibrium, OperatingConditions
 
 _SAME_POSE_RAD = 1e-6
@@ -180,7 +180,7 @@ def find_log_loop(log: Log, *, own_laws: bool = False) -> _EndLoop:
 
     last_ticks = [int(site_log.tick[-1]) for site_log in site_logs]
     final = _fix_delays(resolve_final_scenario(log), last_ticks, read_used_samples)
-    trace = trace_log(log)
+    trace = RunTrace.of_log(log)
     state = None
     if _has_sampled_wall(final.scenario):
         motions = [_SiteMotion(part.t_s, part.q, part.qd, part.theta_hat) for part in site_logs]
@@ -276,11 +276,10 @@ def resolve_final_scenario(log: Log) -> Scenario:
     Args:
         log: The log of the run.
     """
-    commands = [change for change in list_effective_commands(log) if not change.order]
+    run = Timeline(log)
+    commands = [change for change in run.effective_commands if not change.order]
     timeline = sorted([*log.scenario.timeline, *commands], key=lambda change: change.at_s)
-    return msgspec.structs.replace(
-        log.scenario, timeline=tuple(timeline), duration_s=recorded_end_s(log)
-    )
+    return msgspec.structs.replace(log.scenario, timeline=tuple(timeline), duration_s=run.end_s)
 
 
 class _FixedDelays(NamedTuple):
@@ -371,34 +370,22 @@ def _compute_roots(loop: _EndLoop) -> LoopRoots:
         if exact and loop.last_pose is not None:
             # The arms still move, and it is not known where in between they will rest.
             exact = _has_same_sign(sampled_loop, sampled, loop.last_pose)
-        roots = _summarise_roots(sampled, sampled.basis, exact=exact)
+        roots = _summarise_roots(sampled, exact=exact)
         return roots._replace(
             distance_rad=loop.distance_rad,
-            leaves_out=_name_left_out(loop.programs),
+            programs=loop.programs,
             is_numerical=has_imported_law,
+            span_s=sampled.span_s,
+            repeats=sampled.is_exact,
+            deviation_per_s=sampled.deviation_per_s,
         )
-    continuous = compute_delay_spectrum(linearise_loop(loop.conditions, loop.rest), _ROOTS)
-    span = ", in continuous time"
-    if loop.conditions.varying or loop.has_mean_ages:
-        span += ", of the mean ages"
-    roots = _summarise_roots(continuous, span, exact=False)
-    return roots._replace(leaves_out=_name_left_out(loop.programs))
-
-
-def _name_left_out(programs: Sequence[str]) -> str:
-    """Returns a phrase about the programs whose reaction the linear analysis leaves out.
-
-    A program that moves an arm can be any code, which cannot be linearised. The phrase is empty
-    if there is no such program.
-
-    Args:
-        programs: Sites whose arms a program of the user moves.
-    """
-    if not programs:
-        return ""
-    if len(programs) == 1:
-        return f"how the program at {programs[0]} reacts to the arms"
-    return f"how the programs at {join_words(programs)} react to the arms"
+    continuous = Spectrum.of_loop(LinearLoop.of_conditions(loop.conditions, loop.rest), _ROOTS)
+    roots = _summarise_roots(continuous, exact=False)
+    return roots._replace(
+        programs=loop.programs,
+        is_continuous=True,
+        has_mean_ages=loop.conditions.varying or loop.has_mean_ages,
+    )
 
 
 def _has_same_sign(loop: SampledLoop, at_rest: Spectrum, last_pose: Equilibrium) -> bool:
@@ -422,12 +409,11 @@ def _has_same_sign(loop: SampledLoop, at_rest: Spectrum, last_pose: Equilibrium)
     return grows_at_last == (rate_per_s > 0.0)
 
 
-def _summarise_roots(spectrum: Spectrum, span: str, *, exact: bool) -> LoopRoots:
+def _summarise_roots(spectrum: Spectrum, *, exact: bool) -> LoopRoots:
     """Returns the fastest growing root, and its verdict on the stability of the run.
 
     Args:
         spectrum: The roots at the end pose.
-        span: A phrase that states over which ticks the roots are computed.
         exact: True if no delay is averaged or assumed to repeat.
     """
     root = spectrum.rightmost
@@ -441,7 +427,6 @@ def _summarise_roots(spectrum: Spectrum, span: str, *, exact: bool) -> LoopRoots
         swing_rate_per_s=max(swing_rates_per_s, default=None),
         omega_rad_s=abs(root.s.imag),
         drifting=spectrum.drifting,
-        span=span,
     )
 
 

@@ -36,9 +36,7 @@ from ...core import (
     SiteSetup,
     UserLaw,
     chain_stages,
-    list_remembered,
     plug_law,
-    read_memory,
     tick_ns,
     two_link_stages,
 )
@@ -104,11 +102,11 @@ class NumericLaw:
 
         self._plugged_law = plug_law(self._law, setup, self._arrays, np.zeros(0))
 
-        remembered = np.array(read_memory(self._law))
+        remembered = np.array(self._plugged_law.memory)
         self._remembered_count = len(remembered)
         self._uses_previous_tick = False
         self.memory = remembered
-        self.names = _name_memory(self._law, self._remembered_count)
+        self.names = self._plugged_law.memory_names
         self._extend_memory_by_previous_tick(setup)
 
     def _extend_memory_by_previous_tick(self, setup: SiteSetup) -> None:
@@ -306,15 +304,3 @@ class NumericLaw:
         time_ns = tick_ns(_TICK, self._rate_hz)
         memory = self._plugged_law.compute(_TICK, time_ns)
         return np.concatenate([row.tau, memory])
-
-
-def _name_memory(law: Any, count: int) -> tuple[str, ...]:
-    """Returns a name for each value in a law's memory, such as "error[1]" or "memory[1]"."""
-    if callable(getattr(law, "memory", None)):
-        return tuple(f"memory[{n + 1}]" for n in range(count))
-    names = []
-    for attribute in list_remembered(law):
-        value = getattr(law, attribute)
-        numbers = range(1, np.size(value) + 1)
-        names += [f"{attribute}[{number}]" for number in numbers]
-    return tuple(names)

@@ -48,7 +48,7 @@ from ..delay_period import (
     is_ending_trace,
 )
 from .numeric_law import NumericLaw
-from .site_dynamics import SiteRates, evaluate_site_rates
+from .site_dynamics import SiteRates
 
 
 class Equilibrium(NamedTuple):
@@ -213,7 +213,7 @@ class OperatingConditions(NamedTuple):
             The rates of change of each site, with its torques and outputs.
         """
         pairs = zip(self.sites, arguments, strict=True)
-        return [evaluate_site_rates(site, x) for site, x in pairs]
+        return [SiteRates.evaluate(site, x) for site, x in pairs]
 
     @classmethod
     def derive(cls, scenario: Scenario, *, own_laws: bool = True) -> "OperatingConditions":

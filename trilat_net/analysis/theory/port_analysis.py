@@ -2,7 +2,7 @@
 
 A place where an operator or an environment touches an arm is called a port, as in electrical
 networks. A port has two variables: the torque that acts on a joint, and the velocity of the
-joint. `analyse_ports` examines three properties:
+joint. `PortAnalysis.of_scenario` examines three properties:
 
 - Passivity: the arms never return more energy at their ports than they received there.
 - Absolute stability: the arms are stable with any passive operators.
@@ -39,22 +39,21 @@ from ..arm_rows import build_arm_rows
 from ..blas_threads import limit_blas_threads
 from ..dominance_history import compute_lyapunov_weights
 from . import frequency_search, port_response
-from .characteristic_roots import Complex, compute_delay_spectrum
-from .linear_loop import LinearLoop, gather_site_arguments, linearise_loop
+from .characteristic_roots import Complex, Spectrum
+from .linear_loop import LinearLoop, gather_site_arguments
 from .operating_point import Equilibrium, OperatingConditions
 from .port_passivity import (
     EIGENVALUE_ROUNDING,
     HandMatrices,
     Passivity,
     check_against_hands,
-    check_passivity,
     clamp_ports,
     find_best_weights,
     llewellyn_parameter,
     llewellyn_rounding,
 )
-from .port_response import QUOTED_AT_HZ, Transparency, measure_transparency
-from .site_dynamics import compute_following, lay_out_arguments, place_arm
+from .port_response import QUOTED_AT_HZ, Transparency
+from .site_dynamics import ArgumentLayout, compute_following, place_arm
 
 
 def freeze_external_torques(
@@ -92,7 +91,7 @@ def linearise_teleoperator(conditions: OperatingConditions, rest: Equilibrium) -
         rest: The equilibrium.
     """
     frozen = freeze_external_torques(conditions, rest)
-    return _move_ports_to_end_effectors(frozen, rest, linearise_loop(frozen, rest))
+    return _move_ports_to_end_effectors(frozen, rest, LinearLoop.of_conditions(frozen, rest))
 
 
 def build_proof_output(
@@ -187,8 +186,8 @@ class TwoPort(NamedTuple):
 class PortAnalysis(NamedTuple):
     """Result of analysing what operators feel in coupled arms, and the passivity of the arms.
 
-    `analyse_ports` computes it. A port is the place where an operator or an environment touches
-    an arm, such as a joint.
+    `PortAnalysis.of_scenario` computes it. A port is the place where an operator or an
+    environment touches an arm, such as a joint.
 
     Attributes:
         scenario: The teleoperator.
@@ -281,85 +280,127 @@ class PortAnalysis(NamedTuple):
         has_rotations = max(self.axes) > POSITION
         return f"{linear} and {angular}" if has_rotations else linear
 
+    @classmethod
+    @limit_blas_threads()
+    def of_scenario(
+        cls,
+        scenario: Scenario,
+        rest: Equilibrium,
+        of: str | None = None,
+        band_hz: tuple[float, float] = (frequency_search.LOW_HZ, frequency_search.HIGH_HZ),
+        hands: Sequence[HandMatrices] = (),
+    ) -> "PortAnalysis":
+        """Analyses what operators feel when they hold arms, and whether the arms are passive.
 
-@limit_blas_threads()
-def analyse_ports(
-    scenario: Scenario,
-    rest: Equilibrium,
-    of: str | None = None,
-    band_hz: tuple[float, float] = (frequency_search.LOW_HZ, frequency_search.HIGH_HZ),
-    hands: Sequence[HandMatrices] = (),
-) -> PortAnalysis:
-    """Analyses what operators feel when they hold arms, and whether the arms are passive.
+        The coupled arms are linearised about a pose of rest. Their response to torques on the
+        joints is computed over a band of frequencies.
 
-    The coupled arms are linearised about a pose of rest. Their response to torques on the
-    joints is computed over a band of frequencies.
+        Args:
+            scenario: Description of the coupled arms.
+            rest: The pose of rest.
+            of: Site (process that runs one arm) whose arm is once free and once clamped, while
+                operators feel the other arms. If `None`, the slave is used, or the last site if
+                there is no slave.
+            band_hz: Lower and upper end of the band, in Hz.
+            hands: Measured impedances of operators. Any of them may hold the arm of any master.
 
-    Args:
-        scenario: Description of the coupled arms.
-        rest: The pose of rest.
-        of: Site (process that runs one arm) whose arm is once free and once clamped, while
-            operators feel the other arms. If `None`, the slave is used, or the last site if
-            there is no slave.
-        band_hz: Lower and upper end of the band, in Hz.
-        hands: Measured impedances of operators. Any of them may hold the arm of any master.
+        Returns:
+            Passivity, absolute stability, and the impedances that the operators feel.
 
-    Returns:
-        Passivity, absolute stability, and the impedances that the operators feel.
+        Raises:
+            ScenarioError: The scenario cannot be linearised.
+            UsageError: There is no site of that name, or the band is empty.
+        """
+        low, high = band_hz
+        if not 0.0 < low < high:
+            raise UsageError(
+                "a band must go from a frequency above 0 Hz to a higher one, "
+                f"not from {low:g} to {high:g} Hz"
+            )
 
-    Raises:
-        ScenarioError: The scenario cannot be linearised.
-        UsageError: There is no site of that name, or the band is empty.
-    """
-    low, high = band_hz
-    if not 0.0 < low < high:
-        raise UsageError(
-            "a band must go from a frequency above 0 Hz to a higher one, "
-            f"not from {low:g} to {high:g} Hz"
+        conditions = OperatingConditions.derive(scenario)
+        loop = linearise_teleoperator(conditions, rest)
+        other_site = of or scenario.slave
+
+        sites = port_response.list_port_sites(loop)
+        delay_s = port_response.find_longest_delay_s(loop)
+        grid = frequency_search.build_frequency_grid(low, high, delay_s)
+        Y = port_response.build_admittance(loop)
+        w_rad_s = frequency_search.refine_frequencies(Y, grid)
+        Y = frequency_search.cache_response(Y, w_rad_s)
+
+        joints = {
+            joint: Passivity.check(port_response.select_ports(Y, ports), w_rad_s)
+            for joint, ports in port_response.group_ports_by_joint(loop).items()
+        }
+        transparency: list[Transparency] = []
+        for site in sites:
+            if site != other_site:
+                transparency += Transparency.measure(loop, site, other_site)
+
+        clamped_loop = port_response.clamp_site(loop, other_site)
+        held_hands = _locate_hands(scenario, conditions, rest=rest, loop=loop, hands=hands)
+        return cls(
+            scenario=scenario,
+            band_hz=band_hz,
+            resolved_hz=frequency_search.find_resolved_hz(low, high, delay_s),
+            verdict=Spectrum.of_loop(loop, 1).verdict,
+            pole=port_response.PoleAtZero.of_loop(loop),
+            velocity=Passivity.check(Y, w_rad_s),
+            joints=joints,
+            proof=_check_proof(conditions, loop, w_rad_s),
+            beta=compute_proof_weights(conditions),
+            estimates_true=_are_estimates_true(conditions, rest),
+            absolute=_check_absolute_stability(loop, Y, w_rad_s),
+            two_ports=_check_two_ports(loop, Y, w_rad_s),
+            transparency=tuple(transparency),
+            clamped_verdict=Spectrum.of_loop(clamped_loop, 1).verdict,
+            axes=_name_ports(conditions),
+            measured=check_against_hands(
+                Y, w_rad_s, held=held_hands.hands, places=held_hands.places
+            ),
         )
 
-    conditions = OperatingConditions.derive(scenario)
-    loop = linearise_teleoperator(conditions, rest)
-    other_site = of or scenario.slave
+    def to_json(self) -> dict[str, Any]:
+        """Converts an analysis of what operators feel to plain values for JSON.
 
-    sites = port_response.list_port_sites(loop)
-    delay_s = port_response.find_longest_delay_s(loop)
-    grid = frequency_search.build_frequency_grid(low, high, delay_s)
-    Y = port_response.build_admittance(loop)
-    w_rad_s = frequency_search.refine_frequencies(Y, grid)
-    Y = frequency_search.cache_response(Y, w_rad_s)
-
-    joints = {
-        joint: check_passivity(port_response.select_ports(Y, ports), w_rad_s)
-        for joint, ports in port_response.group_ports_by_joint(loop).items()
-    }
-    transparency: list[Transparency] = []
-    for site in sites:
-        if site != other_site:
-            transparency += measure_transparency(loop, site, other_site)
-
-    clamped_loop = port_response.clamp_site(loop, other_site)
-    held_hands = _locate_hands(scenario, conditions, rest=rest, loop=loop, hands=hands)
-    return PortAnalysis(
-        scenario=scenario,
-        band_hz=band_hz,
-        resolved_hz=frequency_search.find_resolved_hz(low, high, delay_s),
-        verdict=compute_delay_spectrum(loop, 1).verdict,
-        pole=port_response.find_pole_at_zero(loop),
-        velocity=check_passivity(Y, w_rad_s),
-        joints=joints,
-        proof=_check_proof(conditions, loop, w_rad_s),
-        beta=compute_proof_weights(conditions),
-        estimates_true=_are_estimates_true(conditions, rest),
-        absolute=_check_absolute_stability(loop, Y, w_rad_s),
-        two_ports=_check_two_ports(loop, Y, w_rad_s),
-        transparency=tuple(transparency),
-        clamped_verdict=compute_delay_spectrum(clamped_loop, 1).verdict,
-        axes=_name_ports(conditions),
-        measured=check_against_hands(
-            Y, w_rad_s, held=held_hands.hands, places=held_hands.places
-        ),
-    )
+        Infinite numbers become `None`, because JSON has no representation for them.
+        """
+        measured = self.measured
+        return {
+            "sites": list(self.sites),
+            "band_hz": list(self.band_hz),
+            "resolved_hz": self.resolved_hz,
+            "roots": self.verdict,
+            "pole_at_zero": {"order": self.pole.order, "passive": self.pole.passive},
+            "passive_qd": _passivity_to_json(self.velocity),
+            "passive_qd_of_joint": {
+                self.axes.get(joint, str(joint)): _passivity_to_json(passivity)
+                for joint, passivity in self.joints.items()
+            },
+            "passive_r": None if self.proof is None else _passivity_to_json(self.proof),
+            "beta": self.beta.tolist(),
+            "estimates_true": self.estimates_true,
+            "absolute": _minima_to_json(self.absolute),
+            "measured_operators": None if measured is None else _minima_to_json(measured),
+            "llewellyn": [
+                {
+                    "sites": list(two_port.sites),
+                    "joint": self.axes.get(two_port.joint, two_port.joint),
+                    "clamped": two_port.clamped,
+                    **_minima_to_json(two_port.minima),
+                }
+                for two_port in self.two_ports
+            ],
+            "roots_clamped": self.clamped_verdict,
+            "felt": [
+                {
+                    **_transparency_to_json(transparency),
+                    "joint": self.axes.get(transparency.joint, transparency.joint),
+                }
+                for transparency in self.transparency
+            ],
+        }
 
 
 def _are_estimates_true(conditions: OperatingConditions, rest: Equilibrium) -> bool:
@@ -388,7 +429,7 @@ def _check_absolute_stability(
         w_rad_s: Frequencies, in rad/s.
     """
     owners = _find_owners(loop)
-    return frequency_search.find_minima(
+    return frequency_search.Minima.find(
         lambda w: find_best_weights(Y(w), owners).margin,
         w_rad_s,
         tolerance=lambda w: np.full(len(w), EIGENVALUE_ROUNDING),
@@ -492,7 +533,7 @@ def _check_proof(
         s = port_response.to_imaginary_axis(w)
         return port_response.evaluate_transfer(loop, s, output)
 
-    return check_passivity(evaluate, w_rad_s, beta)
+    return Passivity.check(evaluate, w_rad_s, beta)
 
 
 def _check_two_ports(
@@ -539,57 +580,12 @@ def _check_llewellyn(
         clamped: Indices of the ports that are clamped. All others are free.
         w_rad_s: Frequencies, in rad/s.
     """
-    return frequency_search.find_minima(
+    return frequency_search.Minima.find(
         lambda w: llewellyn_parameter(clamp_ports(Y(w), keep, clamped)),
         w_rad_s,
         level=1.0,
         tolerance=lambda w: llewellyn_rounding(clamp_ports(Y(w), keep, clamped)),
     )
-
-
-def ports_to_json(ports: PortAnalysis) -> dict[str, Any]:
-    """Converts an analysis of what operators feel to plain values for JSON.
-
-    Infinite numbers become `None`, because JSON has no representation for them.
-
-    Args:
-        ports: The analysis.
-    """
-    measured = ports.measured
-    return {
-        "sites": list(ports.sites),
-        "band_hz": list(ports.band_hz),
-        "resolved_hz": ports.resolved_hz,
-        "roots": ports.verdict,
-        "pole_at_zero": {"order": ports.pole.order, "passive": ports.pole.passive},
-        "passive_qd": _passivity_to_json(ports.velocity),
-        "passive_qd_of_joint": {
-            ports.axes.get(joint, str(joint)): _passivity_to_json(passivity)
-            for joint, passivity in ports.joints.items()
-        },
-        "passive_r": None if ports.proof is None else _passivity_to_json(ports.proof),
-        "beta": ports.beta.tolist(),
-        "estimates_true": ports.estimates_true,
-        "absolute": _minima_to_json(ports.absolute),
-        "measured_operators": None if measured is None else _minima_to_json(measured),
-        "llewellyn": [
-            {
-                "sites": list(two_port.sites),
-                "joint": ports.axes.get(two_port.joint, two_port.joint),
-                "clamped": two_port.clamped,
-                **_minima_to_json(two_port.minima),
-            }
-            for two_port in ports.two_ports
-        ],
-        "roots_clamped": ports.clamped_verdict,
-        "felt": [
-            {
-                **_transparency_to_json(transparency),
-                "joint": ports.axes.get(transparency.joint, transparency.joint),
-            }
-            for transparency in ports.transparency
-        ],
-    }
 
 
 def _passivity_to_json(passivity: Passivity) -> dict[str, Any]:
@@ -694,7 +690,7 @@ def _move_ports_to_end_effectors(
     outputs = []
     arguments = gather_site_arguments(conditions, rest)
     for site, x in zip(conditions.sites, arguments, strict=True):
-        layout = lay_out_arguments(site)
+        layout = ArgumentLayout.of_site(site)
         followed = _list_followed_axes(site)
         arm = place_arm(site, x[layout.q])
         full_J = compute_following(site, arm, x).J

@@ -42,7 +42,7 @@ from numpy.typing import NDArray
 
 from ...core import Array
 from .characteristic_roots import Complex
-from .frequency_search import Minima, find_minima
+from .frequency_search import Minima
 from .port_response import PortResponse
 
 EIGENVALUE_ROUNDING = 1e-8
@@ -89,6 +89,56 @@ class Passivity(NamedTuple):
         ports and Y^H its conjugate transpose.
         """
         return not self.minima.below
+
+    @classmethod
+    def check(
+        cls,
+        response: PortResponse,
+        w_rad_s: Array,
+        weights: Array | None = None,
+    ) -> "Passivity":
+        """Checks whether coupled arms are passive at the places (ports) where operators act.
+
+        The arms are passive if they never return more energy than they received. This is
+        examined over frequency, with additional frequencies near the minima.
+
+        Args:
+            response: Function that returns the response at given frequencies: usually the
+                admittance, the velocities at the p ports per torque. Another output with p
+                entries is allowed too.
+            w_rad_s: First frequencies, rising, shape (F,), in rad/s.
+            weights: Positive weights of the ports, shape (p,). `None` if all are 1. In this
+                case the examined sum of torque times output is a physical power, if the outputs
+                are velocities.
+
+        Returns:
+            The least eigenvalue over frequency, which determines passivity, and related
+            numbers.
+        """
+
+        def evaluate_weighted(w: Array) -> Complex:
+            """Returns the frequency response, with the weights of the ports if any."""
+            Y = response(w)
+            return Y if weights is None else weight_response(Y, weights)
+
+        def find_least(w: Array) -> Array:
+            weighted = evaluate_weighted(w)
+            return find_least_eigenvalue(weighted)
+
+        def find_tolerance(w: Array) -> Array:
+            """Returns the rounding error of the least eigenvalue at each w, in rad/s."""
+            Y = response(w)
+            norm = _find_frobenius_norm(Y)
+            return EIGENVALUE_ROUNDING * norm
+
+        minima = Minima.find(find_least, w_rad_s, tolerance=find_tolerance)
+        Y = evaluate_weighted(minima.w_rad_s)
+        largest_singular_value = np.linalg.norm(Y, 2, axis=(1, 2))
+        size = np.asarray(largest_singular_value, dtype=np.float64)
+        lacking = 0.0
+        if minima.below:
+            lacking = _find_lacking_damping(Y, minima.w_rad_s)
+        return cls(minima, size, lacking)
 
 
 class HandMatrices(NamedTuple):
@@ -189,13 +239,13 @@ def check_against_hands(
         return least
 
     def find_tolerance(w: Array) -> Array:
-        """Returns the rounding error of the least eigenvalue at each frequency w, in rad/s."""
+        """Returns the rounding error of the least eigenvalue at each w, in rad/s."""
         Y = response(w)
         Z: Complex = np.linalg.inv(Y).astype(np.complex128)
         norm = _find_frobenius_norm(Z)
         return EIGENVALUE_ROUNDING * norm
 
-    return find_minima(find_least, w_rad_s, tolerance=find_tolerance)
+    return Minima.find(find_least, w_rad_s, tolerance=find_tolerance)
 
 
 def weight_response(Y: Complex, weights: Array) -> Complex:
@@ -265,54 +315,6 @@ def _find_lacking_damping(Y: Complex, w_rad_s: Array) -> float:
         return np.inf
     largest = float(lacking.max())
     return max(0.0, largest)
-
-
-def check_passivity(
-    response: PortResponse,
-    w_rad_s: Array,
-    weights: Array | None = None,
-) -> Passivity:
-    """Checks whether coupled arms are passive at the places (ports) where operators act.
-
-    The arms are passive if they never return more energy than they received. This is examined
-    over frequency, with additional frequencies near the minima.
-
-    Args:
-        response: Function that returns the response at given frequencies: usually the
-            admittance, the velocities at the p ports per torque. Another output with p entries
-            is allowed too.
-        w_rad_s: First frequencies, rising, shape (F,), in rad/s.
-        weights: Positive weights of the ports, shape (p,). `None` if all are 1. In this case
-            the examined sum of torque times output is a physical power, if the outputs are
-            velocities.
-
-    Returns:
-        The least eigenvalue over frequency, which determines passivity, and related numbers.
-    """
-
-    def evaluate_weighted(w: Array) -> Complex:
-        """Returns the frequency response, with the weights of the ports if there are any."""
-        Y = response(w)
-        return Y if weights is None else weight_response(Y, weights)
-
-    def find_least(w: Array) -> Array:
-        weighted = evaluate_weighted(w)
-        return find_least_eigenvalue(weighted)
-
-    def find_tolerance(w: Array) -> Array:
-        """Returns the rounding error of the least eigenvalue at each frequency w, in rad/s."""
-        Y = response(w)
-        norm = _find_frobenius_norm(Y)
-        return EIGENVALUE_ROUNDING * norm
-
-    minima = find_minima(find_least, w_rad_s, tolerance=find_tolerance)
-    Y = evaluate_weighted(minima.w_rad_s)
-    largest_singular_value = np.linalg.norm(Y, 2, axis=(1, 2))
-    size = np.asarray(largest_singular_value, dtype=np.float64)
-    lacking = 0.0
-    if minima.below:
-        lacking = _find_lacking_damping(Y, minima.w_rad_s)
-    return Passivity(minima, size, lacking)
 
 
 def llewellyn_parameter(Y: Complex) -> Array:

@@ -138,6 +138,47 @@ class PoleAtZero(NamedTuple):
         least = eigenvalues.min(initial=0.0)
         return bool(least >= -tolerance)
 
+    @classmethod
+    def of_loop(cls, loop: LinearLoop) -> "PoleAtZero":
+        """Finds whether constant torques make the velocities of coupled arms grow.
+
+        The velocities grow if the response Y(s), velocity per torque, has a pole at zero. For
+        example, a free mass m has Y(s) = 1 / (m s). A characteristic root at zero alone is not
+        sufficient. The arms have many of these roots, because they can rest in several poses,
+        and a resting arm has no velocity. The pole is found by Cauchy's integral along a small
+        circle around zero, with the radius `ZERO_ROOT_RADIUS_PER_S`.
+
+        Args:
+            loop: Linear model of the coupled arms.
+
+        Returns:
+            Order and residue of the pole. The order is 0 if there is no pole.
+        """
+        angles = 2j * math.pi * np.arange(_CIRCLE_POINTS) / _CIRCLE_POINTS
+        unit_circle = np.exp(angles)
+        small_circle = ZERO_ROOT_RADIUS_PER_S * unit_circle
+        responses = evaluate_transfer(loop, small_circle)
+        circle = unit_circle[:, np.newaxis, np.newaxis]
+        # the coefficient of 1 / s^k is the mean of Y(s) s^k over the circle
+        coefficients = {}
+        for power in range(1, _HIGHEST_POWER + 1):
+            products = responses * circle**power
+            mean = products.mean(axis=0)
+            coefficients[power] = mean.real
+
+        largest = np.abs(responses).max(initial=0.0)
+        least_size = _NEGLIGIBLE * largest
+        powers = []
+        for power, coefficient in coefficients.items():
+            size = np.abs(coefficient).max(initial=0.0)
+            if size > least_size:
+                powers.append(power)
+
+        residue = np.zeros_like(coefficients[1])
+        if 1 in powers:
+            residue = coefficients[1] * ZERO_ROOT_RADIUS_PER_S
+        return cls(max(powers, default=0), residue)
+
 
 def evaluate_transfer(
     loop: LinearLoop,
@@ -327,47 +368,6 @@ def find_longest_delay_s(loop: LinearLoop) -> float:
     """
     delays_s = [term.delay_s for term in loop.delayed]
     return max(delays_s, default=0.0)
-
-
-def find_pole_at_zero(loop: LinearLoop) -> PoleAtZero:
-    """Finds whether constant torques make the velocities of coupled arms grow.
-
-    The velocities grow if the response Y(s), velocity per torque, has a pole at zero. For
-    example, a free mass m has Y(s) = 1 / (m s). A characteristic root at zero alone is not
-    sufficient. The arms have many of these roots, because they can rest in several poses, and a
-    resting arm has no velocity. The pole is found by Cauchy's integral along a small circle
-    around zero, with the radius `ZERO_ROOT_RADIUS_PER_S`.
-
-    Args:
-        loop: Linear model of the coupled arms.
-
-    Returns:
-        Order and residue of the pole. The order is 0 if there is no pole.
-    """
-    angles = 2j * math.pi * np.arange(_CIRCLE_POINTS) / _CIRCLE_POINTS
-    unit_circle = np.exp(angles)
-    small_circle = ZERO_ROOT_RADIUS_PER_S * unit_circle
-    responses = evaluate_transfer(loop, small_circle)
-    circle = unit_circle[:, np.newaxis, np.newaxis]
-    # the coefficient of 1 / s^k is the mean of Y(s) s^k over the circle
-    coefficients = {}
-    for power in range(1, _HIGHEST_POWER + 1):
-        products = responses * circle**power
-        mean = products.mean(axis=0)
-        coefficients[power] = mean.real
-
-    largest = np.abs(responses).max(initial=0.0)
-    least_size = _NEGLIGIBLE * largest
-    powers = []
-    for power, coefficient in coefficients.items():
-        size = np.abs(coefficient).max(initial=0.0)
-        if size > least_size:
-            powers.append(power)
-
-    residue = np.zeros_like(coefficients[1])
-    if 1 in powers:
-        residue = coefficients[1] * ZERO_ROOT_RADIUS_PER_S
-    return PoleAtZero(max(powers, default=0), residue)
 
 
 def clamp_site(loop: LinearLoop, site: str) -> LinearLoop:
@@ -596,55 +596,55 @@ class Transparency(NamedTuple):
         mean = integral / width
         return float(np.exp(mean))
 
+    @classmethod
+    def measure(cls, loop: LinearLoop, at: str, of: str) -> "tuple[Transparency, ...]":
+        """Computes what an operator feels of another arm that is free, and that is clamped.
 
-def measure_transparency(loop: LinearLoop, at: str, of: str) -> tuple[Transparency, ...]:
-    """Computes what an operator feels of another arm while it is free and while it is clamped.
+        With ideal transparency the operator would feel nothing while the other arm is free, and
+        a rigid arm while it is clamped. The impedance along each joint i is Z(j w) = 1 / Y_ii(j
+        w) with the admittance Y of the loop. All other ports are free.
 
-    With ideal transparency the operator would feel nothing while the other arm is free, and a
-    rigid arm while it is clamped. The impedance along each joint i is Z(j w) = 1 / Y_ii(j w)
-    with the admittance Y of the loop. All other ports are free.
+        Args:
+            loop: The loop.
+            at: Site of the operator.
+            of: Site that is free or clamped.
 
-    Args:
-        loop: The loop.
-        at: Site of the operator.
-        of: Site that is free or clamped.
+        Returns:
+            The transparency along each joint of the operator's site.
 
-    Returns:
-        The transparency along each joint of the operator's site.
+        Raises:
+            UsageError: There is no such site, or the two sites are the same.
+        """
+        low, high = _SHOWN_HZ
+        decades = np.log10(high / low)
+        steps = round(_PER_DECADE * decades)
+        points = np.geomspace(low, high, 1 + steps)
+        frequencies_hz = np.union1d(points, TRANSPARENCY_BAND_HZ)
+        w_rad_s = 2.0 * np.pi * frequencies_hz
 
-    Raises:
-        UsageError: There is no such site, or the two sites are the same.
-    """
-    low, high = _SHOWN_HZ
-    decades = np.log10(high / low)
-    steps = round(_PER_DECADE * decades)
-    points = np.geomspace(low, high, 1 + steps)
-    frequencies_hz = np.union1d(points, TRANSPARENCY_BAND_HZ)
-    w_rad_s = 2.0 * np.pi * frequencies_hz
+        ports = find_site_ports(loop, at)
+        if at == of:
+            raise UsageError(
+                f"a load cannot be placed at {at}, because this is the operator's own site"
+            )
+        clamped_loop = clamp_site(loop, of)
+        clamped_ports = find_site_ports(clamped_loop, at)
+        free_admittance = build_admittance(loop)
+        clamped_admittance = build_admittance(clamped_loop)
+        evaluate_free = select_ports(free_admittance, ports)
+        evaluate_clamped = select_ports(clamped_admittance, clamped_ports)
+        free = evaluate_free(w_rad_s)
+        clamped = evaluate_clamped(w_rad_s)
 
-    ports = find_site_ports(loop, at)
-    if at == of:
-        raise UsageError(
-            f"a load cannot be placed at {at}, because this is the operator's own site"
-        )
-    clamped_loop = clamp_site(loop, of)
-    clamped_ports = find_site_ports(clamped_loop, at)
-    free_admittance = build_admittance(loop)
-    clamped_admittance = build_admittance(clamped_loop)
-    evaluate_free = select_ports(free_admittance, ports)
-    evaluate_clamped = select_ports(clamped_admittance, clamped_ports)
-    free = evaluate_free(w_rad_s)
-    clamped = evaluate_clamped(w_rad_s)
-
-    transparencies = []
-    for n, port in enumerate(ports):
-        transparency = Transparency(
-            operator_site=at,
-            other_site=of,
-            joint=_parse_port_joint(loop.inputs[port]),
-            w_rad_s=w_rad_s,
-            free=1.0 / free[:, n, n],
-            clamped=1.0 / clamped[:, n, n],
-        )
-        transparencies.append(transparency)
-    return tuple(transparencies)
+        transparencies = []
+        for n, port in enumerate(ports):
+            transparency = Transparency(
+                operator_site=at,
+                other_site=of,
+                joint=_parse_port_joint(loop.inputs[port]),
+                w_rad_s=w_rad_s,
+                free=1.0 / free[:, n, n],
+                clamped=1.0 / clamped[:, n, n],
+            )
+            transparencies.append(transparency)
+        return tuple(transparencies)

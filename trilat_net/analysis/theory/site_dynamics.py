@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from ...core import SCRIPTED_KINDS, Array, Law, SiteSetup, TorqueKind, TorqueSource
 from ..arm_rows import Numbers, PlacedArm, multiply_columns
 from .numeric_law import NumericLaw
-from .textbook_arm import Following, PlacedChain, follow_in_task, follow_joints, share_pose
+from .textbook_arm import Following, PlacedChain, share_pose
 
 COMPLEX_STEP = 1e-30
 """Imaginary step h of the derivatives."""
@@ -101,22 +101,22 @@ class ArgumentLayout:
         first = self.peer_torque.stop + length * index
         return slice(first, first + length)
 
+    @classmethod
+    def of_site(cls, site: SiteSetup) -> "ArgumentLayout":
+        """Returns where each state and input of a site is stored in one vector.
 
-def lay_out_arguments(site: SiteSetup) -> ArgumentLayout:
-    """Returns where each state and input of a site is stored in one vector.
+        A site is a process that runs one arm. The vector is the argument of the functions that
+        compute how fast the states change. If a user wrote the control law, the values that the
+        law stores take the place of the parameter estimates.
 
-    A site is a process that runs one arm. The vector is the argument of the functions that
-    compute how fast the states change. If a user wrote the control law, the values that the law
-    stores take the place of the parameter estimates.
-
-    Args:
-        site: Setup of the site.
-    """
-    layout = site.layout
-    if isinstance(site.law_factory, NumericLaw):
-        memories = len(site.law_factory.memory)
-        return _make_layout(layout.joints, memories, 0, len(site.links))
-    return _make_layout(layout.joints, layout.parameters, layout.shared, 0)
+        Args:
+            site: Setup of the site.
+        """
+        layout = site.layout
+        if isinstance(site.law_factory, NumericLaw):
+            memories = len(site.law_factory.memory)
+            return _make_layout(layout.joints, memories, 0, len(site.links))
+        return _make_layout(layout.joints, layout.parameters, layout.shared, 0)
 
 
 # An analysis evaluates the same few sites hundreds of times.
@@ -166,6 +166,73 @@ class SiteRates(NamedTuple):
     xd: Numbers
     reflected: Numbers
 
+    @classmethod
+    def evaluate(cls, site: SiteSetup, x: Numbers) -> "SiteRates":
+        """Computes how fast the states of a site change, and the torques that act on its arm.
+
+        A site is a process that runs one arm. Its states are joint angles, joint velocities and
+        parameter estimates. Operators and environments, such as walls, act as defined in the
+        setup. The equations are those of the site's control law and of the dynamics of its arm
+        (docs/reference/laws.md).
+
+        Args:
+            site: Setup of the site.
+            x: States and inputs in the order of `ArgumentLayout.of_site`, shape (arguments,
+                ...).
+        """
+        layout = ArgumentLayout.of_site(site)
+        arm = place_arm(site, x[layout.q])
+        qd = x[layout.qd]
+        following = _follow(site, arm, x, layout)
+
+        continuous = _sum_actors(site, arm, x, layout, sampled=False)
+        external = x[layout.external_torque] + continuous
+        held = _sum_actors(site, arm, x, layout, sampled=True)
+
+        if isinstance(site.law_factory, NumericLaw):
+            state_and_inputs = x[: layout.inputs.stop]
+            law_arguments = np.concatenate([state_and_inputs, external + held])
+            tau, estimate_rate = site.law_factory.evaluate(law_arguments)
+        elif has_estimate(site):
+            tau, estimate_rate = _evaluate_adaptive_law(site, arm, following, x, layout)
+        else:
+            tau = _evaluate_known_gravity_law(site, arm, following, x, layout)
+            estimate_rate = 0.0 * x[layout.estimate]
+
+        torque = tau + external + held
+        theta = _as_columns(site.theta, qd)
+        qdd = arm.joint_acceleration(theta, qd, torque)
+        return cls(
+            qdd=qdd,
+            estimate=estimate_rate,
+            tau=tau,
+            external=external,
+            held=held,
+            x=following.x,
+            xd=following.xd,
+            reflected=following.from_joints(external + held),
+        )
+
+    @classmethod
+    def differentiate(cls, site: SiteSetup, x: Array) -> "SiteRates":
+        """Computes derivatives of a site's rates of change, for the linear model of its arm.
+
+        A site is a process that runs one arm. The rates are differentiated with respect to each
+        of the site's states and inputs, by a complex step, which is exact up to rounding.
+
+        Args:
+            site: Setup of the site.
+            x: States and inputs in the order of `ArgumentLayout.of_site`, shape (arguments,).
+
+        Returns:
+            The derivatives of each rate, torque and output, with a column for each entry of x.
+        """
+        steps = 1j * COMPLEX_STEP * np.eye(len(x))
+        stepped = x[:, np.newaxis] + steps
+        rates = SiteRates.evaluate(site, stepped)
+        derivatives = [rate.imag / COMPLEX_STEP for rate in rates]
+        return cls(*derivatives)
+
 
 def compute_following(site: SiteSetup, arm: PlacedArm | PlacedChain, x: Numbers) -> Following:
     """Computes the errors and the reference motion with which a site follows other sites.
@@ -183,7 +250,7 @@ def compute_following(site: SiteSetup, arm: PlacedArm | PlacedChain, x: Numbers)
         The errors of position and velocity, the reference velocity and acceleration for the
         joints, and the related Jacobian.
     """
-    return _follow(site, arm, x, lay_out_arguments(site))
+    return _follow(site, arm, x, ArgumentLayout.of_site(site))
 
 
 def _follow(
@@ -198,7 +265,7 @@ def _follow(
 
     has_task = site.chain is not None and site.chain.task is not None
     if has_task and isinstance(arm, PlacedChain):
-        return follow_in_task(
+        return Following.in_task(
             site=site,
             arm=arm,
             Lambda=Lambda,
@@ -207,7 +274,7 @@ def _follow(
             x_des=reference,
             xd_des=reference_rate,
         )
-    return follow_joints(
+    return Following.in_joints(
         Lambda=Lambda,
         q=q,
         qd=qd,
@@ -231,89 +298,23 @@ def compute_shared_pose(site: SiteSetup, q: Numbers) -> Numbers:
     return q
 
 
-def evaluate_site_rates(site: SiteSetup, x: Numbers) -> SiteRates:
-    """Computes how fast the states of a site change, and the torques that act on its arm.
-
-    A site is a process that runs one arm. Its states are joint angles, joint velocities and
-    parameter estimates. Operators and environments, such as walls, act as defined in the setup.
-    The equations are those of the site's control law and of the dynamics of its arm
-    (docs/reference/laws.md).
-
-    Args:
-        site: Setup of the site.
-        x: States and inputs in the order of `lay_out_arguments`, shape (arguments, ...).
-    """
-    layout = lay_out_arguments(site)
-    arm = place_arm(site, x[layout.q])
-    qd = x[layout.qd]
-    following = _follow(site, arm, x, layout)
-
-    continuous = _sum_actors(site, arm, x, layout, sampled=False)
-    external = x[layout.external_torque] + continuous
-    held = _sum_actors(site, arm, x, layout, sampled=True)
-
-    if isinstance(site.law_factory, NumericLaw):
-        state_and_inputs = x[: layout.inputs.stop]
-        law_arguments = np.concatenate([state_and_inputs, external + held])
-        tau, estimate_rate = site.law_factory.evaluate(law_arguments)
-    elif has_estimate(site):
-        tau, estimate_rate = _evaluate_adaptive_law(site, arm, following, x, layout)
-    else:
-        tau = _evaluate_known_gravity_law(site, arm, following, x, layout)
-        estimate_rate = 0.0 * x[layout.estimate]
-
-    torque = tau + external + held
-    theta = _as_columns(site.theta, qd)
-    qdd = arm.joint_acceleration(theta, qd, torque)
-    return SiteRates(
-        qdd=qdd,
-        estimate=estimate_rate,
-        tau=tau,
-        external=external,
-        held=held,
-        x=following.x,
-        xd=following.xd,
-        reflected=following.from_joints(external + held),
-    )
-
-
 def compute_reflected_torque(site: SiteSetup, x: Numbers) -> Numbers:
     """Computes the torque of operators and walls that an arm sends to the other arms.
 
     With this torque, a user feels what another arm touches. It is the entry `reflected` of
-    `evaluate_site_rates`, without the other entries.
+    `SiteRates.evaluate`, without the other entries.
 
     Args:
         site: Setup of the site.
-        x: States and inputs in the order of `lay_out_arguments`, shape (arguments, ...).
+        x: States and inputs in the order of `ArgumentLayout.of_site`, shape (arguments, ...).
     """
-    layout = lay_out_arguments(site)
+    layout = ArgumentLayout.of_site(site)
     arm = place_arm(site, x[layout.q])
     following = _follow(site, arm, x, layout)
     continuous = _sum_actors(site, arm, x, layout, sampled=False)
     external = x[layout.external_torque] + continuous
     held = _sum_actors(site, arm, x, layout, sampled=True)
     return following.from_joints(external + held)
-
-
-def differentiate_site_rates(site: SiteSetup, x: Array) -> SiteRates:
-    """Computes the derivatives of a site's rates of change, for the linear model of its arm.
-
-    A site is a process that runs one arm. The rates are differentiated with respect to each of
-    the site's states and inputs, by a complex step, which is exact up to rounding.
-
-    Args:
-        site: Setup of the site.
-        x: States and inputs in the order of `lay_out_arguments`, shape (arguments,).
-
-    Returns:
-        The derivatives of each rate, torque and output, with a column for each entry of x.
-    """
-    steps = 1j * COMPLEX_STEP * np.eye(len(x))
-    stepped = x[:, np.newaxis] + steps
-    rates = evaluate_site_rates(site, stepped)
-    derivatives = [rate.imag / COMPLEX_STEP for rate in rates]
-    return SiteRates(*derivatives)
 
 
 def has_estimate(site: SiteSetup) -> bool:
@@ -558,10 +559,10 @@ def describe_switching_points(site: SiteSetup, x: Array) -> Iterator[str]:
 
     Args:
         site: Setup of the site.
-        x: States and inputs of the site in the order of `lay_out_arguments`, shape
+        x: States and inputs of the site in the order of `ArgumentLayout.of_site`, shape
             (arguments,).
     """
-    layout = lay_out_arguments(site)
+    layout = ArgumentLayout.of_site(site)
     arm = place_arm(site, x[layout.q])
     position = arm.end_effector_position()
 
@@ -590,19 +591,19 @@ def _find_switching_estimates(site: SiteSetup, x: Array) -> NDArray[np.bool_]:
     These estimates are exactly at a limit, and the law does not hold them there. The result is
     True for each of them, shape (P,).
     """
-    layout = lay_out_arguments(site)
+    layout = ArgumentLayout.of_site(site)
     gains = site.gains
     estimate = x[layout.estimate]
     low = np.broadcast_to(gains.low, estimate.shape)
     high = np.broadcast_to(gains.high, estimate.shape)
     is_near_low = np.abs(low - estimate) < SWITCHING_TOLERANCE
     is_near_high = np.abs(high - estimate) < SWITCHING_TOLERANCE
-    rate = evaluate_site_rates(site, x).estimate
+    rate = SiteRates.evaluate(site, x).estimate
     is_still = np.abs(rate) <= SWITCHING_TOLERANCE
     # an estimate that would leave its range without limits is held by its limit
     unlimited_gains = gains._replace(low=-np.inf, high=np.inf)
     unlimited_site = site._replace(gains=unlimited_gains)
-    free_rate = evaluate_site_rates(unlimited_site, x).estimate
+    free_rate = SiteRates.evaluate(unlimited_site, x).estimate
     is_held = _is_at_bound(site, estimate, free_rate)
     adapts = np.asarray(gains.Gamma) > 0
     switching: NDArray[np.bool_] = (is_near_low | is_near_high) & is_still & ~is_held & adapts

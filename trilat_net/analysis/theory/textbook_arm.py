@@ -807,38 +807,116 @@ class Following(NamedTuple):
         along_axes = multiply_columns(self.J, torque)
         return solve_columns(self.A, along_axes)
 
+    @classmethod
+    def in_joints(
+        cls,
+        Lambda: Numbers,
+        q: Numbers,
+        qd: Numbers,
+        q_des: Numbers,
+        qd_des: Numbers,
+    ) -> "Following":
+        """Computes errors and reference motion with which n joints follow desired angles.
 
-def follow_joints(
-    Lambda: Numbers,
-    q: Numbers,
-    qd: Numbers,
-    q_des: Numbers,
-    qd_des: Numbers,
-) -> Following:
-    """Computes the errors and the reference motion with which n joints follow desired angles.
+        The reference velocity of the joints is v = -Lambda (q - q_des), and the reference
+        acceleration is its derivative.
 
-    The reference velocity of the joints is v = -Lambda (q - q_des), and the reference
-    acceleration is its derivative.
+        Args:
+            Lambda: Gain of the error, shape (n,), in 1/s.
+            q: Joint angles, shape (n, ...), in rad.
+            qd: Joint velocities, shape (n, ...), in rad/s.
+            q_des: Desired angles, shape (n, ...), in rad.
+            qd_des: Desired velocities, shape (n, ...), in rad/s.
+        """
+        e = q - q_des
+        ed = qd - qd_des
+        v = -Lambda * e
+        a = -Lambda * ed
+        return cls(
+            x=q,
+            xd=qd,
+            e=e,
+            ed=ed,
+            v=v,
+            a=a,
+        )
 
-    Args:
-        Lambda: Gain of the error, shape (n,), in 1/s.
-        q: Joint angles, shape (n, ...), in rad.
-        qd: Joint velocities, shape (n, ...), in rad/s.
-        q_des: Desired angles, shape (n, ...), in rad.
-        qd_des: Desired velocities, shape (n, ...), in rad/s.
-    """
-    e = q - q_des
-    ed = qd - qd_des
-    v = -Lambda * e
-    a = -Lambda * ed
-    return Following(
-        x=q,
-        xd=qd,
-        e=e,
-        ed=ed,
-        v=v,
-        a=a,
-    )
+    @classmethod
+    def in_task(
+        cls,
+        site: SiteSetup,
+        arm: PlacedChain,
+        Lambda: Numbers,
+        q: Numbers,
+        qd: Numbers,
+        x_des: Numbers,
+        xd_des: Numbers,
+    ) -> "Following":
+        """Computes the errors and the reference motion of an end effector that follows a pose.
+
+        The pose has m coordinates, and the arm has n joints.
+
+        Args:
+            site: Setup of the arm and its control law.
+            arm: Model of the arm in the pose q.
+            Lambda: Gains of the coordinates, in 1/s.
+            q: Joint angles, shape (n, ...), in rad.
+            qd: Joint velocities, shape (n, ...), in rad/s.
+            x_des: Pose to follow, shape (m, ...).
+            xd_des: Velocity of this pose, shape (m, ...).
+
+        Returns:
+            The errors of the end effector, and the reference velocity and acceleration for the
+            joints. In a singular pose, all numbers that need the inverse of the Jacobian are
+            NaN.
+        """
+        assert site.chain is not None
+        assert site.chain.task is not None
+        task = site.chain.task
+        m = site.layout.shared
+        column_axes = q.ndim - 1
+        x = share_pose(task, arm)
+
+        scales = np.array([task.scale] * POSITION + [1.0] * POSITION)
+        scale_rows = _add_axes(scales[:m], (m, 1), column_axes)
+        unscaled_J = arm.pose_jacobian()[:m]
+        unscaled_J_rate = arm.pose_jacobian_rate(qd)[:m]
+        full_J = scale_rows * unscaled_J
+        full_J_rate = scale_rows * unscaled_J_rate
+        xd = multiply_columns(full_J, qd)
+
+        task_axes = np.array(task.axes)
+        axes = _add_axes(task_axes, (m,), column_axes)
+        e = axes * _subtract_poses(x, x_des)
+        ed = axes * (xd - xd_des)
+        axis_rows = axes[:, np.newaxis]
+        J = axis_rows * full_J
+        J_rate = axis_rows * full_J_rate
+        A, least = _damp(task, J)
+
+        preferred = np.array(task.posture or site.q0)
+        posture = _add_axes(preferred, (-1,), column_axes)
+        posture_error = q - posture
+        psi = -task.posture_rate * posture_error
+        psi_d = -task.posture_rate * qd
+        v, a = find_task_reference(
+            J=J,
+            Jd=J_rate,
+            solve=partial(solve_columns, A),
+            posture=(psi, psi_d),
+            error=(Lambda * e, Lambda * ed),
+        )
+        return cls(
+            x=x,
+            xd=xd,
+            e=e,
+            ed=ed,
+            v=v,
+            a=a,
+            J=J,
+            A=A,
+            least=least,
+        )
 
 
 def share_pose(task: TaskSetup, arm: PlacedChain) -> Numbers:
@@ -856,81 +934,6 @@ def share_pose(task: TaskSetup, arm: PlacedChain) -> Numbers:
     orientation = arm.end_effector_orientation()
     rotation = vector_from_rotation(orientation)
     return np.concatenate([position, rotation])
-
-
-def follow_in_task(
-    site: SiteSetup,
-    arm: PlacedChain,
-    Lambda: Numbers,
-    q: Numbers,
-    qd: Numbers,
-    x_des: Numbers,
-    xd_des: Numbers,
-) -> Following:
-    """Computes the errors and the reference motion of an end effector that follows a pose.
-
-    The pose has m coordinates, and the arm has n joints.
-
-    Args:
-        site: Setup of the arm and its control law.
-        arm: Model of the arm in the pose q.
-        Lambda: Gains of the coordinates, in 1/s.
-        q: Joint angles, shape (n, ...), in rad.
-        qd: Joint velocities, shape (n, ...), in rad/s.
-        x_des: Pose to follow, shape (m, ...).
-        xd_des: Velocity of this pose, shape (m, ...).
-
-    Returns:
-        The errors of the end effector, and the reference velocity and acceleration for the
-        joints. In a singular pose, all numbers that need the inverse of the Jacobian are NaN.
-    """
-    assert site.chain is not None
-    assert site.chain.task is not None
-    task = site.chain.task
-    m = site.layout.shared
-    column_axes = q.ndim - 1
-    x = share_pose(task, arm)
-
-    scales = np.array([task.scale] * POSITION + [1.0] * POSITION)
-    scale_rows = _add_axes(scales[:m], (m, 1), column_axes)
-    unscaled_J = arm.pose_jacobian()[:m]
-    unscaled_J_rate = arm.pose_jacobian_rate(qd)[:m]
-    full_J = scale_rows * unscaled_J
-    full_J_rate = scale_rows * unscaled_J_rate
-    xd = multiply_columns(full_J, qd)
-
-    task_axes = np.array(task.axes)
-    axes = _add_axes(task_axes, (m,), column_axes)
-    e = axes * _subtract_poses(x, x_des)
-    ed = axes * (xd - xd_des)
-    axis_rows = axes[:, np.newaxis]
-    J = axis_rows * full_J
-    J_rate = axis_rows * full_J_rate
-    A, least = _damp(task, J)
-
-    preferred = np.array(task.posture or site.q0)
-    posture = _add_axes(preferred, (-1,), column_axes)
-    posture_error = q - posture
-    psi = -task.posture_rate * posture_error
-    psi_d = -task.posture_rate * qd
-    v, a = find_task_reference(
-        J=J,
-        Jd=J_rate,
-        solve=partial(solve_columns, A),
-        posture=(psi, psi_d),
-        error=(Lambda * e, Lambda * ed),
-    )
-    return Following(
-        x=x,
-        xd=xd,
-        e=e,
-        ed=ed,
-        v=v,
-        a=a,
-        J=J,
-        A=A,
-        least=least,
-    )
 
 
 def _subtract_poses(x: Numbers, x_des: Numbers) -> Numbers:

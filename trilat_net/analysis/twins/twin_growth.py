@@ -164,7 +164,7 @@ class RestDeparture(NamedTuple):
 
 
 class TwinGrowth(NamedTuple):
-    """Whether the effects of small pushes on a run grow or die away, see `judge_twins`.
+    """Whether the effects of small pushes on a run grow or die away, see `TwinGrowth.of_twins`.
 
     Each push is made in a repetition of the run, which is called a twin. The difference between
     the twin and the run is then observed.
@@ -375,7 +375,7 @@ class TwinGrowth(NamedTuple):
             twins = Twins.of_log(log, Push.choose(log.scenario, count), own_laws=own_laws)
         except NotRepeatable as error:
             return TwinGrowth(str(error).removeprefix("twins cannot be run: "))
-        return judge_twins(log.scenario, twins, end.counts_from_s, end.quiet_from_s)
+        return TwinGrowth.of_twins(log.scenario, twins, end.counts_from_s, end.quiet_from_s)
 
     @classmethod
     def of_scenario(
@@ -399,75 +399,78 @@ class TwinGrowth(NamedTuple):
             ScenarioError: The scenario cannot run in virtual time.
         """
         twins = Twins.of_scenario(scenario, Push.choose(scenario, count), duration_s)
-        return judge_twins(scenario, twins, end.counts_from_s, end.quiet_from_s)
+        return TwinGrowth.of_twins(scenario, twins, end.counts_from_s, end.quiet_from_s)
 
+    @classmethod
+    def of_twins(
+        cls,
+        scenario: Scenario,
+        twins: Twins,
+        counts_from_s: float,
+        quiet_from_s: float,
+    ) -> "TwinGrowth":
+        """Judges whether the effects of small pushes on a run grow or die away.
 
-def judge_twins(
-    scenario: Scenario,
-    twins: Twins,
-    counts_from_s: float,
-    quiet_from_s: float,
-) -> TwinGrowth:
-    """Judges whether the effects of small pushes on a run grow or die away.
+        Each push is made in a repetition of the run, a twin. The difference between twin and
+        run is evaluated over the judged part of the run.
 
-    Each push is made in a repetition of the run, a twin. The difference between twin and run is
-    evaluated over the judged part of the run.
+        Args:
+            scenario: The description of the experiment.
+            twins: The twins.
+            counts_from_s: Time after which the run is considered, in s. The second half of the
+                time after it is judged.
+            quiet_from_s: Time after which no operator acts on the run and its control loop does
+                not change, in s. Departures from rest are searched for after this time.
+        """
+        t_s = twins.paths[0].t_s
+        has_motion = twins.speed.any(axis=1) | np.isfinite(twins.paths[0].largest).any(axis=1)
+        rows = np.flatnonzero(has_motion)
+        end = (
+            int(rows[-1]) if len(rows) else 0
+        )  # without the last interval, which may be one tick
+        period_s = _find_varying_period_s(scenario)
+        counts_from_s = _fit_to_period(counts_from_s, float(t_s[end]), period_s)
+        first = min(int(np.searchsorted(t_s, counts_from_s)), end)
+        quiet = slice(int(np.searchsorted(t_s, quiet_from_s)), end)
 
-    Args:
-        scenario: The description of the experiment.
-        twins: The twins.
-        counts_from_s: Time after which the run is considered, in s. The second half of the time
-            after it is judged.
-        quiet_from_s: Time after which no operator acts on the run and its control loop does not
-            change, in s. Departures from rest are searched for after this time.
-    """
-    t_s = twins.paths[0].t_s
-    has_motion = twins.speed.any(axis=1) | np.isfinite(twins.paths[0].largest).any(axis=1)
-    rows = np.flatnonzero(has_motion)
-    end = int(rows[-1]) if len(rows) else 0  # without the last interval, which may be one tick
-    period_s = _find_varying_period_s(scenario)
-    counts_from_s = _fit_to_period(counts_from_s, float(t_s[end]), period_s)
-    first = min(int(np.searchsorted(t_s, counts_from_s)), end)
-    quiet = slice(int(np.searchsorted(t_s, quiet_from_s)), end)
+        joint_counts = [scenario.layout(site).joints for site in scenario.names]
+        first_joints = np.cumsum([0, *joint_counts]).tolist()
+        pushes = []
+        departures = []
+        for group, sites in enumerate(find_coupled_sites(scenario)):
+            joints: list[int] = []
+            for site in sites:
+                joints += range(first_joints[site], first_joints[site + 1])
+            amplitudes = [measure_amplitude(path, joints) for path in twins.paths]
+            for path, amplitude in zip(twins.paths, amplitudes, strict=True):
+                is_affected = np.isfinite(amplitude[first:end]).any()
+                if is_affected:
+                    growth = _judge_worst_joint(
+                        path=path,
+                        amplitude=amplitude,
+                        joints=joints,
+                        part=slice(first, end),
+                        joint_names=twins.joints,
+                    )
+                    pushes.append(growth._replace(group=group))
+            departures += list(_find_departures(twins, amplitudes, joints, quiet))
 
-    joint_counts = [scenario.layout(site).joints for site in scenario.names]
-    first_joints = np.cumsum([0, *joint_counts]).tolist()
-    pushes = []
-    departures = []
-    for group, sites in enumerate(find_coupled_sites(scenario)):
-        joints: list[int] = []
-        for site in sites:
-            joints += range(first_joints[site], first_joints[site + 1])
-        amplitudes = [measure_amplitude(path, joints) for path in twins.paths]
-        for path, amplitude in zip(twins.paths, amplitudes, strict=True):
-            is_affected = np.isfinite(amplitude[first:end]).any()
-            if is_affected:
-                growth = _judge_worst_joint(
-                    path=path,
-                    amplitude=amplitude,
-                    joints=joints,
-                    part=slice(first, end),
-                    joint_names=twins.joints,
-                )
-                pushes.append(growth._replace(group=group))
-        departures += list(_find_departures(twins, amplitudes, joints, quiet))
-
-    is_too_short = end <= first
-    no_pushes = (
-        "too short a record to follow a push" if is_too_short else "no push moved an arm"
-    )
-    return TwinGrowth(
-        "" if pushes else no_pushes,
-        from_s=0.5 * float(t_s[first] + t_s[end]),
-        to_s=float(t_s[end]),
-        pushes=tuple(pushes),
-        departure=max(departures, key=lambda departure: departure.rate_per_s, default=None),
-        same_platform=twins.same,
-        links_random=scenario.links_random,
-        delay_period_s=period_s,
-        burst_interval_s=find_burst_interval_s(scenario),
-        twins=twins,
-    )
+        is_too_short = end <= first
+        no_pushes = (
+            "too short a record to follow a push" if is_too_short else "no push moved an arm"
+        )
+        return cls(
+            "" if pushes else no_pushes,
+            from_s=0.5 * float(t_s[first] + t_s[end]),
+            to_s=float(t_s[end]),
+            pushes=tuple(pushes),
+            departure=max(departures, key=lambda departure: departure.rate_per_s, default=None),
+            same_platform=twins.same,
+            links_random=scenario.links_random,
+            delay_period_s=period_s,
+            burst_interval_s=find_burst_interval_s(scenario),
+            twins=twins,
+        )
 
 
 def _find_varying_period_s(scenario: Scenario) -> float | None:
@@ -949,7 +952,7 @@ def twin(
     else:
         pushes = [default._replace(at_s=at_s, again=False) for default in Push.choose(scenario)]
     twins = Twins.of_log(log, pushes, own_laws=True)
-    growth = judge_twins(scenario, twins, counts_from_s, quiet_from_s)
+    growth = TwinGrowth.of_twins(scenario, twins, counts_from_s, quiet_from_s)
     linear = _find_linear_sizes(scenario, growth, sizes) if delta else None
     return PushedTwins(log, at_s, growth, linear)
 

@@ -313,11 +313,11 @@ def metrics_command(
     dash marks a missing value; if the run could have the value, the reason is given.
     docs/reference/metrics.md has every formula.
     """
-    from ...analysis import compute_log_metrics
+    from ...analysis import LogMetrics
 
     log = terminal.open_with_progress(*file)
     log.require_records()
-    metrics = compute_log_metrics(log)
+    metrics = LogMetrics.of_log(log)
     terminal.print_result(metrics, as_json=as_json, brief=not everything)
 
 

@@ -182,18 +182,18 @@ def build_chain(joints: Sequence[ChainJoint], width: int = 0) -> RowArray:
         row.origin = joint.origin_m
         row.at_rest = joint.rotation
         if joint.prismatic:
-            row.slide = apply(joint.rotation, joint.axis)
+            row.slide = multiply_vector(joint.rotation, joint.axis)
         else:
-            by_sine = multiply(joint.rotation, cross_matrix)
+            by_sine = multiply_matrices(joint.rotation, cross_matrix)
             row.by_sine = by_sine
-            row.by_cosine = multiply(by_sine, cross_matrix)
+            row.by_cosine = multiply_matrices(by_sine, cross_matrix)
         for name in _DRIVE:
             row[name] = getattr(joint, name)
     return rows
 
 
 @leaf
-def three(a: Vector) -> Three:
+def read_three(a: Vector) -> Three:
     """Returns the first three numbers of an array as a tuple, for vector arithmetic in 3D.
 
     Compiled code keeps a tuple in registers, whereas a new array would allocate memory in the
@@ -223,7 +223,7 @@ def put_three(a: Array, values: Three) -> None:
 
 
 @leaf
-def dot(a: Three, b: Three) -> float:
+def dot_product(a: Three, b: Three) -> float:
     """Returns the scalar product a' b = a_1 b_1 + a_2 b_2 + a_3 b_3 of two 3D vectors."""
     x = a[0] * b[0]
     y = a[1] * b[1]
@@ -232,7 +232,7 @@ def dot(a: Three, b: Three) -> float:
 
 
 @leaf
-def cross(a: Three, b: Three) -> Three:
+def cross_product(a: Three, b: Three) -> Three:
     """Returns the vector product a x b of two 3D vectors, which is perpendicular to both."""
     x = a[1] * b[2] - a[2] * b[1]
     y = a[2] * b[0] - a[0] * b[2]
@@ -241,7 +241,7 @@ def cross(a: Three, b: Three) -> Three:
 
 
 @leaf
-def add(a: Three, b: Three) -> Three:
+def add_vectors(a: Three, b: Three) -> Three:
     """Returns the sum a + b of two 3D vectors, element by element."""
     x = a[0] + b[0]
     y = a[1] + b[1]
@@ -250,7 +250,7 @@ def add(a: Three, b: Three) -> Three:
 
 
 @leaf
-def subtract(a: Three, b: Three) -> Three:
+def subtract_vectors(a: Three, b: Three) -> Three:
     """Returns the difference a - b of two 3D vectors, element by element."""
     x = a[0] - b[0]
     y = a[1] - b[1]
@@ -259,7 +259,7 @@ def subtract(a: Three, b: Three) -> Three:
 
 
 @leaf
-def scale(factor: float, a: Three) -> Three:
+def scale_vector(factor: float, a: Three) -> Three:
     """Returns a 3D vector multiplied by a number, factor * a."""
     x = factor * a[0]
     y = factor * a[1]
@@ -268,7 +268,7 @@ def scale(factor: float, a: Three) -> Three:
 
 
 @leaf
-def rotate(R: Array, a: Three) -> Three:
+def rotate_by_matrix(R: Array, a: Three) -> Three:
     """Returns the product R a of a rotation matrix and a 3D vector.
 
     If R is the orientation of a link in the base frame, a vector given in the axes of the link
@@ -302,7 +302,7 @@ def _rotate_back(R: Array, a: Three) -> Three:
     return first, second, third
 
 
-def apply(a: Matrix, b: Three) -> Three:
+def multiply_vector(a: Matrix, b: Three) -> Three:
     """Returns the product of a 3 x 3 matrix `a` and a 3D vector `b`.
 
     The sums have a fixed order, so that the result has the same bits on every machine.
@@ -320,14 +320,14 @@ def apply(a: Matrix, b: Three) -> Three:
     return first, second, third
 
 
-def multiply(a: Matrix, b: Matrix) -> Matrix:
+def multiply_matrices(a: Matrix, b: Matrix) -> Matrix:
     """Returns the product a b of two 3 x 3 matrices, each given as three rows.
 
     The sums have a fixed order, so that the result has the same bits on every machine. The sums
     of a linear algebra library may differ in the last bit.
     """
     columns: Any = zip(*b, strict=True)
-    product_columns = [apply(a, column) for column in columns]
+    product_columns = [multiply_vector(a, column) for column in columns]
     rows: Any = zip(*product_columns, strict=True)
     return tuple(rows)
 
@@ -378,17 +378,17 @@ def _move(row: Row, linear: Three, angular: Three, rate: float) -> Spatial:
     Returns:
         The linear and the angular part, in the link's own frame.
     """
-    p = three(row.p)
-    turning_velocity = cross(angular, p)
-    velocity_at_p = add(linear, turning_velocity)
+    p = read_three(row.p)
+    turning_velocity = cross_product(angular, p)
+    velocity_at_p = add_vectors(linear, turning_velocity)
     link_linear = _rotate_back(row.R, velocity_at_p)
     link_angular = _rotate_back(row.R, angular)
-    axis = three(row.axis)
-    joint_velocity = scale(rate, axis)
+    axis = read_three(row.axis)
+    joint_velocity = scale_vector(rate, axis)
     if row.prismatic == 0:
-        link_angular = add(link_angular, joint_velocity)
+        link_angular = add_vectors(link_angular, joint_velocity)
     else:
-        link_linear = add(link_linear, joint_velocity)
+        link_linear = add_vectors(link_linear, joint_velocity)
     return link_linear, link_angular
 
 
@@ -422,11 +422,11 @@ def _momentum(pi: Vector, first: int, linear: Three, angular: Three) -> Spatial:
     spin_z = I_xz * x + I_yz * y + I_zz * z
     mc = (mc_x, mc_y, mc_z)
     spin = (spin_x, spin_y, spin_z)
-    origin_momentum = scale(m, linear)
-    turning_momentum = cross(angular, mc)
-    linear_momentum = add(origin_momentum, turning_momentum)
-    moment = cross(mc, linear)
-    angular_momentum = add(moment, spin)
+    origin_momentum = scale_vector(m, linear)
+    turning_momentum = cross_product(angular, mc)
+    linear_momentum = add_vectors(origin_momentum, turning_momentum)
+    moment = cross_product(mc, linear)
+    angular_momentum = add_vectors(moment, spin)
     return linear_momentum, angular_momentum
 
 
@@ -442,9 +442,9 @@ def _along_axis(row: Row, linear: Three, angular: Three) -> float:
         linear: Linear part of f, the force.
         angular: Angular part of f, the torque.
     """
-    axis = three(row.axis)
+    axis = read_three(row.axis)
     along = angular if row.prismatic == 0 else linear
-    return dot(axis, along)
+    return dot_product(axis, along)
 
 
 @leaf
@@ -479,13 +479,13 @@ def _pass_force(row: Row, before: Row) -> None:
         before: Data of the previous joint; changed.
     """
     R = row.R
-    p = three(row.p)
-    force = rotate(R, three(row.f_lin))
-    link_torque = rotate(R, three(row.f_ang))
-    lever_torque = cross(p, force)
-    torque = add(link_torque, lever_torque)
-    total_force = add(three(before.f_lin), force)
-    total_torque = add(three(before.f_ang), torque)
+    p = read_three(row.p)
+    force = rotate_by_matrix(R, read_three(row.f_lin))
+    link_torque = rotate_by_matrix(R, read_three(row.f_ang))
+    lever_torque = cross_product(p, force)
+    torque = add_vectors(link_torque, lever_torque)
+    total_force = add_vectors(read_three(before.f_lin), force)
+    total_torque = add_vectors(read_three(before.f_ang), torque)
     put_three(before.f_lin, total_force)
     put_three(before.f_ang, total_torque)
 
@@ -522,16 +522,16 @@ def propagate_motion(
         W_lin, W_ang = _move(row, W_lin, W_ang, v[i])
         A_lin, A_ang = _move(row, A_lin, A_ang, a[i])
         # V x (S v)
-        axis = three(row.axis)
-        joint_velocity = scale(v[i], axis)
+        axis = read_three(row.axis)
+        joint_velocity = scale_vector(v[i], axis)
         if row.prismatic == 0:
-            linear_part = cross(V_lin, joint_velocity)
-            angular_part = cross(V_ang, joint_velocity)
-            A_lin = add(A_lin, linear_part)
-            A_ang = add(A_ang, angular_part)
+            linear_part = cross_product(V_lin, joint_velocity)
+            angular_part = cross_product(V_ang, joint_velocity)
+            A_lin = add_vectors(A_lin, linear_part)
+            A_ang = add_vectors(A_ang, angular_part)
         else:
-            linear_part = cross(V_ang, joint_velocity)
-            A_lin = add(A_lin, linear_part)
+            linear_part = cross_product(V_ang, joint_velocity)
+            A_lin = add_vectors(A_lin, linear_part)
         put_three(row.V_lin, V_lin)
         put_three(row.V_ang, V_ang)
         put_three(row.W_lin, W_lin)
@@ -548,10 +548,10 @@ def _motion_cross(V: Spatial, W: Spatial) -> Spatial:
     """
     V_lin, V_ang = V
     W_lin, W_ang = W
-    turned_W = cross(V_ang, W_lin)
-    moved_W = cross(V_lin, W_ang)
-    linear = add(turned_W, moved_W)
-    angular = cross(V_ang, W_ang)
+    turned_W = cross_product(V_ang, W_lin)
+    moved_W = cross_product(V_lin, W_ang)
+    linear = add_vectors(turned_W, moved_W)
+    angular = cross_product(V_ang, W_ang)
     return linear, angular
 
 
@@ -563,10 +563,10 @@ def _force_cross(V: Spatial, f: Spatial) -> Spatial:
     """
     V_lin, V_ang = V
     force, torque = f
-    linear = cross(V_ang, force)
-    turned_torque = cross(V_ang, torque)
-    moved_force = cross(V_lin, force)
-    angular = add(turned_torque, moved_force)
+    linear = cross_product(V_ang, force)
+    turned_torque = cross_product(V_ang, torque)
+    moved_force = cross_product(V_lin, force)
+    angular = add_vectors(turned_torque, moved_force)
     return linear, angular
 
 
@@ -596,12 +596,12 @@ def inverse_dynamics(
     for i in range(n):
         row: Row = chain[i]
         first = LINK_PARAMETERS * i
-        V_lin = three(row.V_lin)
-        V_ang = three(row.V_ang)
-        W_lin = three(row.W_lin)
-        W_ang = three(row.W_ang)
-        A_lin = three(row.A_lin)
-        A_ang = three(row.A_ang)
+        V_lin = read_three(row.V_lin)
+        V_ang = read_three(row.V_ang)
+        W_lin = read_three(row.W_lin)
+        W_ang = read_three(row.W_ang)
+        A_lin = read_three(row.A_lin)
+        A_ang = read_three(row.A_ang)
         V = (V_lin, V_ang)
         W = (W_lin, W_ang)
         V_x_W = _motion_cross(V, W)
@@ -612,20 +612,20 @@ def inverse_dynamics(
         V_x_I_W = _force_cross(V, I_W)
         W_x_I_V = _force_cross(W, I_V)
         I_V_x_W = _momentum(theta, first, V_x_W[0], V_x_W[1])
-        force_sum = add(V_x_I_W[0], W_x_I_V[0])
-        torque_sum = add(V_x_I_W[1], W_x_I_V[1])
-        turning_force = subtract(force_sum, I_V_x_W[0])
-        turning_torque = subtract(torque_sum, I_V_x_W[1])
-        half_force = scale(0.5, turning_force)
-        half_torque = scale(0.5, turning_torque)
-        put_three(row.f_lin, add(I_A[0], half_force))
-        put_three(row.f_ang, add(I_A[1], half_torque))
+        force_sum = add_vectors(V_x_I_W[0], W_x_I_V[0])
+        torque_sum = add_vectors(V_x_I_W[1], W_x_I_V[1])
+        turning_force = subtract_vectors(force_sum, I_V_x_W[0])
+        turning_torque = subtract_vectors(torque_sum, I_V_x_W[1])
+        half_force = scale_vector(0.5, turning_force)
+        half_torque = scale_vector(0.5, turning_torque)
+        put_three(row.f_lin, add_vectors(I_A[0], half_force))
+        put_three(row.f_ang, add_vectors(I_A[1], half_torque))
 
     # Torque of each joint, from the tip to the base: a joint carries all links after it.
     for i in range(n - 1, -1, -1):
         row = chain[i]
-        force = three(row.f_lin)
-        moment = three(row.f_ang)
+        force = read_three(row.f_lin)
+        moment = read_three(row.f_ang)
         rigid = _along_axis(row, force, moment)
         drive = row.armature_kg_m2 * a[i]
         friction = friction_torque(row, v[i])
@@ -646,7 +646,7 @@ def _add_products(factor: float, x: Spatial, y: Spatial, first: int, gradient: A
     linear parts x_lin and y_lin and the angular parts x_ang and y_ang, the term is
 
         x' I y = m x_lin' y_lin
-               + (m c)' (cross(y_lin, x_ang) + cross(x_lin, y_ang))
+               + (m c)' (cross_product(y_lin, x_ang) + cross_product(x_lin, y_ang))
                + x_ang' J y_ang
 
     The factors of the parameters in this sum are the derivatives with respect to them. J is
@@ -664,10 +664,10 @@ def _add_products(factor: float, x: Spatial, y: Spatial, first: int, gradient: A
     y_lin, y_ang = y
     x_1, x_2, x_3 = x_ang
     y_1, y_2, y_3 = y_ang
-    d_m = dot(x_lin, y_lin)
-    y_lin_x_x_ang = cross(y_lin, x_ang)
-    x_lin_x_y_ang = cross(x_lin, y_ang)
-    d_mc = add(y_lin_x_x_ang, x_lin_x_y_ang)
+    d_m = dot_product(x_lin, y_lin)
+    y_lin_x_x_ang = cross_product(y_lin, x_ang)
+    x_lin_x_y_ang = cross_product(x_lin, y_ang)
+    d_mc = add_vectors(y_lin_x_x_ang, x_lin_x_y_ang)
     d_Ixx = x_1 * y_1
     d_Ixy = x_1 * y_2 + x_2 * y_1
     d_Iyy = x_2 * y_2
@@ -711,14 +711,14 @@ def parameter_gradient(chain: RowArray, gradient: Array) -> None:
     """
     for i in range(chain.shape[0]):
         row: Row = chain[i]
-        V_lin = three(row.V_lin)
-        V_ang = three(row.V_ang)
-        W_lin = three(row.W_lin)
-        W_ang = three(row.W_ang)
-        A_lin = three(row.A_lin)
-        A_ang = three(row.A_ang)
-        s_lin = subtract(V_lin, W_lin)
-        s_ang = subtract(V_ang, W_ang)
+        V_lin = read_three(row.V_lin)
+        V_ang = read_three(row.V_ang)
+        W_lin = read_three(row.W_lin)
+        W_ang = read_three(row.W_ang)
+        A_lin = read_three(row.A_lin)
+        A_ang = read_three(row.A_ang)
+        s_lin = subtract_vectors(V_lin, W_lin)
+        s_ang = subtract_vectors(V_ang, W_ang)
         V = (V_lin, V_ang)
         W = (W_lin, W_ang)
         A = (A_lin, A_ang)
@@ -755,25 +755,25 @@ def _add_composite(row: Row, before: Row) -> None:
     total = before.composite
     R = row.R
     m = pi[0]
-    p = three(row.p)
+    p = read_three(row.p)
     link_mc = (pi[1], pi[2], pi[3])
-    mc = rotate(R, link_mc)
+    mc = rotate_by_matrix(R, link_mc)
     # I is the inertia matrix about the origin of the link, in the axes of the link. It is
     # symmetric. x, y and z are the columns of R I, and R I R' has the rows I_x, I_y and I_z.
     column_1 = (pi[4], pi[5], pi[7])
     column_2 = (pi[5], pi[6], pi[8])
     column_3 = (pi[7], pi[8], pi[9])
-    x = rotate(R, column_1)
-    y = rotate(R, column_2)
-    z = rotate(R, column_3)
+    x = rotate_by_matrix(R, column_1)
+    y = rotate_by_matrix(R, column_2)
+    z = rotate_by_matrix(R, column_3)
     row_1 = (x[0], y[0], z[0])
     row_2 = (x[1], y[1], z[1])
     row_3 = (x[2], y[2], z[2])
-    I_x = rotate(R, row_1)
-    I_y = rotate(R, row_2)
-    I_z = rotate(R, row_3)
-    p_mc = dot(p, mc)
-    p_p = dot(p, p)
+    I_x = rotate_by_matrix(R, row_1)
+    I_y = rotate_by_matrix(R, row_2)
+    I_z = rotate_by_matrix(R, row_3)
+    p_mc = dot_product(p, mc)
+    p_p = dot_product(p, p)
     polar = 2.0 * p_mc + m * p_p
     p_x, p_y, p_z = p
     mc_x, mc_y, mc_z = mc
@@ -835,7 +835,7 @@ def mass_matrix(chain: RowArray, theta: Vector) -> None:
         row = chain[i]
         # The force that accelerates the composite body (the link and all links after it) at the
         # joint's unit acceleration.
-        axis = three(row.axis)
+        axis = read_three(row.axis)
         if row.prismatic == 0:
             linear, angular = _momentum(row.composite, 0, still, axis)
         else:
@@ -845,10 +845,10 @@ def mass_matrix(chain: RowArray, theta: Vector) -> None:
         # The torque of this force at each earlier joint is an element of M off the diagonal.
         for j in range(i - 1, -1, -1):
             link: Row = chain[j + 1]
-            linear = rotate(link.R, linear)
-            link_torque = rotate(link.R, angular)
-            lever_torque = cross(three(link.p), linear)
-            angular = add(link_torque, lever_torque)
+            linear = rotate_by_matrix(link.R, linear)
+            link_torque = rotate_by_matrix(link.R, angular)
+            lever_torque = cross_product(read_three(link.p), linear)
+            angular = add_vectors(link_torque, lever_torque)
             row.M[j] = _along_axis(chain[j], linear, angular)
         if i > 0:
             _add_composite(row, chain[i - 1])
@@ -907,30 +907,30 @@ def _bias(chain: RowArray, theta: Vector, gravity: Vector, q: Vector, qd: Vector
         V_lin, V_ang = _move(row, V_lin, V_ang, qd[i])
         A_lin, A_ang = _move(row, A_lin, A_ang, 0.0)
         # V x (S qd)
-        axis = three(row.axis)
-        joint_velocity = scale(qd[i], axis)
+        axis = read_three(row.axis)
+        joint_velocity = scale_vector(qd[i], axis)
         if row.prismatic == 0:
-            linear_part = cross(V_lin, joint_velocity)
-            angular_part = cross(V_ang, joint_velocity)
-            A_lin = add(A_lin, linear_part)
-            A_ang = add(A_ang, angular_part)
+            linear_part = cross_product(V_lin, joint_velocity)
+            angular_part = cross_product(V_ang, joint_velocity)
+            A_lin = add_vectors(A_lin, linear_part)
+            A_ang = add_vectors(A_ang, angular_part)
         else:
-            linear_part = cross(V_ang, joint_velocity)
-            A_lin = add(A_lin, linear_part)
+            linear_part = cross_product(V_ang, joint_velocity)
+            A_lin = add_vectors(A_lin, linear_part)
         # I A + V x* I V
         first = LINK_PARAMETERS * i
         force, torque = _momentum(theta, first, A_lin, A_ang)
         momentum = _momentum(theta, first, V_lin, V_ang)
         V = (V_lin, V_ang)
         turning_force, turning_torque = _force_cross(V, momentum)
-        put_three(row.f_lin, add(force, turning_force))
-        put_three(row.f_ang, add(torque, turning_torque))
+        put_three(row.f_lin, add_vectors(force, turning_force))
+        put_three(row.f_ang, add_vectors(torque, turning_torque))
 
     # Torque of each joint, from the tip to the base: a joint carries all links after it.
     for i in range(n - 1, -1, -1):
         row = chain[i]
-        force = three(row.f_lin)
-        moment = three(row.f_ang)
+        force = read_three(row.f_lin)
+        moment = read_three(row.f_ang)
         rigid = _along_axis(row, force, moment)
         friction = friction_torque(row, qd[i])
         row.bias = rigid + friction
@@ -1058,30 +1058,30 @@ def place_end_effector(chain: RowArray, tip: Vector) -> Three:
         R = row.R
         R_base = row.R_base
         if i == 0:
-            position = three(row.p)
+            position = read_three(row.p)
             for j in range(3):
-                put_three(R_base[j], three(R[j]))
+                put_three(R_base[j], read_three(R[j]))
         else:
             before = chain[i - 1].R_base
-            offset = rotate(before, three(row.p))
-            position = add(position, offset)
+            offset = rotate_by_matrix(before, read_three(row.p))
+            position = add_vectors(position, offset)
             for k in range(3):
                 column = (R[0, k], R[1, k], R[2, k])
-                x, y, z = rotate(before, column)
+                x, y, z = rotate_by_matrix(before, column)
                 R_base[0, k] = x
                 R_base[1, k] = y
                 R_base[2, k] = z
-        axis = rotate(R_base, three(row.axis))
+        axis = rotate_by_matrix(R_base, read_three(row.axis))
         put_three(row.axis_base, axis)
         put_three(row.p_base, position)
-    tip_offset = rotate(chain[n - 1].R_base, three(tip))
-    position = add(position, tip_offset)
+    tip_offset = rotate_by_matrix(chain[n - 1].R_base, read_three(tip))
+    position = add_vectors(position, tip_offset)
     for i in range(n):
         row = chain[i]
-        axis = three(row.axis_base)
+        axis = read_three(row.axis_base)
         if row.prismatic == 0:
-            lever = subtract(position, three(row.p_base))
-            put_three(row.J_lin, cross(axis, lever))
+            lever = subtract_vectors(position, read_three(row.p_base))
+            put_three(row.J_lin, cross_product(axis, lever))
             put_three(row.J_ang, axis)
         else:
             put_three(row.J_lin, axis)

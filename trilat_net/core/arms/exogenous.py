@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 from ..plug.plugged import call_address, compile_to_address, list_numbers
 from ..step.jit import leaf
 from ..step.vectors import Array, Pair, Row, RowArray, Vector, count_started
-from .chain import Three, add, dot, place_end_effector, scale, three
+from .chain import Three, add_vectors, dot_product, place_end_effector, read_three, scale_vector
 from .elementary import sincos
 from .two_link_arm import end_effector_jacobian, forward_kinematics
 
@@ -757,7 +757,7 @@ def _force_in_space(
             actor.at[i] = at[i]
             actor.speed[i] = speed[i]
         _call_user_function(actor, t_s, table)
-        return three(actor.effort)
+        return read_three(actor.effort)
     if actor.kind != _WALL:
         progress, rate = _target_progress(actor, t_s)
         x = _spring_along(
@@ -772,24 +772,24 @@ def _force_in_space(
         if actor.kind == _TASK_HAND:
             return x, y, z
         if actor.kind == _LIVE_FORCE:
-            x, y, z = three(actor.a)
+            x, y, z = read_three(actor.a)
         square = x * x + y * y + z * z
         factor = _live_share(actor, square)
         force = (x, y, z)
-        return scale(factor, force)
+        return scale_vector(factor, force)
 
     # A wall.
-    normal = three(actor.b)
-    point = three(actor.a)
-    depth = dot(point, normal) - dot(at, normal)
+    normal = read_three(actor.b)
+    point = read_three(actor.a)
+    depth = dot_product(point, normal) - dot_product(at, normal)
     is_touched = depth > 0.0  # False for NaN
     if not is_touched:
         return 0.0, 0.0, 0.0
-    outward_speed = dot(speed, normal)
+    outward_speed = dot_product(speed, normal)
     spring = actor.K[0] * depth
     damper = actor.B[0] * outward_speed
     push = max(spring - damper, 0.0)
-    return scale(push, normal)
+    return scale_vector(push, normal)
 
 
 @leaf
@@ -871,8 +871,8 @@ def _tip_motion(qd: Vector, tip: Vector, chain: RowArray) -> tuple[Three, Three]
     position = place_end_effector(chain, tip)
     velocity = (0.0, 0.0, 0.0)
     for i in range(chain.shape[0]):
-        column = three(chain[i].J_lin)
-        velocity = add(velocity, scale(qd[i], column))
+        column = read_three(chain[i].J_lin)
+        velocity = add_vectors(velocity, scale_vector(qd[i], column))
     return position, velocity
 
 
@@ -935,9 +935,9 @@ def put_torque_on_chain(
         force = _force_in_space(actor=actor, t_s=t_s, at=at, speed=speed, table=table)
         # The torque J' F, where J is the Jacobian.
         for i in range(n):
-            column = three(chain[i].J_lin)
-            torque[i] += dot(column, force)
+            column = read_three(chain[i].J_lin)
+            torque[i] += dot_product(column, force)
         if actor.kind == _WALL:
-            force_n = math.sqrt(dot(force, force))
+            force_n = math.sqrt(dot_product(force, force))
             largest_n = max(largest_n, force_n)
     return largest_n

@@ -15,7 +15,7 @@ import math
 
 from ..step.jit import leaf
 from ..step.vectors import Array, choose
-from .chain import Matrix, Three, add, cross, dot, scale
+from .chain import Matrix, Three, add_vectors, cross_product, dot_product, scale_vector
 from .elementary import sincos
 
 _SMALL = 1e-8
@@ -131,7 +131,7 @@ def _quaternion(R: Array | Matrix) -> tuple[float, Three]:
     z = _choose_component(trace, xx, yy, zz, all_z)
     length = math.sqrt(w * w + x * x + y * y + z * z)
     length = choose(w < 0.0, -length, length)
-    return w / length, scale(1.0 / length, (x, y, z))
+    return w / length, scale_vector(1.0 / length, (x, y, z))
 
 
 @leaf
@@ -155,7 +155,7 @@ def rotation_vector(R: Array | Matrix) -> Three:
     angle = 2.0 * half_angle
     is_small = n < _SMALL
     factor = choose(is_small, 2.0, angle) / choose(is_small, w, n)
-    return scale(factor, v)
+    return scale_vector(factor, v)
 
 
 @leaf
@@ -212,7 +212,7 @@ def compose_rotations(turn: Three, vector: Three) -> Three:
         vector: Rotation vector of the first rotation.
     """
     second_matrix = rotation_matrix(turn)
-    inverse_vector = scale(-1.0, vector)
+    inverse_vector = scale_vector(-1.0, vector)
     first_matrix_inverse = rotation_matrix(inverse_vector)
     # `relative_rotation` transposes its second matrix, and the transpose of R' is R.
     return relative_rotation(second_matrix, first_matrix_inverse)
@@ -236,7 +236,7 @@ def rotate_by_vector(turn: Three, vector: Three) -> Three:
 @leaf
 def length(vector: Three) -> float:
     """Returns the Euclidean length of a 3D vector, in the unit of its numbers."""
-    return math.sqrt(dot(vector, vector))
+    return math.sqrt(dot_product(vector, vector))
 
 
 @leaf
@@ -264,12 +264,12 @@ def angular_velocity(turn: Three, rate: Three) -> Three:
         s, c = sincos(angle)
         once_gain = (1.0 - c) / a2
         twice_gain = (angle - s) / (a2 * angle)
-    crossed_once = cross(turn, rate)
-    crossed_twice = cross(turn, crossed_once)
-    once_part = scale(once_gain, crossed_once)
-    twice_part = scale(twice_gain, crossed_twice)
-    correction = add(once_part, twice_part)
-    return add(rate, correction)
+    crossed_once = cross_product(turn, rate)
+    crossed_twice = cross_product(turn, crossed_once)
+    once_part = scale_vector(once_gain, crossed_once)
+    twice_part = scale_vector(twice_gain, crossed_twice)
+    correction = add_vectors(once_part, twice_part)
+    return add_vectors(rate, correction)
 
 
 @leaf
@@ -297,9 +297,9 @@ def rotation_vector_rate(turn: Three, velocity: Three) -> Three:
         half_angle = 0.5 * angle
         sine, cosine = sincos(half_angle)
         c = (1.0 - half_angle * cosine / sine) / a2
-    u_x_w = cross(turn, velocity)
-    u_x_u_x_w = cross(turn, u_x_w)
-    first_order_part = scale(-0.5, u_x_w)
-    second_order_part = scale(c, u_x_u_x_w)
-    correction = add(first_order_part, second_order_part)
-    return add(velocity, correction)
+    u_x_w = cross_product(turn, velocity)
+    u_x_u_x_w = cross_product(turn, u_x_w)
+    first_order_part = scale_vector(-0.5, u_x_w)
+    second_order_part = scale_vector(c, u_x_u_x_w)
+    correction = add_vectors(first_order_part, second_order_part)
+    return add_vectors(velocity, correction)

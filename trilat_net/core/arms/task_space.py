@@ -34,7 +34,16 @@ Invariant:
 
 from ..step.jit import leaf
 from ..step.vectors import Array, Row, RowArray, choose, holds_anywhere
-from .chain import Three, add, cross, place_end_effector, put_three, scale, subtract, three
+from .chain import (
+    Three,
+    add_vectors,
+    cross_product,
+    place_end_effector,
+    put_three,
+    read_three,
+    scale_vector,
+    subtract_vectors,
+)
 from .rotation import compose_rotations, relative_rotation, rotation_matrix
 
 POSITION = 3
@@ -84,7 +93,7 @@ def update_pose(s: Row, chain: RowArray) -> None:
     """
     # This also writes the frames of the links and the columns of J in base axes.
     position = place_end_effector(chain, s.tip)
-    shared_position = scale(s.scale, position)
+    shared_position = scale_vector(s.scale, position)
     put_three(s.x[:3], shared_position)
     if s.shared == POSE:
         # The orientation of the end effector is R_base tip_back', which this function converts
@@ -132,34 +141,34 @@ def _update_jacobian_rate(s: Row, chain: RowArray, tip: Three) -> None:
     tip_velocity = zeros
     origin_before = zeros
     for i in range(chain.shape[0]):
-        column = three(chain[i].J_lin)
-        joint_part = scale(s.qd[i], column)
-        tip_velocity = add(tip_velocity, joint_part)
+        column = read_three(chain[i].J_lin)
+        joint_part = scale_vector(s.qd[i], column)
+        tip_velocity = add_vectors(tip_velocity, joint_part)
 
     for i in range(chain.shape[0]):
         row: Row = chain[i]
-        axis = three(row.axis_base)
-        origin = three(row.p_base)
-        joint_velocity = scale(s.qd[i], axis)
+        axis = read_three(row.axis_base)
+        origin = read_three(row.p_base)
+        joint_velocity = scale_vector(s.qd[i], axis)
         # The previous link carries the joint's origin along.
-        link_vector = subtract(origin, origin_before)
-        link_velocity = cross(angular_velocity, link_vector)
-        origin_velocity = add(origin_velocity, link_velocity)
+        link_vector = subtract_vectors(origin, origin_before)
+        link_velocity = cross_product(angular_velocity, link_vector)
+        origin_velocity = add_vectors(origin_velocity, link_velocity)
         origin_before = origin
         if row.prismatic == 0:
             # The derivatives of the joint's columns, J_ang = axis and J_lin = axis x lever.
-            angular_velocity = add(angular_velocity, joint_velocity)
-            axis_rate = cross(angular_velocity, axis)
-            lever = subtract(tip, origin)
-            lever_rate = subtract(tip_velocity, origin_velocity)
-            axis_part = cross(axis_rate, lever)
-            lever_part = cross(axis, lever_rate)
-            linear = add(axis_part, lever_part)
+            angular_velocity = add_vectors(angular_velocity, joint_velocity)
+            axis_rate = cross_product(angular_velocity, axis)
+            lever = subtract_vectors(tip, origin)
+            lever_rate = subtract_vectors(tip_velocity, origin_velocity)
+            axis_part = cross_product(axis_rate, lever)
+            lever_part = cross_product(axis, lever_rate)
+            linear = add_vectors(axis_part, lever_part)
             angular = axis_rate
         else:
             # The derivatives of J_ang = 0 and J_lin = axis.
-            origin_velocity = add(origin_velocity, joint_velocity)
-            linear = cross(angular_velocity, axis)
+            origin_velocity = add_vectors(origin_velocity, joint_velocity)
+            linear = cross_product(angular_velocity, axis)
             angular = zeros
         for j in range(3):
             s.Jd[j, i] = s.scale * linear[j]
@@ -188,22 +197,22 @@ def update_orientation_reference(s: Row, links: RowArray) -> None:
         s: State of the site (the process that runs this arm); the reference is written into it.
         links: States of the links from the other arms, one row per link.
     """
-    rotation_vector = three(s.x[3:])
+    rotation_vector = read_three(s.x[3:])
     orientation = rotation_matrix(rotation_vector)
     difference = (0.0, 0.0, 0.0)
     velocity = (0.0, 0.0, 0.0)
     for j in range(links.shape[0]):
         link: Row = links[j]
-        peer_vector = three(link.q[3:])
+        peer_vector = read_three(link.q[3:])
         peer_orientation = rotation_matrix(peer_vector)
         turn = relative_rotation(orientation, peer_orientation)
-        weighted_turn = scale(link.alpha, turn)
-        difference = add(difference, weighted_turn)
-        peer_velocity = scale(link.alpha, three(link.qd[3:]))
-        ramp_velocity = scale(-link.alpha_rate, turn)
-        link_velocity = add(peer_velocity, ramp_velocity)
-        velocity = add(velocity, link_velocity)
-    turn_back = scale(-1.0, difference)
+        weighted_turn = scale_vector(link.alpha, turn)
+        difference = add_vectors(difference, weighted_turn)
+        peer_velocity = scale_vector(link.alpha, read_three(link.qd[3:]))
+        ramp_velocity = scale_vector(-link.alpha_rate, turn)
+        link_velocity = add_vectors(peer_velocity, ramp_velocity)
+        velocity = add_vectors(velocity, link_velocity)
+    turn_back = scale_vector(-1.0, difference)
     reference = compose_rotations(turn_back, rotation_vector)
     put_three(s.q_des[3:], reference)
     put_three(s.qd_des[3:], velocity)
@@ -340,8 +349,8 @@ def _update_axis_errors(s: Row) -> None:
         s.e[j] = s.x[j] - s.q_des[j]
         s.ed[j] = s.xd[j] - s.qd_des[j]
     if s.shared == POSE:
-        orientation = rotation_matrix(three(s.x[3:]))
-        reference = rotation_matrix(three(s.q_des[3:]))
+        orientation = rotation_matrix(read_three(s.x[3:]))
+        reference = rotation_matrix(read_three(s.q_des[3:]))
         turn = relative_rotation(orientation, reference)
         put_three(s.e[3:], turn)
     for j in range(s.shared):

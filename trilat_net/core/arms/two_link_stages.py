@@ -15,7 +15,7 @@ from math import inf, isfinite
 from ..step import control
 from ..step.jit import leaf
 from ..step.site_setup import Law
-from ..step.vectors import Array, Pair, Row, Vector, five, pair, put_five, put_pair
+from ..step.vectors import Array, Pair, Row, Vector, put_five, put_pair, read_five, read_pair
 from .exogenous import TorqueSourceRows, TorqueTable, torque_on_arm
 from .two_link_arm import forward_dynamics, inertia, regressor
 
@@ -34,9 +34,9 @@ def update_errors(s: Row) -> None:
         s: State of the site (the process that runs the arm), with q, qd and the reference; the
             results are written into it.
     """
-    q = pair(s.q)
-    qd = pair(s.qd)
-    Lambda = pair(s.Lambda)
+    q = read_pair(s.q)
+    qd = read_pair(s.qd)
+    Lambda = read_pair(s.Lambda)
     e, ed, r = control.control_errors(q=q, qd=qd, q_des=s.q_des, qd_des=s.qd_des, Lambda=Lambda)
     v = (-Lambda[0] * e[0], -Lambda[1] * e[1])
     a = (-Lambda[0] * ed[0], -Lambda[1] * ed[1])
@@ -90,9 +90,15 @@ def update_torque(s: Row) -> None:
     # The limit applies to the sum of all terms, below.
     no_limit = inf
     if s.law == _ADAPTIVE:
-        Y = (five(s.Y[0]), five(s.Y[1]))
+        Y = (read_five(s.Y[0]), read_five(s.Y[1]))
         tau = control.adaptive_torque(
-            Y=Y, theta_hat=five(s.theta_hat), Kp=s.Kp, Kd=s.Kd, r=s.r, ed=s.ed, limit=no_limit
+            Y=Y,
+            theta_hat=read_five(s.theta_hat),
+            Kp=s.Kp,
+            Kd=s.Kd,
+            r=s.r,
+            ed=s.ed,
+            limit=no_limit,
         )
         has_robust_term = s.rho[0] > 0.0 or s.rho[1] > 0.0
         if has_robust_term:
@@ -158,8 +164,8 @@ def update_model(s: Row) -> None:
     """
     put_gravity(s, s.known, s.G)
     if s.needs_model != 0:
-        q = pair(s.q)
-        qd = pair(s.qd)
+        q = read_pair(s.q)
+        qd = read_pair(s.qd)
         M = inertia(s.known, q)
         put_pair(s.M[0], M[0])
         put_pair(s.M[1], M[1])
@@ -201,7 +207,7 @@ def put_source_torque(
         t_s=t_s,
         q=q,
         qd=qd,
-        lengths=pair(s.lengths),
+        lengths=read_pair(s.lengths),
         actors=actors,
         table=table,
         sampled=sampled,
@@ -231,9 +237,9 @@ def update_external_torque(
         actors: Operators and environments, one row for each.
         table: Numerical data of all operators and environments, for example recorded torques.
     """
-    q = pair(s.q)
-    qd = pair(s.qd)
-    lengths = pair(s.lengths)
+    q = read_pair(s.q)
+    qd = read_pair(s.qd)
+    lengths = read_pair(s.lengths)
     held_0, held_1, held_wall_n = torque_on_arm(
         t_s=t_s, q=q, qd=qd, lengths=lengths, actors=actors, table=table, sampled=1
     )
@@ -523,12 +529,12 @@ def advance_arm(
     q, qd = rk4_step(
         t_s=t_s,
         h_s=h_s,
-        q=pair(s.q),
-        qd=pair(s.qd),
-        u=pair(s.u),
-        theta=five(s.theta),
+        q=read_pair(s.q),
+        qd=read_pair(s.qd),
+        u=read_pair(s.u),
+        theta=read_five(s.theta),
         g=s.g,
-        lengths=pair(s.lengths),
+        lengths=read_pair(s.lengths),
         actors=actors,
         table=table,
     )

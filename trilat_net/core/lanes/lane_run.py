@@ -21,9 +21,10 @@ from numba.core.errors import NumbaError
 from numpy.typing import NDArray
 
 from ...records import NS_PER_S, Mode
-from ..step.compiled_run import CompiledRun, RunMemory
+from ..step.compiled_run import CompiledRun
 from ..step.fused_run import NEVER_NS, ReplayedInputs
 from ..step.jit import find_lane_address, is_lane_code_stored, leaf, read_lane_assembly
+from ..step.run_state import RunMemory
 from ..step.site_arrays import SiteArrays
 from ..step.ticks import BUCKETS_PER_S, first_tick_at, tick_ns
 from ..step.vectors import Array, IntArray

@@ -40,7 +40,7 @@ from ..step.kernel import (
 )
 from ..step.site_setup import Law, StaleAction
 from ..step.ticks import BUCKETS_PER_S, tick_ns
-from ..step.vectors import Array, IntArray, Vector, five, pair, put_pair
+from ..step.vectors import Array, IntArray, Vector, put_pair, read_five, read_pair
 from .lane_laws import compute_law
 from .lane_rows import Words, in_lane, number_of, pointer_to, select_row
 
@@ -140,14 +140,14 @@ def _advance_stage(
     return two_link_stages.advance_stage(
         t_s=t_s,
         ahead_s=ahead_s,
-        q=pair(s.q),
-        qd=pair(s.qd),
+        q=read_pair(s.q),
+        qd=read_pair(s.qd),
         qd_before=qd_before,
         qdd_before=qdd_before,
-        u=pair(s.u),
-        theta=five(s.theta),
+        u=read_pair(s.u),
+        theta=read_five(s.theta),
         g=s.g,
-        lengths=pair(s.lengths),
+        lengths=read_pair(s.lengths),
         actors=actors,
         table=table,
     )
@@ -419,12 +419,12 @@ def advance_site(
         stages = in_lane(scratch, lane)[0]
         qdd = two_link_stages.find_stage_acceleration(
             t_s=number_of(t_ns, lane) * 1e-9,
-            q=pair(s.q),
-            qd=pair(s.qd),
-            u=pair(s.u),
-            theta=five(s.theta),
+            q=read_pair(s.q),
+            qd=read_pair(s.qd),
+            u=read_pair(s.u),
+            theta=read_five(s.theta),
             g=s.g,
-            lengths=pair(s.lengths),
+            lengths=read_pair(s.lengths),
             actors=in_lane(actors, lane),
             table=table,
         )
@@ -436,8 +436,8 @@ def advance_site(
             t_s=number_of(t_ns, lane) * 1e-9,
             ahead_s=0.5 * (1.0 / s.rate_hz),
             s=s,
-            qd_before=pair(s.qd),
-            qdd_before=pair(stages.qdd_1),
+            qd_before=read_pair(s.qd),
+            qdd_before=read_pair(stages.qdd_1),
             actors=in_lane(actors, lane),
             table=table,
         )
@@ -450,8 +450,8 @@ def advance_site(
             t_s=number_of(t_ns, lane) * 1e-9,
             ahead_s=0.5 * (1.0 / s.rate_hz),
             s=s,
-            qd_before=pair(stages.qd_2),
-            qdd_before=pair(stages.qdd_2),
+            qd_before=read_pair(stages.qd_2),
+            qdd_before=read_pair(stages.qdd_2),
             actors=in_lane(actors, lane),
             table=table,
         )
@@ -465,21 +465,21 @@ def advance_site(
             t_s=number_of(t_ns, lane) * 1e-9,
             ahead_s=h_s,
             s=s,
-            qd_before=pair(stages.qd_3),
-            qdd_before=pair(stages.qdd_3),
+            qd_before=read_pair(stages.qd_3),
+            qdd_before=read_pair(stages.qdd_3),
             actors=in_lane(actors, lane),
             table=table,
         )
         q, qd = two_link_stages.combine_stages(
             h_s=h_s,
-            q=pair(s.q),
-            qd=pair(s.qd),
-            qd_2=pair(stages.qd_2),
-            qd_3=pair(stages.qd_3),
+            q=read_pair(s.q),
+            qd=read_pair(s.qd),
+            qd_2=read_pair(stages.qd_2),
+            qd_3=read_pair(stages.qd_3),
             qd_4=qd_4,
-            qdd_1=pair(stages.qdd_1),
-            qdd_2=pair(stages.qdd_2),
-            qdd_3=pair(stages.qdd_3),
+            qdd_1=read_pair(stages.qdd_1),
+            qdd_2=read_pair(stages.qdd_2),
+            qdd_3=read_pair(stages.qdd_3),
             qdd_4=qdd_4,
         )
         if s.mode != _DIVERGED:

@@ -29,36 +29,6 @@ from .lane_structure import find_obstacle
 from .run_groups import LEAST_RUNS
 
 
-class LaneEndedError(Exception):
-    """Raised if a run and its displaced copies (twins) can no longer be simulated together.
-
-    The reason is that an arm left its limits, or that a control law failed. The caller then
-    simulates the runs again, one by one.
-    """
-
-
-def suits_twins(
-    run: CompiledRun, runs: int, ticks: Sequence[int], least_site_ticks: int
-) -> bool:
-    """Returns True if a run and its twins are computed faster together than one by one.
-
-    The twins are copies of the run that start slightly displaced. Computing them together, with
-    vector instructions, has two conditions: all features of the scenario are supported; and the
-    compiled code exists, or the runs are so long that compiling it pays off.
-
-    Args:
-        run: The run before its first tick (control period).
-        runs: Number of runs, the twins included.
-        ticks: Number of ticks of each site (arm controller).
-        least_site_ticks: Number of simulated ticks, summed over all sites and runs, from which
-            compiling the code pays off.
-    """
-    if not LEAST_RUNS <= runs <= LANES or find_obstacle(run):
-        return False
-    site_ticks = runs * sum(ticks)
-    return site_ticks >= least_site_ticks or has_lane_code(run)
-
-
 class TwinLanes(LaneRun):
     """A run and slightly displaced copies of it (twins), simulated side by side.
 
@@ -66,12 +36,40 @@ class TwinLanes(LaneRun):
 
     Args:
         run: The run before its first tick (control period). This object does not advance. See
-            `suits_twins`.
+            `suits`.
         count: Number of runs, the twins included.
         ticks: Number of ticks of each site (arm controller) in the whole run.
         feed: Inputs of a recorded run that is repeated.
         kept: Number of records of each site that are kept between two calls of `step_to`.
     """
+
+    class EndedError(Exception):
+        """Error: a run and its displaced copies can no longer be simulated together.
+
+        The reason is that an arm left its limits, or that a control law failed. The caller then
+        simulates the runs again, one by one.
+        """
+
+    @staticmethod
+    def suits(run: CompiledRun, runs: int, ticks: Sequence[int], least_site_ticks: int) -> bool:
+        """Returns True if a run and its twins are computed faster together than one by one.
+
+        The twins are copies of the run that start slightly displaced. Computing them together,
+        with vector instructions, has two conditions: all features of the scenario are
+        supported; and the compiled code exists, or the runs are so long that compiling it pays
+        off.
+
+        Args:
+            run: The run before its first tick (control period).
+            runs: Number of runs, the twins included.
+            ticks: Number of ticks of each site (arm controller).
+            least_site_ticks: Number of simulated ticks, summed over all sites and runs, from
+                which compiling the code pays off.
+        """
+        if not LEAST_RUNS <= runs <= LANES or find_obstacle(run):
+            return False
+        site_ticks = runs * sum(ticks)
+        return site_ticks >= least_site_ticks or has_lane_code(run)
 
     def __init__(
         self,
@@ -113,16 +111,20 @@ class TwinLanes(LaneRun):
             last_ns: Time of the last tick to be executed, ns since the epoch.
 
         Raises:
-            LaneEndedError: An arm left its limits, or a law failed.
+            EndedError: An arm left its limits, or a law failed.
         """
         self._last_ticks = self._ticks.copy()
         ticks = [first_tick_at(last_ns + 1, rate_hz) for rate_hz in self._rates_hz.tolist()]
         try:
             self._step_to(np.minimum(ticks, self._planned_ticks))
         except Exception as error:  # a law may raise any exception
-            raise LaneEndedError from error
+            raise TwinLanes.EndedError from error
         if (self._ended.ticks[: self._count] >= 0).any():
-            raise LaneEndedError
+            raise TwinLanes.EndedError
+
+    def list_runs(self) -> "list[_LaneTwin]":
+        """Returns the run and its twins, the run first."""
+        return [_LaneTwin(self, lane) for lane in range(self._count)]
 
     def _use_samples(self, end: IntArray) -> int:
         """Computes the samples in use in a block of ticks, which are equal for all runs."""
@@ -177,7 +179,7 @@ class TwinLanes(LaneRun):
         return records
 
 
-class LaneTwin:
+class _LaneTwin:
     """A run or a slightly displaced copy of it (twin), simulated side by side with others.
 
     The class has the methods of `CompiledRun` that are needed to measure the growth of the
@@ -195,7 +197,7 @@ class LaneTwin:
         self._lanes = lanes
         self._lane = lane
 
-    def copy_state(self, other: "LaneTwin") -> None:
+    def copy_state(self, other: "_LaneTwin") -> None:
         """Makes this run continue from exactly the same state as another run.
 
         The other run must belong to the same simulation. Both runs then give the same results,
@@ -203,7 +205,7 @@ class LaneTwin:
         """
         self.scale_difference(other, 0.0)
 
-    def scale_difference(self, other: "LaneTwin", factor: float) -> None:
+    def scale_difference(self, other: "_LaneTwin", factor: float) -> None:
         """Multiplies the difference between the states of this run and another run by a factor.
 
         Every floating-point number x of the state becomes x_other + factor (x - x_other), as in
@@ -231,7 +233,7 @@ class LaneTwin:
         field_words = slice(columns.start, columns.start + offsets.shape[1])
         self._lanes._site.view(np.float64)[:, field_words, self._lane] += offsets
 
-    def measure_distance(self, other: "LaneTwin", field: str) -> float:
+    def measure_distance(self, other: "_LaneTwin", field: str) -> float:
         """Returns the largest absolute difference of one field, such as "q", between two runs.
 
         For the fields and units see `CompiledRun.measure_distance`.

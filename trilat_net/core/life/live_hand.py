@@ -25,8 +25,8 @@ Rules:
   back along the line, the overshoot is at most V^2 / (2 a) + V h / 2 at the speed limit V.
 
 Invariant:
-    - `advance_hand` contains all of these rules. Its result depends only on its stored state
-      and on the messages that were received before the control period.
+    - `HandRules.advance` contains all of these rules. Its result depends only on its stored
+      state and on the messages that were received before the control period.
     - The result is stored in the record of each control period. Therefore a log repeats what
       people did without their messages.
 """
@@ -131,6 +131,61 @@ class HandRules(NamedTuple):
     max_goal_norm: float = math.inf
     acceleration_limit: float = math.inf
     reach: "HandReach" = HandReach()
+
+    def start(self) -> "HandStep":
+        """Returns the state in which nobody has moved the arm yet."""
+        return HandStep(HandMemory(), empty_hand_vector(self.size))
+
+    def advance(
+        self,
+        memory: "HandMemory",
+        t_ns: int,
+        commands: Sequence["HandCommand"],
+        locate: Callable[[], Sequence[float]],
+    ) -> "HandStep":
+        """Computes how a person or program pulls the arm in one control period.
+
+        The person or program sends goals. A target moves smoothly to the newest goal, and the
+        arm is pulled to the target. This function moves the target by one period, accepts the
+        messages, ends the hold of a sender that is silent for too long, and chooses the next
+        velocity of the target.
+
+        Args:
+            memory: State after the previous period.
+            t_ns: Nominal time of the period, ns since the start of the session.
+            commands: Messages received since the previous period, in order.
+            locate: Function that returns the present pose of the arm, in the coordinates of the
+                target.
+
+        Returns:
+            The action in this period, and the state for the next period.
+        """
+        refused: list[str] = []
+        changes: list[tuple[int, str]] = []
+        state = _move_target(self, memory) if memory.target else memory
+        for command in commands:
+            state, outcome = _accept_command(
+                rules=self, memory=state, t_ns=t_ns, command=command, locate=locate
+            )
+            if outcome in (TAKEN, RELEASED):
+                changes.append((command.source, outcome))
+            elif outcome:
+                refused.append(outcome)
+
+        silence_ns = t_ns - state.received_ns
+        if state.source and silence_ns > SILENCE_NS:
+            changes.append((state.source, SILENT))
+            # One less, so that the silent holder can take hold again by repeating its number.
+            state = _release(state, state.number - 1)
+
+        if not state.target:
+            return HandStep(state, empty_hand_vector(self.size), tuple(refused), tuple(changes))
+
+        is_held = state.source != 0
+        rate = _find_rate(self, state, t_ns) if is_held else _find_fading_rate(self, state)
+        state = state._replace(rate=rate)
+        vector = [state.grip, float(state.number), float(state.source), *state.target, *rate]
+        return HandStep(state, vector, tuple(refused), tuple(changes))
 
 
 class HandCommand(NamedTuple):
@@ -269,59 +324,6 @@ def empty_hand_vector(size: int) -> list[float]:
     return [0.0, -1.0, 0.0, *[0.0] * (2 * size)]
 
 
-def advance_hand(
-    rules: HandRules,
-    memory: HandMemory,
-    t_ns: int,
-    commands: Sequence[HandCommand],
-    locate: Callable[[], Sequence[float]],
-) -> HandStep:
-    """Computes how a person or program pulls the arm in one control period.
-
-    The person or program sends goals. A target moves smoothly to the newest goal, and the arm
-    is pulled to the target. This function moves the target by one period, accepts the messages,
-    ends the hold of a sender that is silent for too long, and chooses the next velocity of the
-    target.
-
-    Args:
-        rules: Limits of the goals and of the target's motion.
-        memory: State after the previous period.
-        t_ns: Nominal time of the period, ns since the start of the session.
-        commands: Messages received since the previous period, in order.
-        locate: Function that returns the present pose of the arm, in the coordinates of the
-            target.
-
-    Returns:
-        The action in this period, and the state for the next period.
-    """
-    refused: list[str] = []
-    changes: list[tuple[int, str]] = []
-    state = _move_target(rules, memory) if memory.target else memory
-    for command in commands:
-        state, outcome = _accept_command(
-            rules=rules, memory=state, t_ns=t_ns, command=command, locate=locate
-        )
-        if outcome in (TAKEN, RELEASED):
-            changes.append((command.source, outcome))
-        elif outcome:
-            refused.append(outcome)
-
-    silence_ns = t_ns - state.received_ns
-    if state.source and silence_ns > SILENCE_NS:
-        changes.append((state.source, SILENT))
-        # One less, so that the silent holder can take hold again by repeating its number.
-        state = _release(state, state.number - 1)
-
-    if not state.target:
-        return HandStep(state, empty_hand_vector(rules.size), tuple(refused), tuple(changes))
-
-    is_held = state.source != 0
-    rate = _find_rate(rules, state, t_ns) if is_held else _find_fading_rate(rules, state)
-    state = state._replace(rate=rate)
-    vector = [state.grip, float(state.number), float(state.source), *state.target, *rate]
-    return HandStep(state, vector, tuple(refused), tuple(changes))
-
-
 def _move_target(rules: HandRules, memory: HandMemory) -> HandMemory:
     """Returns the state one period later, with the target moved and the grip firmer or weaker.
 
@@ -417,7 +419,8 @@ def glide(
 
     A simulated spring pulls the arm to a target, which moves to the goal of the last message.
     The grip, a factor of the force from 0 to 1, grows initially. The result equals that of
-    `advance_hand`, bit for bit, but one compiled call computes all ticks (control periods).
+    `HandRules.advance`, bit for bit, but one compiled call computes all ticks (control
+    periods).
 
     Args:
         first: The first tick.

@@ -31,7 +31,6 @@ from .live_hand import (
     HandMemory,
     HandRules,
     HandStep,
-    advance_hand,
     glide,
 )
 
@@ -323,7 +322,8 @@ class OwnHand:
             read_angles: Function that returns the joint angles, rad.
 
         Returns:
-            The action in this period and the state for the next period, see `advance_hand`.
+            The action in this period and the state for the next period, see
+            `HandRules.advance`.
         """
         # The commands whose delay has passed, in order.
         commands = []
@@ -333,8 +333,7 @@ class OwnHand:
                 break
             self._due.popleft()
             commands.append(command)
-        step = advance_hand(
-            rules=self._rules,
+        step = self._rules.advance(
             memory=self._memory,
             t_ns=tick_ns(k, self._rules.rate_hz),
             commands=commands,

@@ -15,7 +15,7 @@ Invariant:
 
 from math import inf, isfinite
 
-from ..arms.chain import put_three, scale, three
+from ..arms.chain import put_three, read_three, scale_vector
 from ..arms.rotation import compose_rotations, relative_rotation, rotation_matrix
 from ..arms.task_space import count_linear_coordinates, has_orientation
 from ..step.jit import leaf
@@ -75,9 +75,9 @@ def _limit_turn(site: SiteRow) -> None:
             previous tick. `q_des` and `qd_des`, the new reference and its velocity, are
             limited. `qd_des_limit` contains the limits of the velocity, rad/s.
     """
-    vector_before = three(site.q_followed[3:])
+    vector_before = read_three(site.q_followed[3:])
     orientation_before = rotation_matrix(vector_before)
-    desired_orientation = rotation_matrix(three(site.q_des[3:]))
+    desired_orientation = rotation_matrix(read_three(site.q_des[3:]))
     turn = relative_rotation(desired_orientation, orientation_before)
     # The largest factor with which the turn is within the limits of all three axes.
     factor = 1.0
@@ -87,8 +87,8 @@ def _limit_turn(site: SiteRow) -> None:
         if angle * factor > largest_angle:
             factor = largest_angle / angle
     if factor < 1.0:
-        limited_turn = scale(factor, turn)
-        velocity = scale(factor * site.rate_hz, turn)
+        limited_turn = scale_vector(factor, turn)
+        velocity = scale_vector(factor * site.rate_hz, turn)
         # The previous orientation, followed by the limited turn.
         put_three(site.q_des[3:], compose_rotations(limited_turn, vector_before))
         put_three(site.qd_des[3:], velocity)

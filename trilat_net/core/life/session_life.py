@@ -38,7 +38,7 @@ Invariant:
 
 from math import isfinite
 
-from ..arms.chain import add, put_three, scale, subtract, three
+from ..arms.chain import add_vectors, put_three, read_three, scale_vector, subtract_vectors
 from ..arms.rotation import (
     angular_velocity,
     compose_rotations,
@@ -145,7 +145,7 @@ def _alignment_s(site: SiteRow) -> float:
     for i in range(count_linear_coordinates(site)):
         longest_distance = max(longest_distance, abs(site.q_held[i]))
     if has_orientation(site):
-        angle = length(three(site.q_held[3:]))
+        angle = length(read_three(site.q_held[3:]))
         longest_distance = max(longest_distance, angle)
     needed_s = 1.5 * longest_distance / site.align_speed
     duration_s: float = max(MIN_ALIGN_NS * 1e-9, needed_s)
@@ -182,11 +182,11 @@ def _start_alignment(t_ns: int, site: SiteRow, reason: int, q: Array, qd: Array)
     turn = (0.0, 0.0, 0.0)
     turn_rate = (0.0, 0.0, 0.0)
     if has_orientation(site):
-        site_rotation = rotation_matrix(three(q[3:]))
-        peers_rotation = rotation_matrix(three(site.q_des[3:]))
+        site_rotation = rotation_matrix(read_three(q[3:]))
+        peers_rotation = rotation_matrix(read_three(site.q_des[3:]))
         turn = relative_rotation(site_rotation, peers_rotation)
-        peers_velocity = rotate_by_vector(turn, three(site.qd_des[3:]))
-        turn_velocity = subtract(three(qd[3:]), peers_velocity)
+        peers_velocity = rotate_by_vector(turn, read_three(site.qd_des[3:]))
+        turn_velocity = subtract_vectors(read_three(qd[3:]), peers_velocity)
         turn_rate = rotation_vector_rate(turn, turn_velocity)
 
     is_near = length(turn) <= site.align_limit
@@ -247,8 +247,8 @@ def _extrapolate_reference(site: SiteRow) -> None:
     for i in range(count_linear_coordinates(site)):
         site.q_followed[i] += period_s * site.qd_followed[i]
     if has_orientation(site):
-        turn = scale(period_s, three(site.qd_followed[3:]))
-        orientation = compose_rotations(turn, three(site.q_followed[3:]))
+        turn = scale_vector(period_s, read_three(site.qd_followed[3:]))
+        orientation = compose_rotations(turn, read_three(site.q_followed[3:]))
         put_three(site.q_followed[3:], orientation)
 
 
@@ -516,8 +516,8 @@ def _add_offset(t_ns: int, site: SiteRow) -> None:
         z, z_rate = _find_offset(t_ns, duration_s, site, 5)
         turn = (x, y, z)
         turn_rate = (x_rate, y_rate, z_rate)
-        peers_velocity = rotate_by_vector(turn, three(site.qd_des[3:]))
+        peers_velocity = rotate_by_vector(turn, read_three(site.qd_des[3:]))
         turn_velocity = angular_velocity(turn, turn_rate)
-        orientation = compose_rotations(turn, three(site.q_des[3:]))
+        orientation = compose_rotations(turn, read_three(site.q_des[3:]))
         put_three(site.q_des[3:], orientation)
-        put_three(site.qd_des[3:], add(turn_velocity, peers_velocity))
+        put_three(site.qd_des[3:], add_vectors(turn_velocity, peers_velocity))

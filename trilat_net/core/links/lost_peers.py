@@ -18,7 +18,7 @@ The field `gone` of a link stores the state of the peer. It is 0 while the peer 
 since the start of the session.
 """
 
-from ..arms.chain import add, scale, three
+from ..arms.chain import add_vectors, read_three, scale_vector
 from ..arms.rotation import length, relative_rotation, rotation_matrix
 from ..arms.task_space import count_linear_coordinates, has_orientation
 from ..step.jit import leaf
@@ -103,22 +103,22 @@ def _is_orientation_near(back: int, site: SiteRow, links: RowArray) -> bool:
         links: State of each link, one row per peer, with the pose q of the peer. `gone` is 0
             for a present peer. The weights of the present peers must not all be 0.
     """
-    orientation = rotation_matrix(three(site.x[3:]))
+    orientation = rotation_matrix(read_three(site.x[3:]))
     total = 0.0  # the sum of the weights of the present peers
     sum_of_turns = (0.0, 0.0, 0.0)
     for j in range(links.shape[0]):
         link: LinkRow = links[j]
         is_present = link.gone == 0.0
         if is_present:
-            peer_orientation = rotation_matrix(three(link.q[3:]))
+            peer_orientation = rotation_matrix(read_three(link.q[3:]))
             turn = relative_rotation(orientation, peer_orientation)
-            sum_of_turns = add(sum_of_turns, scale(link.alpha, turn))
+            sum_of_turns = add_vectors(sum_of_turns, scale_vector(link.alpha, turn))
             total += link.alpha
 
     link = links[back]
-    peer_orientation = rotation_matrix(three(link.q[3:]))
+    peer_orientation = rotation_matrix(read_three(link.q[3:]))
     turn = relative_rotation(orientation, peer_orientation)
-    difference = add(turn, scale(-1.0 / total, sum_of_turns))
+    difference = add_vectors(turn, scale_vector(-1.0 / total, sum_of_turns))
     turn_of_reference = length(difference) * link.alpha / (total + link.alpha)
     near: bool = turn_of_reference <= site.align_limit
     return near

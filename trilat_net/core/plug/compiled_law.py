@@ -45,6 +45,7 @@ from .user_law import (
     describe_failure,
     law_name,
     list_remembered,
+    name_memory,
 )
 
 CHECKED: Any = {"_nrt": False, "boundscheck": True}
@@ -619,6 +620,11 @@ class CompiledLaw:
         """
         memory: list[float] = self.row[: self._remembered].tolist()
         return memory
+
+    @property
+    def memory_names(self) -> tuple[str, ...]:
+        """A name for each number of `memory`, as "error[1]"."""
+        return name_memory(self._law)
 
     def restore(self, memory: Sequence[float]) -> None:
         """Restores the control law to its state after a recorded control period.

@@ -65,6 +65,22 @@ class LawRecords(NamedTuple):
     memory: Mapping[str, Array]
     peers: Sequence[PeerRecords]
 
+    def sum_work(self, tau: Array) -> Array:
+        """Returns the work of a joint torque since the start of the run, in each period.
+
+        A torque is constant from each tick (start of a period) to the next. Its work in the
+        period is the torque times the step of the joint angles, summed over the joints.
+
+        Args:
+            tau: Torque held from each tick to the next, shape (K, n), N m.
+
+        Returns:
+            The work at each tick, J, shape (K,). The first number is 0.
+        """
+        angle_steps = np.diff(self.q, axis=0)
+        work_steps: Array = np.einsum("kj,kj->k", tau[:-1], angle_steps)
+        return np.concatenate([[0.0], np.cumsum(work_steps)])
+
 
 class LawEnergies(NamedTuple):
     """Account of the energy that a control law gave, took, stored and dissipated.
@@ -97,21 +113,3 @@ class LawEnergies(NamedTuple):
     observed: Sequence[Array] = ()
     weight: float = 1.0
     gravity: float = 1.0
-
-
-def sum_work(tau: Array, q: Array) -> Array:
-    """Returns the work of the joint torques since the start of a run, in each control period.
-
-    A torque is constant from each tick (start of a period) to the next. Its work in the period
-    is the torque times the step of the joint angles, summed over the joints.
-
-    Args:
-        tau: Torque held from each tick to the next, shape (K, n), N m.
-        q: Joint angles at each tick, shape (K, n), rad.
-
-    Returns:
-        The work at each tick, J, shape (K,). The first number is 0.
-    """
-    angle_steps = np.diff(q, axis=0)
-    work_steps: Array = np.einsum("kj,kj->k", tau[:-1], angle_steps)
-    return np.concatenate([[0.0], np.cumsum(work_steps)])

@@ -23,7 +23,16 @@ from ..step.site_setup import SiteSetup
 from ..step.ticks import tick_ns
 from ..step.vectors import Array, Row, RowArray
 from .law_channel import SentVector
-from .user_law import LawInput, LawVector, PeerView, UserLaw, call_law, read_memory, restore_law
+from .user_law import (
+    LawInput,
+    LawVector,
+    PeerView,
+    UserLaw,
+    call_law,
+    name_memory,
+    read_memory,
+    restore_law,
+)
 
 
 @leaf
@@ -196,6 +205,11 @@ class PlainLaw:
         them.
         """
         return read_memory(self._law)
+
+    @property
+    def memory_names(self) -> tuple[str, ...]:
+        """A name for each number of `memory`, as "error[1]"."""
+        return name_memory(self._law)
 
     def restore(self, memory: Sequence[float]) -> None:
         """Restores the control law to its state after a recorded control period.

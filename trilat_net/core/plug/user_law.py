@@ -397,6 +397,18 @@ def read_memory(law: Any) -> list[float]:
     return numbers
 
 
+def name_memory(law: Any) -> tuple[str, ...]:
+    """Returns a name for each number that a law remembers, as "error[1]" or "memory[1]"."""
+    if callable(getattr(law, "memory", None)):
+        return tuple(f"memory[{n + 1}]" for n in range(len(law.memory())))
+    names = []
+    for attribute in list_remembered(law):
+        value = getattr(law, attribute)
+        numbers = range(1, np.size(value) + 1)
+        names += [f"{attribute}[{number}]" for number in numbers]
+    return tuple(names)
+
+
 def write_memory(law: Any, memory: Sequence[float]) -> None:
     """Gives a control law the numbers that it remembered from earlier control periods.
 

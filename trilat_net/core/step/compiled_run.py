@@ -20,6 +20,7 @@ import numpy as np
 from ...errors import LawFailed
 from ...records import NS_PER_S, Mode
 from ..arms.exogenous import TorqueKind
+from ..links.link_schedule import LinkSchedule
 from ..plug.compiled_law import CompiledLaw, plug_law
 from ..plug.law_view import PlainLaw
 from .fused_run import (
@@ -27,7 +28,6 @@ from .fused_run import (
     PROGRESS_DTYPE,
     LawArrays,
     RecentRecords,
-    ReplayedInputs,
     finish_site,
     max_over_joints,
     run_until,
@@ -35,7 +35,7 @@ from .fused_run import (
     sums_dtype,
 )
 from .run_inputs import RunInputs
-from .run_state import RunState
+from .run_state import RunMemory, RunState
 from .site_arrays import SiteArrays, apply_change
 from .site_setup import SiteSetup
 from .ticks import BUCKETS_PER_S, PlantState, tick_ns
@@ -107,40 +107,6 @@ class RunTotals(NamedTuple):
     walls_j: float | None
 
 
-class RunMemory(NamedTuple):
-    """All arrays of a simulated run, for modules that compute several runs side by side.
-
-    N is the number of sites (processes that run one arm), and P the largest number of peers
-    (other sites) from which a site receives samples (sent states).
-
-    Attributes:
-        tables: Arrays of all sites.
-        progress: Progress of each site, shape (N,), see `ProgressRow`.
-        next_samples: Next sample to accept, for each site and peer, shape (N, P).
-        sent: Latest records (results of control periods) of the sites.
-        peaks: Peaks in intervals of 50 ms, see `run_until`.
-        sums: Sums over the records, shape (N,), see `SumsRow`.
-        settled_rad: Position error below which an arm counts as settled, rad.
-        laws: Gains and memory of compiled laws that are not part of the kernel. None if no site
-            has such a law.
-        compiled_laws: The compiled laws themselves, by the index of their site.
-        has_plain_law: True if a site has a law in plain Python.
-        feed: Inputs of a recorded run.
-    """
-
-    tables: SiteArrays
-    progress: RowArray
-    next_samples: IntArray
-    sent: RecentRecords
-    peaks: Array
-    sums: RowArray
-    settled_rad: float
-    laws: LawArrays | None
-    compiled_laws: Mapping[int, CompiledLaw]
-    has_plain_law: bool
-    feed: ReplayedInputs
-
-
 class CompiledRun:
     """Simulation of several arms, each with its controller (site), in one compiled loop.
 
@@ -197,6 +163,9 @@ class CompiledRun:
         self._tables = SiteArrays.stack(setups, changes, self._inputs.late_ns)
         self.layouts = [setup.layout for setup in setups]
         self.rates_hz = [setup.rate_hz for setup in setups]
+        self._links = [setup.links for setup in setups]
+        # The samples that each site uses in all ticks, computed when they are read.
+        self._used: dict[int, IntArray] = {}
         self._plug_laws(setups)
         self._progress: RowArray = np.zeros(count, PROGRESS_DTYPE)
         self._progress["rate_hz"] = self.rates_hz
@@ -529,12 +498,6 @@ class CompiledRun:
         self.step_to(round(until_s * NS_PER_S))
         self.ran_s = until_s if self.diverged_s is None else self.diverged_s
 
-    @property
-    def ticks(self) -> list[int]:
-        """Number of ticks (control periods) that each site has executed."""
-        ticks: list[int] = self._progress["tick"].tolist()
-        return ticks
-
     def plan(self, ticks: Sequence[int]) -> None:
         """Sets how many ticks each site will execute in total, and allocates memory for them.
 
@@ -854,6 +817,31 @@ class CompiledRun:
         while not self.is_finished:
             self.advance_to(self.find_batch_end())
             yield self.pop_records()
+
+    def read_samples_in_use(self, i: int, count: int) -> IntArray:
+        """Returns which samples a site used in its latest ticks, shape (count, peers).
+
+        A sample is the state that a peer, another site, sent in one of its ticks. The samples
+        follow from the delays of the links alone, so they are computed again and not stored.
+        The run must not repeat a log, because its samples would then arrive as recorded.
+
+        Args:
+            i: Index of the site.
+            count: Number of ticks, at most the number of executed ticks.
+
+        Returns:
+            For each tick of the site, the ticks in which the peers sent the samples. -1 before
+            the first sample of a peer.
+        """
+        stop = int(self._progress[i]["tick"])
+        if i not in self._used or len(self._used[i]) < stop:
+            duration_s = max(self.duration_s, self.ran_s)
+            used = [
+                LinkSchedule(link).draw_run(self.rates_hz[i], duration_s)
+                for link in self._links[i]
+            ]
+            self._used[i] = np.stack(used, axis=1)
+        return self._used[i][stop - count : stop]
 
     @property
     def records(self) -> Array:

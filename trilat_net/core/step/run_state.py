@@ -1,4 +1,4 @@
-"""Copies the state of a simulated run to another, or scales the difference between two runs.
+"""Defines the state of a simulated run, which can be copied to another run.
 
 The growth of a small difference between two runs of the same scenario shows whether the runs
 are stable.
@@ -7,12 +7,50 @@ Invariant:
     - Numbers that are equal in both runs do not change.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from .vectors import Array
+from ..plug.compiled_law import CompiledLaw
+from .fused_run import LawArrays, RecentRecords, ReplayedInputs
+from .site_arrays import SiteArrays
+from .vectors import Array, IntArray, RowArray
+
+
+class RunMemory(NamedTuple):
+    """All arrays of a simulated run, for modules that compute several runs side by side.
+
+    N is the number of sites (processes that run one arm), and P the largest number of peers
+    (other sites) from which a site receives samples (sent states).
+
+    Attributes:
+        tables: Arrays of all sites.
+        progress: Progress of each site, shape (N,), see `ProgressRow`.
+        next_samples: Next sample to accept, for each site and peer, shape (N, P).
+        sent: Latest records (results of control periods) of the sites.
+        peaks: Peaks in intervals of 50 ms, see `run_until`.
+        sums: Sums over the records, shape (N,), see `SumsRow`.
+        settled_rad: Position error below which an arm counts as settled, rad.
+        laws: Gains and memory of compiled laws that are not part of the kernel. None if no site
+            has such a law.
+        compiled_laws: The compiled laws themselves, by the index of their site.
+        has_plain_law: True if a site has a law in plain Python.
+        feed: Inputs of a recorded run.
+    """
+
+    tables: SiteArrays
+    progress: RowArray
+    next_samples: IntArray
+    sent: RecentRecords
+    peaks: Array
+    sums: RowArray
+    settled_rad: float
+    laws: LawArrays | None
+    compiled_laws: Mapping[int, CompiledLaw]
+    has_plain_law: bool
+    feed: ReplayedInputs
 
 
 def mark_floats(dtype: np.dtype[np.generic]) -> NDArray[np.bool_]:

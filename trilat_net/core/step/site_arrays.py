@@ -317,7 +317,7 @@ def needed_pages(setup: SiteSetup) -> int:
     return calendar_pages(setup.rate_hz, longest_us, _NEAR_NS)
 
 
-def links_bytes(setup: SiteSetup, pages: int) -> int:
+def links_bytes(setup: SiteSetup, pages: int | None = None) -> int:
     """Returns the memory that the network links of an arm take, in bytes.
 
     The ring buffers in which delayed messages wait take most of the memory. `CalendarSizer`
@@ -325,8 +325,11 @@ def links_bytes(setup: SiteSetup, pages: int) -> int:
 
     Args:
         setup: Setup of the arm.
-        pages: Number of samples that can wait in the ring buffer of each link.
+        pages: Number of samples that can wait in the ring buffer of each link. By default it is
+            the number that the delays need.
     """
+    if pages is None:
+        pages = needed_pages(setup)
     number_bytes = 8
     law_numbers = 0  # count of values that a user's law receives with each sample
     if setup.law_factory is not None:

@@ -402,7 +402,8 @@ def describe_mode(
     1.250 s: a peer is stale". A peer is stale if no sample has arrived from it for too long.
 
     No reason is given for the modes RETURN and RUN, which follow as soon as samples of all
-    peers arrive, unless the arm returns because a peer was dropped or restored.
+    peers arrive, unless the arm returns because a peer was dropped or restored. The sentence
+    about an arm that left its speed limit (DIVERGED) states the speed.
 
     Args:
         site: Name of the site.
@@ -417,6 +418,10 @@ def describe_mode(
     Returns:
         The sentence.
     """
+    if output.mode is Mode.DIVERGED:
+        speed = max(abs(v) for v in output.qd)
+        t_s = output.t_ns * 1e-9
+        return f"{site} diverged at t = {t_s:.3f} s: a joint moves at {speed:.4g} rad/s"
     if glides:
         reason = find_life_reason(output)
         text = _REASONS.get(reason, "")
@@ -434,15 +439,3 @@ def describe_mode(
         text = ""
     event = f"{site} {_ACTIVITIES[output.mode]} from t = {output.t_ns * 1e-9:.3f} s"
     return f"{event}: {text}" if text else event
-
-
-def describe_divergence(site: str, output: TickRecord) -> str:
-    """Writes the sentence for the log that an arm moved faster than its speed limit.
-
-    Args:
-        site: Name of the process that runs the arm.
-        output: Record of the control period in which this happened.
-    """
-    speed = max(abs(v) for v in output.qd)
-    t_s = output.t_ns * 1e-9
-    return f"{site} diverged at t = {t_s:.3f} s: a joint moves at {speed:.4g} rad/s"

@@ -28,7 +28,7 @@ Vector = Sequence[float] | Any
 
 
 @leaf
-def pair(a: Vector) -> Pair:
+def read_pair(a: Vector) -> Pair:
     """Returns the first two numbers of an array as a tuple.
 
     Compiled code keeps a tuple in registers, whereas a new array would allocate memory in the
@@ -38,7 +38,7 @@ def pair(a: Vector) -> Pair:
 
 
 @leaf
-def five(a: Vector) -> Five:
+def read_five(a: Vector) -> Five:
     """Returns the first five numbers of an array as a tuple.
 
     Compiled code keeps a tuple in registers, whereas a new array would allocate memory in the

@@ -281,7 +281,7 @@ class Ros2SiteChannels:
         }
 
     def _make_error_array(self) -> _ArrayChannel:
-        """Returns the array of the synchronisation error, of a pose or of the joints."""
+        """Returns the array channel of the synchronisation error of the pose or the joints."""
         if self._arm.shares_pose:
             shared = self._arm.counts.shared
             axes = TASK_AXES[:shared]

@@ -1,4 +1,4 @@
-"""Connects this program with ROS 2 programs, by the Zenoh network of the latter.
+"""Connects this program with ROS 2 programs over their Zenoh network.
 
 ROS 2 is the Robot Operating System. `ros2_graph` publishes and subscribes to topics of ROS
 programs, without a ROS installation, and `ros2_names` checks the names of topics.

@@ -34,13 +34,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ...analysis import (
-    build_arm_rows,
-    find_program,
-    find_user_shares,
-    find_users,
-    trace_dominance,
-)
+from ...analysis import DominanceHistory, SharedSlave, build_arm_rows
 from ...core import POSITION, Array
 from ...errors import LogError, UsageError, count_nouns, join_words
 from ...files import import_extra
@@ -246,7 +240,7 @@ def _write(
     _check_choice("environment_state", environment_state, SWITCHES)
     _check_choice("episodes", episodes, EPISODES)
 
-    programs = [program or find_program(log) or NO_PROGRAM for log in logs]
+    programs = [program or SharedSlave(log).program or NO_PROGRAM for log in logs]
     names: Names = {}
     tasks: dict[str, int] = {}
     parts = list[Columns]()
@@ -383,7 +377,7 @@ def _choose_plugin_site(log: Log, settings: _Settings) -> str:
     Raises:
         UsageError: The settings name a user that does not exist.
     """
-    users = find_users(log.scenario)[1]
+    users = SharedSlave(log).users
     program = settings.program if settings.program != NO_PROGRAM else ""
     site = settings.site or program or users[-1]
     if site not in users:
@@ -605,17 +599,19 @@ def _read_columns(
         UsageError: The program or the user of the plugin is not a user, or the plugin cannot
             hold an arm in this scenario.
     """
-    slave, users = find_users(log.scenario)
+    shared_slave = SharedSlave(log)
+    slave = shared_slave.name
+    users = shared_slave.users
     if not slave or not users:
         raise LogError(f"{log.source}: the session must have a slave and at least one master")
 
     slave_records = log[slave]
     slave_rows = rows[slave]
     frame_times_s = slave_records.t_s[slave_rows]
-    dominance = trace_dominance(log, slave, frame_times_s)
+    dominance = DominanceHistory.of_log(log, slave, frame_times_s)
     has_program = settings.program != NO_PROGRAM
     program = settings.program if has_program else ""
-    shared = find_user_shares(log.scenario, dominance.alpha, program)
+    shared = shared_slave.find_shares(dominance.alpha, program)
     # Without a program, the first user leads if no share is larger than the others.
     leader = shared.leader if has_program else shared.shares.argmax(axis=1)
     plugin_site = _choose_plugin_site(log, settings)

@@ -19,7 +19,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ...analysis import trace_dominance
+from ...analysis import DominanceHistory
 from ...log import SCENARIO, Log, McapWriter, collect_provenance
 from ...log.ros2 import (
     DIAGNOSTICS,
@@ -182,7 +182,7 @@ class _SiteBag:
         The first messages also contain the description of the robot.
         """
         records = self._log[self._site]
-        dominance = trace_dominance(self._log, self._site, records.t_s)
+        dominance = DominanceHistory.of_log(self._log, self._site, records.t_s)
         dominance_factors = dominance.alpha.tolist()
         log_ns = records.log_time_ns.tolist()
         publish_ns = records.publish_time_ns.tolist()

@@ -23,15 +23,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from ...analysis import (
-    DelayDistribution,
-    StatedModel,
-    has_one_constant_delay,
-    list_changes,
-    list_stated_models,
-    measure_delay_distributions,
-    recorded_end_s,
-)
+from ...analysis import DelayDistribution, Timeline
 from ...core import Array
 from ...log import Ints, Log
 from .. import style
@@ -55,7 +47,7 @@ _BINS_PER_DECADE = 20
 
 
 @draws("sample_age", "age of the samples in use, per link", in_report=True)
-def draw_sample_age(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
+def _draw_sample_age(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
     """Draws the age of the sample in use on every link over time, in ms.
 
     The age of a sample of a peer's state is the time from its sending until its use. The figure
@@ -67,9 +59,8 @@ def draw_sample_age(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
         form: Width, type sizes and resolution of the figure.
     """
     ages_ms = _read_ages_ms(log)
-    stated_delays = {}
-    for link, models in _list_link_models(log).items():
-        stated_delays[link] = trace_stated_delay(log, models)
+    timeline = Timeline(log)
+    stated_delays = {link: trace_stated_delay(timeline, link) for link in log.scenario.links}
 
     has_bands = False
     with style.time_figure(log, form, 0.6 + 1.05 * len(log.sites)) as plot:
@@ -144,8 +135,8 @@ def has_varying_delay(log: Log) -> bool:
     Returns:
         True if at least one link has more than one constant delay.
     """
-    link_models = _list_link_models(log).values()
-    return not all(has_one_constant_delay(models) for models in link_models)
+    links = Timeline(log).stated_links.values()
+    return not all(link.has_one_constant_delay for link in links)
 
 
 @draws(
@@ -165,7 +156,7 @@ def _draw_delay_distributions(log: Log, form: FigureSize = REPORT_SIZE) -> Figur
         log: Log of the run.
         form: Width, type sizes and resolution of the figure.
     """
-    links = measure_delay_distributions(log)
+    links = DelayDistribution.list_of_log(log)
     x_ms = choose_delay_axis_ms(links)
     with style.styled_figure(form, 0.6 + 1.05 * len(log.sites)) as figure:
         grid, panels = _add_link_panels(figure, log)
@@ -191,12 +182,6 @@ def _draw_delay_distributions(log: Log, form: FigureSize = REPORT_SIZE) -> Figur
         entries = [(f"age, {text}", line) for text, line in _list_sender_entries(log)]
         style.add_legend(figure, [*entries, ("delay of the samples", style.LIMIT_LINE)])
     return figure
-
-
-def _list_link_models(log: Log) -> dict[str, list[StatedModel]]:
-    """Returns the delay models of every link: the initial model, and one after every change."""
-    changes = list_changes(log)
-    return {link: list_stated_models(log, link, changes) for link in log.scenario.links}
 
 
 def choose_delay_axis_ms(links: list[DelayDistribution]) -> Array:
@@ -246,22 +231,23 @@ def compute_cumulative_percent(values: Array, limits: Array) -> Array:
     return 100.0 * counts / len(values)
 
 
-def trace_stated_delay(log: Log, models: list[StatedModel]) -> tuple[Array, Array]:
+def trace_stated_delay(timeline: Timeline, link: str) -> tuple[Array, Array]:
     """Returns the mean delay that the scenario states for a network link, as a line to draw.
 
     Figures draw this line dashed beside the measured delays, which should agree with it.
 
     Args:
-        log: Log of the run.
-        models: Delay models of the link in order of time, at least one. A model applies until
-            the next one replaces it.
+        timeline: What happened in the run. It has the delay models of the link. A model applies
+            until the next one replaces it.
+        link: Name of the link, "j->i".
 
     Returns:
         Times in s, and mean delays in ms, each of shape (3 M,) for M models. Each model has a
         point at its start, a point at its end, and a NaN that interrupts the line.
     """
+    models = timeline.stated_links[link].models
     starts_s = [model.from_s for model in models]
-    last_s = max(recorded_end_s(log), starts_s[-1])
+    last_s = max(timeline.end_s, starts_s[-1])
     ends_s = [*starts_s[1:], last_s]
 
     times_s: list[float] = []

@@ -3,7 +3,7 @@
 A planar arm is drawn in its plane. An arm in space, called a chain, is drawn as seen from one
 fixed direction, in parallel projection. Up in the picture is opposite to gravity.
 
-`draw_arms` returns a Matplotlib figure, and `render_arms_svg` returns SVG for the page. Both
+The figure "arms" is one of Matplotlib, and `render_arms_svg` returns SVG for the page. Both
 draw the same poses, which `find_pose` computes.
 
 Invariant:
@@ -20,7 +20,7 @@ from markupsafe import Markup
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from ...analysis import joint_positions_m, recorded_end_s, site_signals, upright_axes
+from ...analysis import Timeline, joint_positions_m, site_signals, upright_axes
 from ...core import Array
 from ...log import Log
 from ...scenario import ArmModel
@@ -191,7 +191,7 @@ def choose_instants_s(log: Log, count: int = INSTANTS) -> list[float]:
     Returns:
         The times in increasing order, in s.
     """
-    end_s = recorded_end_s(log)
+    end_s = Timeline(log).end_s
     grid_s = np.linspace(0.0, end_s, 1001)
     moved_rad = np.zeros_like(grid_s)
     for site in log.sites:
@@ -292,7 +292,7 @@ def compute_pose_box_m(poses: Sequence[_ArmPose | None]) -> PictureBox:
 
 
 @draws("arms", "the arms at a few instants", in_report=True)
-def draw_arms(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
+def _draw_arms(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
     """Draws the poses of all arms at a few times, with a row per site and a column per time.
 
     A reader sees at one glance how the arms moved, and how closely they followed each other.

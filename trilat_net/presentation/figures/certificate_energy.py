@@ -22,13 +22,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from ...analysis import (
-    Certificate,
-    EnergyBalance,
-    ObservedEnergy,
-    certify_log,
-    find_unjudged_spans,
-)
+from ...analysis import Certificate, EnergyBalance, ObservedEnergy, certify_log
 from ...core import Array
 from ...log import Log
 from .. import style
@@ -105,7 +99,7 @@ def draw_functional(
         for axes in (total_panel, parts_panel, work_panel, residual_panel):
             # The lower panels have a legend in place of the numbers of the changes.
             plot.mark(axes, log.sites, numbered=axes is total_panel)
-            for from_s, to_s in find_unjudged_spans(balance):
+            for from_s, to_s in balance.unjudged_spans:
                 axes.axvspan(from_s, to_s, **_UNJUDGED)
 
         rise = certificate.verdict.rise

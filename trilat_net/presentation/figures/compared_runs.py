@@ -14,7 +14,7 @@ from typing import NamedTuple
 
 from matplotlib.figure import Figure
 
-from ...analysis import recorded_end_s, site_signals
+from ...analysis import Timeline, site_signals
 from ...core import Array
 from ...errors import UsageError, count_nouns
 from ...log import Log, SiteLog
@@ -96,7 +96,7 @@ def draw_compared_runs(
     labels = [f"{signal.name}{gap}of {site} ({unit})" for site in sites]
     row_in = 0.95 if form.narrow else 1.25
     height_in = choose_height_in(first_log, 0.9 + row_in * len(sites))
-    end_s = max(recorded_end_s(log) for log in logs.values())
+    end_s = max(Timeline(log).end_s for log in logs.values())
     lines = [_style_run(number, form) for number in range(len(logs))]
     with style.styled_figure(form, height_in) as figure:
         grid, lowest = add_joint_rows(

@@ -24,13 +24,11 @@ from matplotlib.figure import Figure
 
 from ...analysis import (
     SETTLED_ERROR_RAD,
+    DominanceHistory,
+    Timeline,
+    VirtualWall,
     build_arm_rows,
-    list_changes,
-    list_walls,
     site_signals,
-    trace_dominance,
-    wall_depth,
-    wall_force,
 )
 from ...core import LINK_PARAMETERS, Array
 from ...execution import simulate_without_operators
@@ -132,7 +130,7 @@ def draw_operator_displacement(
 
 
 @draws("control_torques", "torque of the controllers")
-def draw_control_torques(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
+def _draw_control_torques(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
     """Draws the torques that the controllers command at the joints of all arms, in N m.
 
     These torques do not include the torques of operators and walls. If a controller reached its
@@ -252,7 +250,7 @@ def add_joint_rows(
 
 
 @draws("operation", "torque on the arms above their angles", explain_absent_operator)
-def draw_operation(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
+def _draw_operation(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
     """Draws the torques of the operators on the arms, in N m, and the joint angles, in rad.
 
     An operator is the person or program that moves an arm. The torques are above the angles, or
@@ -301,7 +299,7 @@ def choose_height_in(log: Log, two_joints_in: float) -> float:
 
 
 @draws("positions", "actual and desired angles (Fig. 4 of the paper)", in_report=True)
-def draw_positions(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
+def _draw_positions(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
     """Draws the desired and the actual joint angles over time, as Fig. 4 of the paper.
 
     A site is an arm with its controller. Its desired angles are the average of the angles of
@@ -345,7 +343,7 @@ def draw_positions(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
     "errors, and the largest one still to come (Fig. 5 of the paper)",
     in_report=True,
 )
-def draw_tracking_errors(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
+def _draw_tracking_errors(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
     """Draws the tracking errors of every site over time, as Fig. 5 of the paper.
 
     The error is e = q - q_des, the actual minus the desired joint angles. The panel below
@@ -392,7 +390,7 @@ def draw_tracking_errors(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
 
 
 @draws("settling", "size of the errors on a log axis, settling times")
-def draw_settling(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
+def _draw_settling(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
     """Draws the largest error of any joint of every site over time, on a logarithmic axis.
 
     A triangle marks the time at which a site settles, and the legend states this time.
@@ -462,7 +460,7 @@ def _has_changing_estimates(log: Log) -> bool:
     unless(_has_changing_estimates, "no estimate changed in this run"),
     in_report=True,
 )
-def draw_parameter_estimates(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
+def _draw_parameter_estimates(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
     """Draws the estimates of the arms' inertial parameters over time, with the true values.
 
     Adaptive control laws estimate these parameters while the arm moves. The figure shows the
@@ -579,7 +577,7 @@ def _draw_estimate(
 
 
 @draws("phase", "errors against their rates")
-def draw_phase_portrait(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
+def _draw_phase_portrait(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
     """Draws the tracking errors of each joint against their rates of change (phase portrait).
 
     Each joint has a panel. The horizontal axis shows the error q - q_des, the actual minus the
@@ -636,7 +634,7 @@ def _has_only_chains(log: Log) -> bool:
     unless(_has_only_chains, "its arms are planar"),
     in_report=True,
 )
-def draw_end_effector_paths(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
+def _draw_end_effector_paths(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
     """Draws the paths of the end effectors of arms in space, projected onto three planes, in m.
 
     All sites share the coordinate frame. If the sites exchange poses of their end effectors
@@ -722,7 +720,7 @@ def list_sites_with_changing_dominance(log: Log) -> list[str]:
     Args:
         log: Log of the run.
     """
-    changed_sites = {changed.change.dominance for changed in list_changes(log)}
+    changed_sites = {changed.change.dominance for changed in Timeline(log).changes}
     return [site for site in log.sites if site in changed_sites]
 
 
@@ -731,7 +729,7 @@ def list_sites_with_changing_dominance(log: Log) -> list[str]:
     "shares that change, and the motion of the arms",
     unless(list_sites_with_changing_dominance, "the shares of all sites are constant"),
 )
-def draw_authority(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
+def _draw_authority(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
     """Draws how the authority over the arms changes during a run, and how the arms move.
 
     The upper panels show the dominance factors: the weights with which a site follows each of
@@ -753,7 +751,7 @@ def draw_authority(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
         share_panels = panels[: len(changing_sites)]
         joint_panels = panels[len(changing_sites) :]
         for site, axes in zip(changing_sites, share_panels, strict=True):
-            factors = trace_dominance(log, site, log[site].t_s).alpha
+            factors = DominanceHistory.of_log(log, site, log[site].t_s).alpha
             for peer, factor in zip(log.scenario.peers(site), factors.T, strict=True):
                 plot.trace(axes, site, factor, **style.site_line(log, peer))
             axes.set(ylim=(-0.05, 1.05), ylabel=f"share in {site} (1)")
@@ -781,7 +779,7 @@ def _list_sites_with_walls(log: Log) -> list[str]:
     Args:
         log: Log of the run.
     """
-    return [site for site in log.sites if list_walls(log.scenario.sites[site])]
+    return [site for site in log.sites if VirtualWall.list_of_site(log.scenario.sites[site])]
 
 
 @draws(
@@ -789,7 +787,7 @@ def _list_sites_with_walls(log: Log) -> list[str]:
     "force of the walls, and depth in them",
     unless(_list_sites_with_walls, "no site has a wall in this run"),
 )
-def draw_contact(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
+def _draw_contact(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
     """Draws the force and the depth of the contact between the arms and the virtual walls.
 
     The panels show the normal force of every wall, in N, and the depth to which the end
@@ -806,10 +804,11 @@ def draw_contact(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
             records = log[site]
             arm_rows = build_arm_rows(log.scenario, site)
             end_effector = arm_rows.place_end_effector(records.q, records.qd)
-            for wall_number, wall in enumerate(list_walls(log.scenario.sites[site])):
+            walls = VirtualWall.list_of_site(log.scenario.sites[site])
+            for wall_number, wall in enumerate(walls):
                 dashes = style.DASHES[wall_number % len(style.DASHES)]
-                force_n = wall_force(wall, records.t_s, end_effector)
-                depth_mm = 1e3 * np.maximum(wall_depth(wall, end_effector), 0.0)
+                force_n = wall.find_force(records.t_s, end_effector)
+                depth_mm = 1e3 * np.maximum(wall.find_depth(end_effector), 0.0)
                 plot.trace(force_panel, site, force_n, 1.1, linestyle=dashes)
                 plot.trace(depth_panel, site, depth_mm, 1.1, linestyle=dashes)
 

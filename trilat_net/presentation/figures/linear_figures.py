@@ -16,7 +16,7 @@ Invariant:
     - Frequencies at which a criterion of passivity or stability fails are shaded.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -25,14 +25,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import MultipleLocator
 
-from ...analysis import (
-    MAX_COMMON_DELAY_S,
-    LinearAnalysis,
-    Minima,
-    PortAnalysis,
-    Spectrum,
-    Transparency,
-)
+from ...analysis import MAX_COMMON_DELAY_S, LinearAnalysis, PortAnalysis
 from ...core import Array
 from .. import style
 from ..appearance import COLUMN_IN, REPORT_SIZE, SITE_COLOURS, FigureSize, list_site_colours
@@ -77,14 +70,13 @@ def draw_port_impedance(ports: PortAnalysis, size: FigureSize = REPORT_SIZE) -> 
             row, column = divmod(index, columns)
             magnitude = grid[2 * row, column]
             phase = grid[2 * row + 1, column]
-            responses = [response for response in ports.transparency if response.joint == joint]
-            _plot_impedance(ports, responses, magnitude, phase)
+            _plot_impedance(ports, joint, magnitude, phase)
 
             title = ports.name_port(joint)
             if is_crowded:
                 phase.set_xticks(_CROWDED_TICKS_HZ)
             else:
-                title += _describe_ratios(responses)
+                title += _describe_ratios(ports, joint)
             magnitude.set_title(title)
             is_lowest_in_column = index + columns >= len(joints)
             if is_lowest_in_column:
@@ -123,19 +115,18 @@ def _list_impedance_entries(ports: PortAnalysis) -> list[tuple[str, dict[str, An
     return entries
 
 
-def _plot_impedance(
-    ports: PortAnalysis, responses: Sequence[Transparency], magnitude: Axes, phase: Axes
-) -> None:
+def _plot_impedance(ports: PortAnalysis, joint: int, magnitude: Axes, phase: Axes) -> None:
     """Draws the impedance that each operator feels along one joint, over frequency.
 
     Each arm has two lines: the impedance while another arm is free, and while it is clamped.
 
     Args:
         ports: Analysis of the ports, the places at which operators hold the arms.
-        responses: Impedances of the joint, at least one.
+        joint: Index of the joint or axis.
         magnitude: Panel of the magnitude.
         phase: Panel of the phase.
     """
+    responses = [response for response in ports.transparency if response.joint == joint]
     for number, response in enumerate(responses):
         frequency_hz = _convert_to_hz(response.w_rad_s)
         width = 1.1
@@ -157,9 +148,13 @@ def _plot_impedance(
         axes.set_xlim(frequency_hz[0], frequency_hz[-1])
 
 
-def _describe_ratios(responses: Sequence[Transparency]) -> str:
+def _describe_ratios(ports: PortAnalysis, joint: int) -> str:
     """Returns a line of a title with each site's ratio of clamped to free impedance, in dB."""
-    ratios = [f"{response.operator_site} {response.ratio_db:+.1f} dB" for response in responses]
+    ratios = [
+        f"{response.operator_site} {response.ratio_db:+.1f} dB"
+        for response in ports.transparency
+        if response.joint == joint
+    ]
     text = f"\nclamped / free {', '.join(ratios)}"
     return text.replace("-", "\N{MINUS SIGN}")
 
@@ -231,14 +226,14 @@ def _style_joint(joint: int) -> dict[str, Any]:
     }
 
 
-def _plot_over_hz(axes: Axes, minima: Minima, values: Array, **options: Any) -> None:
-    """Draws values, shape (F,), over the frequencies of `minima`."""
-    axes.semilogx(_convert_to_hz(minima.w_rad_s), values, **options)
+def _plot_over_hz(axes: Axes, w_rad_s: Array, values: Array, **options: Any) -> None:
+    """Draws values over angular frequencies, both of shape (F,), on an axis in Hz."""
+    axes.semilogx(_convert_to_hz(w_rad_s), values, **options)
 
 
-def _shade_failures(axes: Axes, minima: Minima) -> None:
-    """Shades the bands of frequency in which a curve lies below its limit."""
-    for band in minima.below:
+def _shade_failures(axes: Axes, bands: Iterable[tuple[float, float]]) -> None:
+    """Shades the bands of frequency, in Hz, in which a curve lies below its limit."""
+    for band in bands:
         axes.axvspan(*band, **_FAILS)
 
 
@@ -254,9 +249,10 @@ def _plot_eigenvalues(ports: PortAnalysis, axes: Axes) -> None:
         curves.append((ports.proof, _PROOF))
     curves.append((ports.velocity, _ALL))
     for passivity, line_style in curves:
-        relative = passivity.minima.values / (2.0 * passivity.size)
-        _plot_over_hz(axes, passivity.minima, relative, **line_style)
-    _shade_failures(axes, ports.velocity.minima)
+        minima = passivity.minima
+        relative = minima.values / (2.0 * passivity.size)
+        _plot_over_hz(axes, minima.w_rad_s, relative, **line_style)
+    _shade_failures(axes, ports.velocity.minima.below)
     axes.axhline(0.0, **style.LIMIT_LINE)
     axes.set(ylim=(-1.08, 1.08), ylabel=r"$\lambda_{\min}(Y+Y^{\mathrm{H}})\,/\,2\|Y\|$")
 
@@ -265,16 +261,18 @@ def _plot_parameters(ports: PortAnalysis, axes: Axes) -> None:
     """Draws Llewellyn's parameter of every joint, with the limit 1."""
     for two_port in ports.two_ports:
         line = _style_joint(two_port.joint)
-        _plot_over_hz(axes, two_port.minima, two_port.minima.values, **line)
-        _shade_failures(axes, two_port.minima)
+        minima = two_port.minima
+        _plot_over_hz(axes, minima.w_rad_s, minima.values, **line)
+        _shade_failures(axes, minima.below)
     axes.axhline(1.0, **style.LIMIT_LINE)
     axes.set(ylim=(-1.2, _MAX_SHOWN_PARAMETER), ylabel="Llewellyn's parameter")
 
 
 def _plot_margin(ports: PortAnalysis, axes: Axes) -> None:
     """Draws the smallest eigenvalue under the best weights, with the limit 0."""
-    _plot_over_hz(axes, ports.absolute, ports.absolute.values, **_ALL)
-    _shade_failures(axes, ports.absolute)
+    minima = ports.absolute
+    _plot_over_hz(axes, minima.w_rad_s, minima.values, **_ALL)
+    _shade_failures(axes, minima.below)
     axes.axhline(0.0, **style.LIMIT_LINE)
     axes.set_ylabel("margin, best weights")
 
@@ -298,7 +296,7 @@ def draw_root_map(analysis: LinearAnalysis) -> Figure:
         axes = figure.add_subplot()
         _plot_roots(
             axes=axes,
-            spectrum=analysis.continuous,
+            roots=[root.s for root in analysis.continuous.roots],
             mark="o",
             colour=SITE_COLOURS[0],
             label="continuous",
@@ -306,7 +304,7 @@ def draw_root_map(analysis: LinearAnalysis) -> Figure:
         if analysis.sampled is not None:
             _plot_roots(
                 axes=axes,
-                spectrum=analysis.sampled,
+                roots=[root.s for root in analysis.sampled.roots],
                 mark="x",
                 colour=SITE_COLOURS[1],
                 label="as computed",
@@ -334,20 +332,21 @@ def draw_root_map(analysis: LinearAnalysis) -> Figure:
     return figure
 
 
-def _plot_roots(axes: Axes, spectrum: Spectrum, mark: str, colour: str, label: str) -> None:
+def _plot_roots(
+    axes: Axes, roots: Sequence[complex], mark: str, colour: str, label: str
+) -> None:
     """Draws characteristic roots of a linear system in the complex plane.
 
-    The system is unstable if any root has a positive real part. The spectrum lists only one
-    root of each complex pair, and its conjugate is drawn too.
+    The system is unstable if any root has a positive real part. The conjugate of each complex
+    root is drawn too.
 
     Args:
         axes: Panel of the figure, as Matplotlib axes.
-        spectrum: The roots. Each complex pair is listed once.
+        roots: The roots, of which each complex pair is listed once.
         mark: Marker of Matplotlib.
         colour: Colour of the markers.
         label: Text in the legend.
     """
-    roots = [root.s for root in spectrum.roots]
     conjugates = [root.conjugate() for root in roots if root.imag]
     all_roots = np.array([*roots, *conjugates])
     axes.plot(

@@ -19,9 +19,9 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from ...analysis import (
+    Timeline,
     certify_run,
     largest_magnitude,
-    recorded_end_s,
     settling_time_of_all_s,
     site_signals,
 )
@@ -164,7 +164,7 @@ def draw_overlay(logs: Mapping[str, Log], form: FigureSize = REPORT_SIZE) -> Fig
         first_log = next(iter(logs.values()))
         panels = _add_panels(figure, first_log, form)
         line_styles = {name: _style_run(number) for number, name in enumerate(logs)}
-        end_s = max(recorded_end_s(log) for log in logs.values())
+        end_s = max(Timeline(log).end_s for log in logs.values())
         for panel, axes in zip(_PANELS, panels, strict=True):
             envelopes = {name: _compute_envelope(panel, log) for name, log in logs.items()}
             _scale_axis(axes, panel, [values for _, values in envelopes.values()])
@@ -223,7 +223,7 @@ def _compute_envelope(panel: _Panel, log: Log) -> tuple[Array, Array]:
     # Spans are so long that each has at least two records of every site on average.
     record_counts = [len(log[site]) for site in log.sites]
     span_count = max(1, min(_MAX_SPANS, min(record_counts) // 2))
-    edges_s = np.linspace(0.0, recorded_end_s(log), span_count + 1)
+    edges_s = np.linspace(0.0, Timeline(log).end_s, span_count + 1)
     largest = np.full(span_count, np.nan)
     for site in log.sites:
         last_edges = np.searchsorted(edges_s, log[site].t_s, side="right") - 1

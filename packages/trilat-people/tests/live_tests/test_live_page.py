@@ -37,10 +37,7 @@ from tests.net.local_bus import LocalNetwork
 from tests.net.waiting import until
 from tests.page.whole_pages import watched_page
 from trilat_net.analysis.arm_rows import joint_positions_m
-from trilat_net.analysis.certificate.energy_balance import (
-    compute_energy_balance,
-    compute_site_energies,
-)
+from trilat_net.analysis.certificate.energy_balance import EnergyBalance, SiteEnergy
 from trilat_net.log.log_reader import Log, open_log
 from trilat_net.net.clock import SystemClock
 from trilat_net.scenario import load_scenario
@@ -57,7 +54,7 @@ def start_live(stage: Stage, scenario: str, *options: str) -> Process:
 
 def assert_energies_match(log: Log, energies: list[list[float]]) -> None:
     """Asserts that the energies on the page are those of `certify` at the same times."""
-    balance = compute_energy_balance(compute_site_energies(log))
+    balance = EnergyBalance.of_energies(SiteEnergy.by_site(log))
     t_s, V, supplied = np.array(energies).T
     rows = np.searchsorted(balance.t_s, t_s - 1e-9)
     is_recorded = rows < len(balance.t_s)

@@ -26,7 +26,6 @@ from trilat_net.analysis import (
     AlignedRecords,
     EndEffectorRows,
     TorqueSplit,
-    align_records,
     build_arm_rows,
     sample_ages_ns,
 )
@@ -368,7 +367,7 @@ class ExperimentTrial:
         mean age of the first user's samples (sent states) at the slave.
         """
         measures = self._measure_motion(log, outcome.ended_s)
-        aligned = align_records(log)
+        aligned = AlignedRecords.by_site(log)
         users = self.protocol.users
 
         # Force and work of each user.

@@ -30,14 +30,14 @@ from trilat_net.analysis import (
     BodyTurns,
     EndEffectorRows,
     TorqueSplit,
+    VirtualWall,
     build_arm_rows,
     joint_positions_m,
-    list_walls,
     upright_axes,
-    wall_force,
 )
 from trilat_net.core import Array, HandInForce, LifeAlarm
 from trilat_net.net import Event
+from trilat_net.presentation import describe_energy_obstacle
 from trilat_net.records import NS_PER_S
 from trilat_net.scenario import Scenario, describe_event
 
@@ -80,7 +80,7 @@ class _ArmFrames:
         self._site = site
         self._model = scenario.arms[site]
         self._spec = scenario.sites[site]
-        self._walls = list_walls(self._spec)
+        self._walls = VirtualWall.list_of_site(self._spec)
         self._hand = self._spec.find_live_hand()
         limits_nm = np.asarray(self._spec.limits.tau_limit_nm, dtype=np.float64)
         joint_count = self._model.counts.joints
@@ -113,8 +113,8 @@ class _ArmFrames:
         body_sizes_m = self._scenario.bodies_m(self._site).values()
         walls: list[Json] = []
         for wall in self._walls:
-            point_m = list(wall.a)
-            normal = list(wall.b)
+            point_m = list(wall.source.a)
+            normal = list(wall.source.b)
             walls.append({"at": point_m, "normal": normal})
 
         return {
@@ -358,9 +358,8 @@ class _ArmFrames:
         """
         total = np.zeros_like(split.end_effector.position)
         for wall in self._walls:
-            size_n = wall_force(wall, records.nominal_s, split.end_effector)
-            normal = np.array(wall.b)
-            total = total + size_n[:, np.newaxis] * normal
+            size_n = wall.find_force(records.nominal_s, split.end_effector)
+            total = total + size_n[:, np.newaxis] * wall.normal
         return total
 
 
@@ -495,7 +494,7 @@ class SessionFrames:
 
         energy_problem = ""
         if view.energy is not None:
-            energy_problem = view.energy.reason
+            energy_problem = describe_energy_obstacle(view.energy)
         silence_s = 0.0
         if not view.ended:
             silence_s = round(view.session_silence_s, 1)
@@ -531,7 +530,10 @@ class SessionFrames:
         There is a value for each complete control period. At most one value per
         `ENERGY_PERIOD_S` becomes a point.
         """
-        new_energies = self._view.advance_energy()
+        energy = self._view.energy
+        if energy is None:
+            return
+        new_energies = energy.compute_next(self._view.complete_ticks)
         if new_energies is None:
             return
 

@@ -26,7 +26,7 @@ from typing import Generic, TypeVar
 import msgspec
 
 from recorder import AWAY_NS, GapRepair, InboundQueue, SiteReception
-from trilat_net.analysis import KEPT_S, EnergyCourse, RecordWindow, RunningEnergy
+from trilat_net.analysis import KEPT_S, RecordWindow, RunningEnergy
 from trilat_net.core import TAKEN, LifeAlarm
 from trilat_net.errors import ScenarioError, WireError
 from trilat_net.net import (
@@ -414,20 +414,13 @@ class SessionView:
                 self._tokens.discard(key)
                 self._left_ns = None if self._tokens else now_ns
 
-    def advance_energy(self) -> EnergyCourse | None:
-        """Computes the energy of the session at the new ticks, to check stability.
+    @property
+    def complete_ticks(self) -> dict[str, int]:
+        """For every site, the last tick up to which no record is missing.
 
-        The energy function V of the stability proof must not rise by more than people and walls
-        supply. A tick is a period of the control loop. It is new if, since the last call, the
-        records of all sites have arrived for it.
-
-        Returns:
-            V and the supplied energy over time, in J. `None` if there is no new tick.
+        A tick is a period of the control loop.
         """
-        if self.energy is None:
-            return None
-        complete = {name: site.complete for name, site in self.sites.items()}
-        return self.energy.compute_next(complete)
+        return {name: site.complete for name, site in self.sites.items()}
 
     def find_peer_ticks(
         self, site: str, tick: int, used: Mapping[str, int]
@@ -490,10 +483,9 @@ class SessionView:
         Args:
             scenario: Scenario of the session. All of its sites must have replied and run.
         """
-        windows = {name: RecordWindow(scenario, name) for name in scenario.names}
         self.links = LinkTables(scenario.links, scenario.timeline)
         self.dominance = {site: dict(scenario.dominance[site]) for site in scenario.names}
-        self.energy = RunningEnergy(scenario, windows)
+        self.energy = RunningEnergy(scenario)
         for name in scenario.names:
             self.sites[name] = SiteView(
                 bus=self.bus,
@@ -501,7 +493,7 @@ class SessionView:
                 scenario=scenario,
                 name=name,
                 boot=self.members[name].boot,
-                window=windows[name],
+                window=self.energy.windows[name],
             )
 
     def _receive(self, key: str, block: bytes, mono_ns: int) -> None:

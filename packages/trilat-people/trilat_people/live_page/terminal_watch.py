@@ -18,6 +18,7 @@ from trilat_net.app import SessionDisplay, StatusRow
 from trilat_net.core import LifeAlarm
 from trilat_net.errors import SessionError
 from trilat_net.net import Bus, Clock, Connection, connect_to_session
+from trilat_net.presentation import describe_energy_obstacle
 from trilat_net.records import NS_PER_S
 from trilat_net.scenario import embedded_names_reader
 from trilat_net.signals import Interrupt
@@ -130,7 +131,10 @@ class SessionWatch:
             # This call only serves to raise an error if there is no such site.
             view.scenario.find_site(self._as_site)
 
-        course = view.advance_energy()  # energies at the new ticks, None without new ticks
+        energy = view.energy
+        if energy is None:
+            return
+        course = energy.compute_next(view.complete_ticks)
         if course is not None:
             self._energy_text = (
                 f"V = {course.V[-1]:.4g} J at {course.t_s[-1]:.1f} s, "
@@ -138,9 +142,9 @@ class SessionWatch:
             )
             return
 
-        energy = view.energy
-        if energy is not None and energy.reason:
-            self._energy_text = f"no V: {energy.reason}"
+        obstacle = describe_energy_obstacle(energy)
+        if obstacle:
+            self._energy_text = f"no V: {obstacle}"
 
     @property
     def title(self) -> str:

@@ -43,7 +43,7 @@ from tests.net.local_bus import LocalNetwork
 from tests.net.manual_clock import ManualClock
 from tests.net.waiting import drained, until
 from tests.scenario.builders import posed_task_text
-from trilat_net.analysis.dominance_history import evaluate_ramps, list_scripted_ramps
+from trilat_net.analysis.dominance_history import DominancePlan
 from trilat_net.app.running_session import ShareHistory
 from trilat_net.core.step.ticks import Mode, TickRecord
 from trilat_net.errors import RunFailed, UsageError
@@ -444,8 +444,9 @@ def test_shares_are_those_that_the_certificate_sees(
         ramps.append(scenario.ramp("s", to, round(at_s * 1e9), ramp_s))
     if len({ramp.start_ns for ramp in ramps}) == len(ramps):
         t_s = np.arange(100) / 10.0
-        first, scripted = list_scripted_ramps(scenario, "s")
-        planned = evaluate_ramps(first, [*scripted, *ramps], t_s, 0.0).alpha
+        plan = DominancePlan.of_scenario(scenario, "s")
+        plan.ramps.extend(ramps)
+        planned = plan.evaluate(t_s).alpha
         np.testing.assert_allclose(
             [history.advance_to(round(t * 1e9)) for t in t_s], planned, atol=1e-9
         )

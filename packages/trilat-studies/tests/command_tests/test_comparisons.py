@@ -10,7 +10,8 @@ from study_builders import TRIO
 import trilat_net as tn
 from tests.cli.running import trilat
 from tests.json_outline import is_documented
-from trilat_net.analysis.metrics.measures import Metric, quantities
+from trilat_net.analysis.metrics.log_metrics import LogMetrics
+from trilat_net.analysis.metrics.measures import Metric
 
 
 @pytest.fixture(scope="module")
@@ -176,8 +177,8 @@ def test_metrics_of_every_unit_are_ranked() -> None:
     """The short text of any two values of any metric has a conclusion."""
     log = tn.simulate("two_sites", duration_s=0.2)
     comparison = tn.compare(log, log)
-    assert {"J", "rad", "N m"} < {quantity.unit for quantity in quantities()}
-    for quantity in quantities():
+    assert {"J", "rad", "N m"} < {quantity.unit for quantity in LogMetrics.list_quantities()}
+    for quantity in LogMetrics.list_quantities():
         row = comparison.metrics.rows[0]._replace(
             quantity=quantity, entries=(Metric(0.0), Metric(1e6))
         )

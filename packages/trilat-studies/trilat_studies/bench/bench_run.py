@@ -34,16 +34,15 @@ import numpy as np
 from trilat_net.analysis import (
     SETTLED_ERROR_RAD,
     THROWN_RAD,
+    DominancePlan,
     EndBehaviour,
     RunEnd,
     Stability,
     TwinGrowth,
+    VirtualWall,
     build_arm_rows,
     decision_facts,
     judge_virtual_run,
-    list_walls,
-    plan_dominance,
-    wall_force,
 )
 from trilat_net.core import Array
 from trilat_net.errors import CodeFailed, UsageError
@@ -392,7 +391,8 @@ def _measure(run: BenchRun, judged: JudgedRun, duration_s: float) -> BenchRun:
 
         tip = arm.place_end_effector(record.q, record.qd)
         t_s = record.t_ns / NS_PER_S
-        wall_forces += [wall_force(wall, t_s, tip) for wall in list_walls(spec)]
+        walls = VirtualWall.list_of_site(spec)
+        wall_forces += [wall.find_force(t_s, tip) for wall in walls]
 
     # There are no maxima if the task has no wall.
     peaks_n = [float(force.max()) for force in wall_forces]
@@ -553,8 +553,8 @@ def _find_contact_s(scenario: Scenario, records: dict[str, RecordBatch]) -> floa
     tip = build_arm_rows(scenario, SLAVE).place_end_effector(record.q, record.qd)
     t_s = record.t_ns / NS_PER_S
     contact_times_s = []
-    for wall in list_walls(scenario.sites[SLAVE]):
-        touching = np.flatnonzero(wall_force(wall, t_s, tip) > 0.0)
+    for wall in VirtualWall.list_of_site(scenario.sites[SLAVE]):
+        touching = np.flatnonzero(wall.find_force(t_s, tip) > 0.0)
         if len(touching):
             contact_times_s.append(float(t_s[touching[0]]))
     return min(contact_times_s, default=None)
@@ -803,7 +803,7 @@ def _measure_error_rad(scenario: Scenario, records: dict[str, RecordBatch]) -> f
     """
     slave = records[SLAVE]
     t_s = slave.t_ns / NS_PER_S
-    alpha = plan_dominance(scenario, SLAVE, t_s)
+    alpha = DominancePlan.of_scenario(scenario, SLAVE).evaluate(t_s).alpha
     reference: Array = np.zeros_like(slave.q)
     for index, peer in enumerate(scenario.peers(SLAVE)):
         weight = alpha[:, index, None]

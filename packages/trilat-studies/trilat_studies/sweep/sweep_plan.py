@@ -24,7 +24,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from trilat_net.analysis import find_quantity
+from trilat_net.analysis import LogMetrics
 from trilat_net.errors import ScenarioError, UsageError, count_nouns, suggest_nearest
 from trilat_net.fields import split_unit
 from trilat_net.own_code import allow_own_code, name_law_classes
@@ -661,7 +661,7 @@ def _list_metrics(names: Sequence[str]) -> tuple[str, ...]:
     """
     keys = [names] if isinstance(names, str) else names
     try:
-        return tuple(dict.fromkeys(find_quantity(key).key for key in keys))
+        return tuple(dict.fromkeys(LogMetrics.find_quantity(key).key for key in keys))
     except KeyError as error:
         raise UsageError(f"--metric: {error.args[0]}") from None
 

@@ -25,7 +25,7 @@ from typing import Any, NamedTuple
 
 import msgspec
 
-from trilat_net.analysis import find_quantity
+from trilat_net.analysis import LogMetrics
 from trilat_net.errors import ScenarioError, UsageError, count_nouns
 from trilat_net.files import write_whole
 from trilat_net.results import Result
@@ -561,7 +561,7 @@ def _list_quantities(plan: SweepPlan) -> dict[str, tuple[str, str]]:
         plan: The sweep, whose requested metrics come first.
     """
     quantities = {}
-    for metric in map(find_quantity, plan.metrics):
+    for metric in map(LogMetrics.find_quantity, plan.metrics):
         quantities[metric.key] = (metric.name, metric.unit)
     return quantities | _TOTALS
 

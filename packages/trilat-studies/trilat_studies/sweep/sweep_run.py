@@ -25,7 +25,7 @@ from typing import Any, NamedTuple
 
 import msgspec
 
-from trilat_net.analysis import measure_run
+from trilat_net.analysis import LogMetrics
 from trilat_net.errors import (
     CodeFailed,
     CodeWithheld,
@@ -492,7 +492,7 @@ def _complete_run(task: CellItem, scenario: Scenario, outcome: CellResult) -> Ce
     metrics: dict[str, float | None] = {}
     log_metrics = [key for key in plan.metrics if key not in CellResult.__struct_fields__]
     if log_metrics:
-        measured = measure_run(simulate_scenario(scenario), log_metrics)
+        measured = LogMetrics.measure_run(simulate_scenario(scenario), log_metrics)
         metrics = {key: measured[key].value for key in log_metrics}
 
     laws = dict.fromkeys(site.law_name for site in scenario.sites.values())

@@ -43,15 +43,15 @@ import numpy as np
 
 from trilat_net.analysis import (
     SETTLED_ERROR_RAD,
+    DominancePlan,
     EndBehaviour,
     RunEnd,
+    SourceRows,
     Stability,
     build_arm_rows,
-    compute_target_motion,
     find_closed_groups,
     find_hanging_sites,
     left_perron_vector,
-    plan_dominance,
 )
 from trilat_net.core import Array
 from trilat_net.errors import CodeFailed, ScenarioError
@@ -232,7 +232,7 @@ def _list_springs(scenario: Scenario, t_s: Array) -> Iterator[_SpringHistory]:
             if not isinstance(hand, JointSpring):
                 continue
             acts = (t_s >= hand.start_s) & (t_s < hand.end_s)
-            target_rad, _ = compute_target_motion(hand.actor, t_s)
+            target_rad, _ = SourceRows(hand.actor).find_target_motion(t_s)
             yield _SpringHistory(
                 site=name,
                 stiffness_nm_rad=np.array(hand.stiffness_nm_rad),
@@ -648,7 +648,7 @@ def _compute_promised_motion(
     alpha = np.zeros((len(t_s), len(laws), len(laws)))
     for site, name in enumerate(scenario.names):
         peers = [scenario.names.index(peer) for peer in scenario.peers(name)]
-        alpha[:, site, peers] = plan_dominance(scenario, name, t_s)
+        alpha[:, site, peers] = DominancePlan.of_scenario(scenario, name).evaluate(t_s).alpha
     run = TuningRun(laws=laws, t_s=t_s, q=q, outside_nm=-tau_x, alpha=alpha)
     return laws[0].target_motion(run)
 

@@ -1,0 +1,110 @@
+"""Analyses the control loop of arms that rest in one common pose, with gains of choice.
+
+The search for the gains of an arm (`trilat tune --arm`) asks for one number: at which rate
+small motions about a pose grow with these gains. `RestingLoop` answers it for any pose, any
+gains, and for the delays of the scenario or a constant delay instead.
+
+Invariant:
+    - The gains of the scenario do not matter, and neither do its start poses.
+"""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from ...core import Array
+from ...scenario import Scenario
+from .characteristic_roots import CharacteristicRoot
+from .floquet import SamplesInUse
+from .linear_edge import find_rightmost_root
+from .operating_point import Equilibrium, OperatingConditions
+
+_NO_ROOT_PER_S = -1e3
+"""Real part of the root of a loop without roots, such as one with negligible gains, in 1/s."""
+
+
+@dataclass(frozen=True)
+class RestingLoop:
+    """The linearised control loop of arms that rest in one common pose.
+
+    Attributes:
+        conditions: Tick rates of the arms, and the delays between them.
+    """
+
+    conditions: OperatingConditions
+
+    @classmethod
+    def of_scenario(cls, scenario: Scenario) -> "RestingLoop":
+        """Returns the loop of the arms of a scenario, with the delays of its links.
+
+        Args:
+            scenario: The description of the experiment.
+        """
+        return cls(OperatingConditions.derive(scenario))
+
+    @property
+    def rate_hz(self) -> int:
+        """The tick rate of the first site, in Hz."""
+        return self.conditions.sites[0].rate_hz
+
+    @property
+    def varies(self) -> bool:
+        """True if the ages of the samples that the sites use vary during a run."""
+        return self.conditions.varying
+
+    @property
+    def largest_age_s(self) -> float:
+        """The largest age of the samples in use on any link, in s.
+
+        The age of a sample (a state that one arm sent to another) is the time from its sending
+        until its use. If the ages of a link vary, their mean counts.
+        """
+        return float(self.conditions.age_s.max())
+
+    def find_age_quantile_s(self, quantile: float) -> float:
+        """Returns an age that a share of all samples in use do not exceed, in s.
+
+        Args:
+            quantile: The share, from 0 to 1.
+        """
+        used = SamplesInUse.predict(self.conditions).used.values()
+        ages_by_link = [np.arange(len(samples)) - samples for samples in used]
+        ages = np.concatenate(ages_by_link)
+        age_ticks = float(np.quantile(ages, quantile, method="higher"))
+        return age_ticks / self.rate_hz
+
+    def fix_age(self, age_s: float) -> "RestingLoop":
+        """Returns the loop with one constant age of all samples, in place of ages that vary.
+
+        Args:
+            age_s: The age, in s.
+        """
+        has_delay = self.conditions.age_s > 0.0
+        ages_s: Array = np.where(has_delay, age_s, 0.0)
+        return RestingLoop(self.conditions._replace(age_s=ages_s, varying=False))
+
+    def find_root(self, law: Any, pose: Array, *, sampled: bool = True) -> CharacteristicRoot:
+        """Returns the characteristic root of the loop with the largest real part.
+
+        The real part of the root is the rate, in 1/s, at which small motions grow. A negative
+        value means that they decay.
+
+        Args:
+            law: Control law of all arms, with its gains.
+            pose: Pose of all arms, shape (n,), in rad or m, for n joints.
+            sampled: True to analyse the sampled loop, False to analyse it in continuous time.
+
+        Returns:
+            The root. If the loop has no roots, a root with a large negative real part.
+        """
+        sites = []
+        for site in self.conditions.sites:
+            gains = law.linear_gains(site.theta)
+            sites.append(site._replace(gains=gains))
+        poses = np.tile(pose, (len(sites), 1))
+        theta = np.array([site.theta for site in sites])
+        rest = Equilibrium(poses, theta, "a pose", 0.0)
+        conditions = self.conditions._replace(sites=tuple(sites))
+        root = find_rightmost_root(conditions, rest, sampled=sampled)
+        return root or CharacteristicRoot(complex(_NO_ROOT_PER_S), 1, ())

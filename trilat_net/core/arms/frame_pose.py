@@ -1,0 +1,101 @@
+"""Computes products of the poses of frames, and expresses inertias in other frames.
+
+The functions are plain Python, because the files of arms are read before any code is compiled.
+
+Invariant:
+    - Each sum has a fixed order, so that results are the same on every machine.
+"""
+
+from typing import NamedTuple
+
+from .chain import Matrix, Three, multiply_matrices, multiply_vector
+from .elementary import sincos
+
+_plain_sincos = getattr(sincos, "py_func", sincos)
+"""The function `sincos` as plain Python. Compiling it takes longer than reading a file."""
+
+
+class FramePose(NamedTuple):
+    """Position and orientation of a coordinate frame, expressed in another frame.
+
+    Attributes:
+        rotation: Rotation matrix, three rows.
+        origin_m: Origin of the frame, in m.
+    """
+
+    rotation: Matrix = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
+    origin_m: Three = (0.0, 0.0, 0.0)
+
+    @classmethod
+    def from_angles(cls, rpy_rad: Three, origin_m: Three) -> "FramePose":
+        """Returns the pose with the rotation R_z(yaw) R_y(pitch) R_x(roll).
+
+        Args:
+            rpy_rad: The angles roll, pitch and yaw.
+            origin_m: Origin of the frame.
+        """
+        # s and c are sines and cosines.
+        (sr, cr), (sp, cp), (sy, cy) = map(_plain_sincos, rpy_rad)
+        rotation = (
+            (cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr),
+            (sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr),
+            (-sp, cp * sr, cp * cr),
+        )
+        return cls(rotation, origin_m)
+
+    def __matmul__(self, inner: "FramePose") -> "FramePose":
+        """Returns the product of two poses, which places one frame inside another.
+
+        The pose `inner` is relative to the frame of this pose. The result is the pose of the
+        inner frame, relative to the frame to which this pose is relative.
+        """
+        x, y, z = self.turn(inner.origin_m)
+        ox, oy, oz = self.origin_m
+        rotation = multiply_matrices(self.rotation, inner.rotation)
+        return FramePose(rotation, (ox + x, oy + y, oz + z))
+
+    def turn(self, vector: Three) -> Three:
+        """Rotates a vector from the axes of this frame to the axes of the outer frame.
+
+        Args:
+            vector: The vector in the axes of this frame.
+        """
+        return multiply_vector(self.rotation, vector)
+
+    def place_body(self, mass: float, tensor: Matrix) -> tuple[float, ...]:
+        """Returns the inertial parameters of a body in the outer frame of this pose.
+
+        The tensor I about the centre of mass is rotated, R I R^T, and moved to the origin of
+        the other frame by the parallel axis theorem.
+
+        Args:
+            mass: Mass, in kg.
+            tensor: Inertia about the centre of mass, in kg m^2. The origin of this pose is the
+                centre of mass, and its axes are those of the tensor.
+
+        Returns:
+            The ten parameters m, m cx, m cy, m cz, Ixx, Ixy, Iyy, Ixz, Iyz, Izz.
+        """
+        # Rows of the rotation R, and the centre of mass in the other frame.
+        (r0, r1, r2), (x, y, z) = self
+        # Columns of I R^T. The entries of R I R^T follow row by row.
+        columns = (
+            multiply_vector(tensor, r0),
+            multiply_vector(tensor, r1),
+            multiply_vector(tensor, r2),
+        )
+        (xx, xy, xz) = multiply_vector(columns, r0)
+        (_, yy, yz) = multiply_vector(columns, r1)
+        (_, _, zz) = multiply_vector(columns, r2)
+        return (
+            mass,
+            mass * x,
+            mass * y,
+            mass * z,
+            xx + mass * (y * y + z * z),
+            xy - mass * x * y,
+            yy + mass * (x * x + z * z),
+            xz - mass * x * z,
+            yz - mass * y * z,
+            zz + mass * (x * x + y * y),
+        )
