@@ -8,7 +8,7 @@ from trilat_net.core.step.kernel import site_tick
 from trilat_net.core.step.site_step import Site
 from trilat_net.core.step.ticks import Arrival, TickInput, TickRecord
 from trilat_net.net.messages import PeerSample
-from trilat_net.net.offset import OffsetEstimator, exact_offset
+from trilat_net.net.offset import OffsetEstimate, OffsetEstimator
 from trilat_net.net.timing import PeerClock, SiteTiming
 from trilat_net.net.wire import decode, encode_sample, encode_state
 from trilat_net.scenario import load_scenario
@@ -30,7 +30,8 @@ class TickParts:
             encode_sample(p, 7, record, AT_NS - DELAY_NS, self.echo) for p in site.peers
         ]
         peers = [
-            PeerClock(peer, 0, 0, exact_offset(0), OffsetEstimator()) for peer in site.peers
+            PeerClock(peer, 0, 0, OffsetEstimate.exact(0), OffsetEstimator())
+            for peer in site.peers
         ]
         self.timing = SiteTiming(0, site.rate_hz, peers, "m2")
         self.timing.record_sent(0, AT_NS - 2 * DELAY_NS)

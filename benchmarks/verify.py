@@ -12,8 +12,9 @@ from pathlib import Path
 from unittest import mock
 
 from trilat_net.execution import verification, virtual
-from trilat_net.log import mcap_reader, site_log
+from trilat_net.log import mcap_reader
 from trilat_net.log.log_reader import open_log
+from trilat_net.log.packed.indexed_records import IndexedRecords
 from trilat_net.scenario import load_scenario
 
 CASES = ("paper", "4g", "six_joints")
@@ -54,7 +55,7 @@ def verify_singly(path: Path) -> verification.VerifyResult:
     """Verifies a log without compiled reading and without the compiled loop."""
     with (
         mock.patch.object(mcap_reader, "_BLOCK_BYTES", 1 << 40),
-        mock.patch.object(site_log, "index_records", return_value=None),
+        mock.patch.object(IndexedRecords, "of_payloads", return_value=None),
     ):
         return verification.verify_log(open_log(path))
 

@@ -12,24 +12,22 @@ from trilat_net.hooks import import_on_use
 __all__ = [
     "AWAY_NS",
     "GapRepair",
-    "InboundMessage",
     "InboundQueue",
     "ReadScenario",
-    "RecordedScenario",
     "SiteReception",
     "record_session",
 ]
 
 if TYPE_CHECKING:
     from .backfill import GapRepair
-    from .record_process import ReadScenario, RecordedScenario, record_session
-    from .site_reception import AWAY_NS, InboundMessage, InboundQueue, SiteReception
+    from .record_process import ReadScenario, record_session
+    from .site_reception import AWAY_NS, InboundQueue, SiteReception
 else:
     __getattr__ = import_on_use(
         __name__,
         {
             "backfill": "GapRepair",
-            "record_process": "ReadScenario RecordedScenario record_session",
-            "site_reception": "AWAY_NS InboundMessage InboundQueue SiteReception",
+            "record_process": "ReadScenario record_session",
+            "site_reception": "AWAY_NS InboundQueue SiteReception",
         },
     )

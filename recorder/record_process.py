@@ -19,7 +19,6 @@ from collections.abc import Callable, Mapping
 from contextlib import ExitStack, suppress
 from functools import partial
 from pathlib import Path
-from typing import NamedTuple
 
 from trilat_net import process
 from trilat_net.errors import LogRefused, RunFailed, SessionError
@@ -32,7 +31,6 @@ from trilat_net.net import (
     EventPublisher,
     SessionJoin,
     connect_to_session,
-    describe_clocks,
     describe_member,
     new_boot,
     share_threads,
@@ -68,26 +66,14 @@ A longer period costs less computing time.
 """
 
 
-class RecordedScenario(NamedTuple):
-    """The parts of a session's scenario that the recorder needs.
-
-    A scenario is the TOML text that describes the arms, their control laws and the network. The
-    recorder does not import the code that interprets it, so its caller provides the parts.
-
-    Attributes:
-        scenario: Names, rates and sizes of the sites, from which the messages to expect follow.
-        make_views: Creates the messages for log viewers. If None, the log contains no such
-            messages.
-    """
-
-    scenario: SessionScenario
-    make_views: MakeViews | None = None
-
-
-ReadScenario = Callable[[str, str], RecordedScenario]
+ReadScenario = Callable[[str, str], tuple[SessionScenario, MakeViews | None]]
 """Function that reads the text of a resolved scenario, which another process has sent.
 
-Its second argument is the name of the text, for error messages. The text is not trusted.
+Its second argument is the name of the text, for error messages. The text is not trusted. The
+result has the names, rates and sizes of the sites, from which the messages to expect follow.
+It also has a function that creates the messages for viewers of logs, or None if the log
+contains no such messages. The recorder does not import the code that interprets scenarios, so
+that its caller provides this function.
 """
 CollectProvenance = Callable[[], Mapping[str, str]]
 """Function that returns the facts about this program that a log contains, see `provenance`."""
@@ -255,7 +241,7 @@ class Recorder:
                     raise
         return recording
 
-    def _find_scenario(self, epoch: Epoch) -> RecordedScenario:
+    def _find_scenario(self, epoch: Epoch) -> tuple[SessionScenario, MakeViews | None]:
         """Returns the scenario to record, which a member has sent with its identity.
 
         A recorder needs no scenario file. Members that were started again after the common
@@ -298,7 +284,7 @@ class Recorder:
             recording.join_late(now_ns)
 
         self._say(f"recorder: {text}, writing {path}")
-        for clock_text in describe_clocks(self._joining.pinger, epoch.boots, epoch.mono_ns):
+        for clock_text in self._joining.pinger.describe_clocks(epoch.boots, epoch.mono_ns):
             self._say(f"recorder: {clock_text}")
 
     def _receive_presence(self, recording: Recording) -> None:
@@ -416,7 +402,7 @@ def record_session(
                 connection,
                 clock,
                 session,
-                lambda text: read_scenario(text, session).scenario.names,
+                lambda text: read_scenario(text, session)[0].names,
                 stopped=interrupt.is_requested,
                 timeout_s=join_timeout_s,
                 say=lambda text: say(f"recorder: {text}"),

@@ -37,6 +37,7 @@ from trilat_net.net import (
     make_decoder,
     number_message,
     skipped_numbers,
+    split_states,
     topics,
 )
 from trilat_net.recorded_change import count_skipped_ticks
@@ -64,7 +65,7 @@ _OTHER_KEYS = "others"
 """Name under which the keys beyond `KEYS` are counted."""
 
 
-class InboundMessage(NamedTuple):
+class _InboundMessage(NamedTuple):
     """A network message in the recorder's queue, which is not yet decoded or written to a log.
 
     Attributes:
@@ -94,7 +95,7 @@ class InboundQueue:
 
     def __init__(self, clock: Clock) -> None:
         self._clock = clock
-        self._queue: deque[InboundMessage] = deque()
+        self._queue: deque[_InboundMessage] = deque()
         # The threads of the network write the counters of received bytes, and the other thread
         # those of drained bytes. Therefore they need no common lock.
         self._received_bytes = Counter[str]()
@@ -133,9 +134,9 @@ class InboundQueue:
                 return
             self._received_bytes[counted_key] += size
             self._total_received_bytes += size
-            self._queue.append(InboundMessage(key, payload, self._clock.monotonic_ns()))
+            self._queue.append(_InboundMessage(key, payload, self._clock.monotonic_ns()))
 
-    def drain(self, until_ns: int | None = None) -> Iterator[InboundMessage]:
+    def drain(self, until_ns: int | None = None) -> Iterator[_InboundMessage]:
         """Removes waiting messages from the queue, so that they can be written.
 
         The threads of the network fill the queue, and the thread that writes the log calls this
@@ -267,6 +268,17 @@ class SiteReception:
             for channel in SITE_CHANNELS
         }
         self._largest_counts[topics.EVENT] = self._event_bytes_left // _LEAST_EVENT_BYTES
+
+    def split(self, channel: str, block: bytes) -> Iterable[bytes]:
+        """Splits the bytes that arrived in a channel into the payloads of single messages.
+
+        A block in the channel of records contains several records.
+
+        Args:
+            channel: Name of the channel.
+            block: The bytes.
+        """
+        return split_states(block) if channel == topics.STATE else (block,)
 
     def read(self, channel: str, payload: bytes) -> SiteMessage:
         """Decodes a message of a site and checks its sender and number, without counting it.

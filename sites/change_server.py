@@ -39,13 +39,7 @@ from trilat_net.net import (
 )
 from trilat_net.recorded_change import SiteOrder
 from trilat_net.records import Mode
-from trilat_net.scenario import (
-    LinkTables,
-    Scenario,
-    make_site_order,
-    resolve_change,
-    to_core_change,
-)
+from trilat_net.scenario import LinkTables, Scenario, resolve_change
 
 AHEAD_MS = 100
 """Time from the acceptance of a change until it takes effect, in ms."""
@@ -276,10 +270,8 @@ class ChangeServer:
                 "switch is held"
             )
 
-        change = make_site_order(
-            self._scenario, self._site, order, tick_ns(tick, self._rate_hz)
-        )
-        return to_core_change(self._scenario, change)
+        change = self._scenario.make_site_order(self._site, order, tick_ns(tick, self._rate_hz))
+        return self._scenario.to_core_change(change)
 
     def _schedule_stop(self, next_tick: int, stop_s: float) -> tuple[str, int]:
         """Schedules the end of the run at a requested time, unless an earlier end is scheduled.
@@ -367,4 +359,4 @@ class ChangeServer:
             self._links[change.link] = change.to
         else:
             pending_ns.append(from_ns)
-        return to_core_change(self._scenario, change)
+        return self._scenario.to_core_change(change)

@@ -32,15 +32,14 @@ from trilat_net.net import (
     Bus,
     Clock,
     Connection,
-    HandMessage,
+    HandSender,
     HandViewMessage,
     SiteClient,
-    SiteSender,
     SystemClock,
     read_messages,
     topics,
 )
-from trilat_net.scenario import HandSite, Scenario, make_hand_program
+from trilat_net.scenario import HandSite, Scenario
 from trilat_net.signals import Interrupt
 
 POLL_NS = 500_000
@@ -87,7 +86,7 @@ class HandProcess(SiteClient):
         site_rate_hz = hand_site.scenario.sites[hand_site.name].rate_hz
         self._ticks_per_view = site_rate_hz // hand_site.rate_hz
 
-        self._sender = SiteSender.for_hand(bus, clock, session, hand_site.name)
+        self._sender = HandSender(bus, clock, session, hand_site.name)
         self._views = bus.inbox(topics.key(session, hand_site.name, topics.VIEW), _VIEWS_KEPT)
         self._announced_ns = 0
         self._waiting_views = deque[HandViewMessage]()
@@ -160,9 +159,7 @@ class HandProcess(SiteClient):
         """
         goal_field = "force" if self._pushes else "target"
         fields = {goal_field: goal or [], "grip": goal is not None}
-        self._sender.send(
-            HandMessage, source=self._code, n=view_tick // self._ticks_per_view, **fields
-        )
+        self._sender.move(self._code, n=view_tick // self._ticks_per_view, **fields)
 
 
 def _read_view(message: HandViewMessage) -> HandView:
@@ -239,7 +236,7 @@ def run_hand(
             "such hand"
         )
 
-    program = make_hand_program(hand_site)
+    program = hand_site.make_program()
     clock = SystemClock()
     stopped = interrupt.is_requested
     give_up_ns = clock.monotonic_ns() + int(timeout_s * 1e9)

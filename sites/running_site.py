@@ -23,7 +23,6 @@ from trilat_net.net import (
     PeerClock,
     Pinger,
     SiteTiming,
-    describe_clocks,
     encode,
     find_turn_ns,
     make_site_known,
@@ -84,7 +83,7 @@ class RunningSite:
         site.start_at(epoch.first)
         parts.buffer.start_at(epoch.first)
         self._timing = self._make_timing(pinger)
-        self._clock_texts = describe_clocks(pinger, epoch.boots, epoch.mono_ns)
+        self._clock_texts = pinger.describe_clocks(epoch.boots, epoch.mono_ns)
         self._inbox = PeerInbox(
             links=parts.setup.links,
             rings=parts.rings,

@@ -44,16 +44,7 @@ from trilat_net.net import (
 from trilat_net.own_code import ImportedLaw
 from trilat_net.recorded_change import SiteOrder
 from trilat_net.records import Arrival, TickRecord
-from trilat_net.scenario import (
-    HandPlayer,
-    HandSite,
-    OwnPlant,
-    PlantPlayer,
-    Scenario,
-    make_hand_program,
-    make_site_order,
-    to_core_change,
-)
+from trilat_net.scenario import HandPlayer, HandSite, OwnPlant, PlantPlayer, Scenario
 from trilat_net.signals import Interrupt
 
 from .change_server import ChangeServer
@@ -266,7 +257,7 @@ class SiteParts:
         own_hand = HandSite.find(self.scenario, name)
         if own_hand is not None and not own_hand.has_separate_process:
             run_hand = self._watch_code(f"the hand {own_hand.program}", own_hand.rate_hz)
-            self.hand = HandPlayer(own_hand, make_hand_program(own_hand), run_hand)
+            self.hand = HandPlayer(own_hand, own_hand.make_program(), run_hand)
             return
 
         inbox = self.bus.inbox(self._key(topics.HAND), MESSAGES_KEPT)
@@ -384,14 +375,10 @@ class SiteParts:
             order: The order.
             skipped: Number of skipped ticks, for the order "overrun".
         """
-        change = make_site_order(
-            scenario=self.scenario,
-            site=self.name,
-            order=order,
-            from_ns=tick_ns(tick, self.site.rate_hz),
-            ticks=skipped,
+        change = self.scenario.make_site_order(
+            site=self.name, order=order, from_ns=tick_ns(tick, self.site.rate_hz), ticks=skipped
         )
-        return to_core_change(self.scenario, change)
+        return self.scenario.to_core_change(change)
 
 
 WARM_UP_TICKS = 200

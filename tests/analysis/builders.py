@@ -26,7 +26,6 @@ from trilat_net.net import topics
 from trilat_net.net.wire import encode, encode_state
 from trilat_net.scenario import Scenario, load_scenario, parse_scenario
 from trilat_net.scenario.change import Change
-from trilat_net.scenario.run_changes import to_core_change
 
 FOUR = """
 name = "four"
@@ -176,7 +175,7 @@ def drive_run(
     peers = {name: scenario.peers(name) for name in scenario.names}
     network = RecordedNetwork(arrivals_by_site, peers)
     ordered = {
-        site: {tick: [to_core_change(scenario, change)] for tick, change in changes.items()}
+        site: {tick: [scenario.to_core_change(change)] for tick, change in changes.items()}
         for site, changes in ORDERED.items()
         if site in scenario.sites
     }

@@ -9,6 +9,7 @@ import re
 import shutil
 import subprocess
 from collections.abc import Iterator
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -21,13 +22,7 @@ from tests.cli.running import COMMAND, PLAIN, shorten, trilat
 from tests.log.builders import edit_log_bytes, open_bytes
 from trilat_net.app.cli import app
 from trilat_net.errors import CodeWithheld, ScenarioError, UsageError
-from trilat_net.own_code.code_consent import list_imported_code
-from trilat_net.own_code.imported_code import (
-    CodeKey,
-    allowed_code,
-    import_class,
-    remembered_settings,
-)
+from trilat_net.own_code.imported_code import CodeKey, allowed_code, remembered_settings
 from trilat_net.presentation.figures.registry import list_drawable_figures
 
 WITNESS = "import os\nwith open(os.environ['WITNESS'], 'a') as told:\n    told.write(__file__ + ';')\n"
@@ -571,11 +566,12 @@ def test_remembered_file_without_settings_allows_nothing(reader: Path) -> None:
 @pytest.mark.usefixtures("log_folder")
 def test_code_with_other_settings_is_withheld(keys: dict[str, Any]) -> None:
     allowed = tn.load_scenario("paper", keys)
-    (named,) = list_imported_code([allowed])
+    parts = [(site.control, *site.hands, site.plant) for site in allowed.sites.values()]
+    (named,) = [part for part in chain(*parts) if hasattr(part, "source_sha256")]
     others = {**named.settings, "table": "/etc/passwd"}
     other = msgspec.structs.replace(named, settings=others)
     with pytest.raises(CodeWithheld, match=r'table = "/etc/passwd" \(was its default\)'):
-        import_class(CodeKey.of(other), "sites.s", named.method)
+        CodeKey.of(other).import_class("sites.s", named.method)
 
 
 def test_laws_of_this_process_need_no_permission(log_folder: Path) -> None:

@@ -12,7 +12,6 @@ from trilat_net.log.log_reader import Log
 from trilat_net.net.messages import RESTING_MODES
 from trilat_net.own_code.code_consent import allow_own_code
 from trilat_net.scenario import Scenario, parse_scenario
-from trilat_net.scenario.run_changes import make_site_order, to_core_change
 
 TEXT = """
 name = "glide"
@@ -80,8 +79,8 @@ def make_ordered_log(
 
     def change(site: str, tick: int, order: str) -> CoreChange:
         t_ns = tick_ns(tick, scenario.sites[site].rate_hz)
-        order_change = make_site_order(scenario, site, order, t_ns, ticks)
-        return to_core_change(scenario, order_change)
+        order_change = scenario.make_site_order(site, order, t_ns, ticks)
+        return scenario.to_core_change(order_change)
 
     commands = {
         site: {tick: [change(site, tick, order)] for tick, order in of_site.items()}

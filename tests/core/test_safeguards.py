@@ -28,7 +28,6 @@ from trilat_net.execution.virtual_comparison import compare_with_virtual
 from trilat_net.execution.what_if import rerun
 from trilat_net.log.log_reader import Log
 from trilat_net.scenario import load_scenario
-from trilat_net.scenario.run_changes import make_site_order
 
 
 @pytest.mark.long
@@ -155,7 +154,7 @@ def test_missed_ticks_are_held_or_a_fault(missed: int, mode: str) -> None:
 
 def test_sites_of_other_rules_know_no_orders() -> None:
     with pytest.raises(ScenarioError, match=r"has on_stale\.action = 'use'"):
-        make_site_order(load_scenario("free"), "s", "stop", 0)
+        load_scenario("free").make_site_order("s", "stop", 0)
 
 
 @pytest.mark.long

@@ -25,7 +25,7 @@ from trilat_net.execution.what_if import Rerun
 from trilat_net.log.log_reader import Log
 from trilat_net.net.messages import STATE_VECTORS, State
 from trilat_net.scenario import Scenario, load_scenario
-from trilat_net.scenario.run_changes import LinkTables, resolve_change, to_core_change
+from trilat_net.scenario.run_changes import LinkTables, resolve_change
 
 Array = NDArray[np.float64]
 
@@ -128,7 +128,7 @@ def make_log_with_commands(
         tables = LinkTables(scenario.links, ())
         change = resolve_change(scenario, tables, request, round(at_s * 1e9))
         tick = round(at_s * scenario.sites[site].rate_hz)
-        schedule.setdefault(tick, []).append(to_core_change(scenario, change))
+        schedule.setdefault(tick, []).append(scenario.to_core_change(change))
     return open_bytes(simulate_bytes(scenario, commands={site: schedule}))
 
 

@@ -7,11 +7,7 @@ import pytest
 
 from tests.log.builders import make_log
 from trilat_net.errors import ScenarioError, UsageError
-from trilat_net.execution.rerun_execution import (
-    RerunRequest,
-    describe_rerun_changes,
-    resolve_rerun_request,
-)
+from trilat_net.execution.rerun_execution import RerunRequest
 
 from .deliveries import SITES
 
@@ -21,19 +17,19 @@ Overrides = Mapping[str, Any] | Sequence[str]
 def request_rerun(
     replace: Sequence[str], overrides: Overrides = (), *, closed_loop: bool = False
 ) -> RerunRequest:
-    return resolve_rerun_request(make_log("paper"), replace, overrides, closed_loop=closed_loop)
+    return RerunRequest.resolve(make_log("paper"), replace, overrides, closed_loop=closed_loop)
 
 
 def test_an_unchanged_request_is_the_logs_experiment() -> None:
     for name in ("paper", "handover", "outage"):
         log = make_log(name, {"duration_s": 0.3})
         for replace in (log.sites[:1], log.sites):
-            request = resolve_rerun_request(log, replace, (), closed_loop=False)
+            request = RerunRequest.resolve(log, replace, (), closed_loop=False)
             assert request.scenario == log.scenario
             assert (
                 request.changes,
                 request.without_effect,
-                describe_rerun_changes(request),
+                request.describe_changes(),
             ) == (
                 [],
                 [],
@@ -68,7 +64,7 @@ def test_an_unchanged_request_is_the_logs_experiment() -> None:
 def test_differences_are_lines_of_the_executed_scenario(
     overrides: list[str], arguments: list[str]
 ) -> None:
-    assert describe_rerun_changes(request_rerun(["s"], overrides)) == arguments
+    assert request_rerun(["s"], overrides).describe_changes() == arguments
 
 
 def test_copied_sites_keep_their_settings() -> None:

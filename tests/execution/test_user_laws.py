@@ -22,7 +22,7 @@ from trilat_net.execution.virtual_comparison import compare_with_virtual
 from trilat_net.log.log_reader import Log, open_log
 from trilat_net.own_code.code_consent import find_user_laws
 from trilat_net.scenario import load_scenario
-from trilat_net.scenario.run_changes import LinkTables, resolve_change, to_core_change
+from trilat_net.scenario.run_changes import LinkTables, resolve_change
 
 LAW = "tests.laws:Adaptive"
 SHORT: dict[str, Any] = {"duration_s": 0.12, "link.delay_ms": 20.0}
@@ -63,8 +63,8 @@ def test_restarted_sites_are_the_same(law: str) -> None:
         {"dominance": "s", "to": {"m1": 0.9, "m2": 0.1}, "ramp_s": 0.1},
     ]
     changes = [
-        to_core_change(
-            scenario, resolve_change(scenario, LinkTables(scenario.links, ()), order, 10**8)
+        scenario.to_core_change(
+            resolve_change(scenario, LinkTables(scenario.links, ()), order, 10**8)
         )
         for order in orders
     ]

@@ -23,6 +23,7 @@ from trilat_net.execution.virtual_comparison import (
 )
 from trilat_net.execution.virtual_network import PromptNetwork
 from trilat_net.log.log_reader import Log
+from trilat_net.log.message_identity import compute_virtual_boot
 from trilat_net.scenario import Scenario, load_scenario
 
 Rates = tuple[int, int, int]
@@ -141,11 +142,11 @@ def test_simulate_applies_overrides() -> None:
 def test_virtual_boots_depend_on_scenario_and_name(site: str) -> None:
     scenario = load_scenario("paper")
     other = load_scenario("paper", {"seed": 2})
-    assert virtual.compute_boot(scenario, site) == virtual.compute_boot(
-        load_scenario("paper"), site
-    )
-    assert virtual.compute_boot(scenario, site) != virtual.compute_boot(other, site)
-    assert virtual.compute_boot(scenario, "m1") != virtual.compute_boot(scenario, "s")
+    same = load_scenario("paper")
+    boot = compute_virtual_boot(scenario.sha256, site)
+    assert boot == compute_virtual_boot(same.sha256, site)
+    assert boot != compute_virtual_boot(other.sha256, site)
+    assert boot != compute_virtual_boot(scenario.sha256, "m2")
 
 
 def make_delivered_log(delays: dict[Sample, int]) -> Log:

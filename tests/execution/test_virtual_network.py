@@ -4,13 +4,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from trilat_net.core.step.ticks import MAX_ARRIVALS, Arrival, Mode, TickRecord
-from trilat_net.execution.virtual_network import (
-    Deliveries,
-    RecordedNetwork,
-    complete_deliveries,
-    read_deliveries,
-    retime_deliveries,
-)
+from trilat_net.execution.virtual_network import Deliveries, RecordedNetwork
 from trilat_net.log.site_log import SiteLog
 from trilat_net.net.wire import encode_state
 
@@ -83,8 +77,8 @@ def list_arrivals(deliveries: Deliveries) -> set[Sample]:
 
 def test_whole_logs_give_their_recorded_arrivals() -> None:
     part = make_site_log(make_steady_way(3))
-    deliveries = complete_deliveries(part, *SENDERS)
-    assert deliveries == read_deliveries(part)
+    deliveries = Deliveries.complete(part, *SENDERS)
+    assert deliveries == Deliveries.read(part)
     assert deliveries.entries == {state.tick: state.rx for state in part.states}
     assert (deliveries.first, deliveries.last, deliveries.unrecorded) == (
         0,
@@ -96,7 +90,7 @@ def test_whole_logs_give_their_recorded_arrivals() -> None:
 @given(lost=lost_ticks, ticks=st.integers(1, 9))
 def test_steady_networks_reveal_missing_arrivals(lost: set[int], ticks: int) -> None:
     whole = make_site_log(make_steady_way(ticks))
-    deliveries = complete_deliveries(make_site_log(make_steady_way(ticks), lost), *SENDERS)
+    deliveries = Deliveries.complete(make_site_log(make_steady_way(ticks), lost), *SENDERS)
     assert deliveries.unrecorded == lost
     pairs = {k: sorted(entry[:2] for entry in at) for k, at in deliveries.entries.items() if at}
     assert pairs == {
@@ -109,21 +103,21 @@ def test_every_arrived_sample_is_listed_once(under_way: Way, lost: set[int]) -> 
     """Samples older than the newest one in a record are listed in order; later samples are unknown."""
     whole = make_site_log(in_order(under_way))
     gapped = make_site_log(in_order(under_way), lost)
-    deliveries = complete_deliveries(gapped, *SENDERS)
+    deliveries = Deliveries.complete(gapped, *SENDERS)
     for state in gapped.states:
         assert deliveries.entries[state.tick] == state.rx
     assert sum(map(len, deliveries.entries.values())) == len(list_arrivals(deliveries))
-    listed = list_arrivals(read_deliveries(gapped))
+    listed = list_arrivals(Deliveries.read(gapped))
     newest = [max((tick for j, tick in listed if j == peer), default=-1) for peer in (0, 1)]
     assert {s for s in list_arrivals(deliveries) if s[1] <= newest[s[0]]} == {
-        s for s in list_arrivals(read_deliveries(whole)) if s[1] <= newest[s[0]]
+        s for s in list_arrivals(Deliveries.read(whole)) if s[1] <= newest[s[0]]
     }
     assert all(k > tick for k, at in deliveries.entries.items() for _, tick, _ in at)
 
 
 def test_a_lost_sample_does_not_come() -> None:
     """Sample 50 was lost, far from any gap."""
-    deliveries = complete_deliveries(
+    deliveries = Deliveries.complete(
         make_site_log({**make_steady_way(), (0, 50): None}, {20, 21, 80}), *SENDERS
     )
     assert (0, 50) not in list_arrivals(deliveries)
@@ -135,10 +129,8 @@ rates = st.sampled_from([250, 333, 500, 1000, 1500, 4000])
 
 @given(ticks=st.integers(1, 30), rate_hz=rates, peer_rate_hz=rates)
 def test_other_rates_keep_the_travel_time(ticks: int, rate_hz: int, peer_rate_hz: int) -> None:
-    deliveries = read_deliveries(make_site_log(make_steady_way(ticks)))
-    later_deliveries = retime_deliveries(
-        deliveries, 1000, rate_hz, [1000, 1000], [peer_rate_hz, 1000]
-    )
+    deliveries = Deliveries.read(make_site_log(make_steady_way(ticks)))
+    later_deliveries = deliveries.retime(1000, rate_hz, [1000, 1000], [peer_rate_hz, 1000])
     assert later_deliveries.last == 119 * rate_hz // 1000
     first = [
         (k, m)
@@ -154,8 +146,8 @@ def test_other_rates_keep_the_travel_time(ticks: int, rate_hz: int, peer_rate_hz
 
 
 def test_other_rates_keep_lost_samples_lost() -> None:
-    deliveries = read_deliveries(make_site_log({**make_steady_way(), (0, 50): None}))
-    doubled = retime_deliveries(deliveries, 1000, 1000, [1000, 1000], [2000, 1000])
+    deliveries = Deliveries.read(make_site_log({**make_steady_way(), (0, 50): None}))
+    doubled = deliveries.retime(1000, 1000, [1000, 1000], [2000, 1000])
     assert not {(0, 100), (0, 101)} & list_arrivals(doubled)
     assert {(0, 99), (0, 102), (1, 50)} <= list_arrivals(doubled)
 

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from trilat_net.core.step.site_setup import Layout
 from trilat_net.errors import WireError
 from trilat_net.log import record_columns
-from trilat_net.log.packed.indexed_records import IndexedRecords, index_records
+from trilat_net.log.packed.indexed_records import IndexedRecords
 from trilat_net.log.packed.packed_messages import PackedMessages
 from trilat_net.net.messages import MODE_WORDS, READABLE, State
 from trilat_net.net.wire import decode, encode_state
@@ -77,7 +77,7 @@ def draw_payload(draw: st.DrawFn, layout: Layout) -> bytes:
 
 
 def index_payloads(payloads: list[bytes], layout: Layout) -> IndexedRecords | None:
-    return index_records(PackedMessages.pack(payloads), "m1", PEERS, layout)
+    return IndexedRecords.of_payloads(PackedMessages.pack(payloads), "m1", PEERS, layout)
 
 
 def assert_equal_columns(

@@ -18,6 +18,7 @@ from trilat_net.errors import LogError
 from trilat_net.execution import virtual
 from trilat_net.log.log_reader import open_log
 from trilat_net.log.log_writer import LogWriter
+from trilat_net.log.message_identity import compute_virtual_boot
 from trilat_net.log.provenance import collect_provenance
 from trilat_net.net.wire import encode_state
 from trilat_net.scenario import list_shipped, load_scenario
@@ -55,7 +56,7 @@ def test_plain_readers_find_every_payload_byte() -> None:
     sent = {
         (site.name, output.tick): encode_state(
             site.name,
-            virtual.compute_boot(scenario, site.name),
+            compute_virtual_boot(scenario.sha256, site.name),
             site.peers,
             output,
             arrivals,

@@ -13,7 +13,7 @@ from tests.log.disks import open_file_on
 from trilat_net.app.cli.members import parse_split
 from trilat_net.errors import LogRefused, UsageError
 from trilat_net.log.log_file import LogFile
-from trilat_net.log.log_layout import find_parts, part_path
+from trilat_net.log.log_layout import part_path
 from trilat_net.log.log_reader import open_log
 from trilat_net.log.log_writer import LogParts, LogStorage, LogWriter
 from trilat_net.log.mcap_writer import Sink
@@ -93,7 +93,7 @@ def test_joined_parts_are_the_unsplit_file(
         messages.append((key, os.urandom(length), log_ns, n))
     place = LogStorage(path, split_bytes=size, split_ns=duration_ns)
     write_messages(place, messages)
-    parts = find_parts(path)
+    parts = LogStorage(path).find_parts()
     if not place.splits:
         assert list(tmp_path.iterdir()) == [path]
         assert read_file(path)[0] == messages
@@ -200,9 +200,9 @@ def test_any_name_will_do(name: str, tmp_path: Path) -> None:
     place = LogStorage(tmp_path / name, split_ns=1)
     (tmp_path / "run1-001.mcap").write_bytes(b"")
     write_messages(place, messages)
-    assert sorted(find_parts(place.path)) == [1, 2, 3]
+    assert sorted(place.find_parts()) == [1, 2, 3]
     assert [
-        message for path in find_parts(place.path).values() for message in read_file(path)[0]
+        message for path in place.find_parts().values() for message in read_file(path)[0]
     ] == messages
 
 
@@ -253,7 +253,7 @@ def test_full_disks_at_seams_keep_earlier_parts(tmp_path: Path) -> None:
         taken = write_on_disk(room, path, messages)
         stored = [
             message
-            for _, part in sorted(find_parts(path).items())
+            for _, part in sorted(LogStorage(path).find_parts().items())
             for message in read_file(part)[0]
         ]
         assert stored == taken

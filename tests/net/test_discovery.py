@@ -14,7 +14,7 @@ from trilat_net.errors import SessionError
 from trilat_net.net import discovery, topics
 from trilat_net.net.clock import SystemClock
 from trilat_net.net.connection import Connection, default_endpoint, find_free_endpoints
-from trilat_net.net.discovery import connect_to_session, find_members
+from trilat_net.net.discovery import SessionMembers, connect_to_session
 from trilat_net.net.membership import EventPublisher, liveliness_token
 from trilat_net.net.messages import VERSION, Info
 from trilat_net.net.requests import ChangeReply, ChangeRequest
@@ -115,7 +115,9 @@ def find_answering(*payloads: bytes) -> list[Info]:
             topics.key(SESSION, f"m{n}", topics.INFO), lambda _, sent=payload: sent
         )
     asker = network.join()
-    return list(find_members(asker, clock, SESSION, stopped=lambda: False, timeout_s=0.5))
+    return list(
+        SessionMembers(asker, clock, SESSION).find(stopped=lambda: False, timeout_s=0.5)
+    )
 
 
 def test_members_are_found_despite_unreadable_answers() -> None:

@@ -15,7 +15,6 @@ from trilat_net.net.offset import (
     OffsetEstimator,
     OffsetLimit,
     SlewedOffset,
-    exact_offset,
     format_offset,
 )
 
@@ -223,7 +222,7 @@ def test_memory_is_bounded_to_the_newest() -> None:
 
 
 def test_one_clock_needs_no_estimate() -> None:
-    offset = exact_offset(0)
+    offset = OffsetEstimate.exact(0)
     course = SlewedOffset(offset)
     for at_ns in (-S, 0, 10**16):
         assert offset.extrapolate_ns(at_ns) == course.evaluate_ns(at_ns) == 0
@@ -232,7 +231,7 @@ def test_one_clock_needs_no_estimate() -> None:
 
 
 def test_contradictions_widen_an_estimate() -> None:
-    offset = exact_offset(5)
+    offset = OffsetEstimate.exact(5)
     wider = offset.widen(OffsetLimit(0, -100), None)
     assert (wider.low_ns, wider.high_ns, wider.offset_ns) == (-100, 5, 5)
     assert offset.widen(None, None) == offset
@@ -257,7 +256,7 @@ estimates = st.builds(
 def test_the_used_offset_is_always_continuous(
     bends: list[tuple[OffsetEstimate, int]],
 ) -> None:
-    course = SlewedOffset(exact_offset(5))
+    course = SlewedOffset(OffsetEstimate.exact(5))
     now_ns = 0
     for estimate, passed_ns in bends:
         now_ns += passed_ns
@@ -274,7 +273,7 @@ def test_the_used_offset_is_always_continuous(
 
 @given(estimates)
 def test_used_offset_reaches_and_follows_its_estimate(estimate: OffsetEstimate) -> None:
-    course = SlewedOffset(exact_offset(0))
+    course = SlewedOffset(OffsetEstimate.exact(0))
     course.slew_to(0, estimate)
     for at_ns in (SLEW_NS, 2 * SLEW_NS, 10 * SLEW_NS):
         assert abs(course.evaluate_ns(at_ns) - estimate.extrapolate_ns(at_ns)) <= 2

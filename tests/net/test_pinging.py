@@ -11,7 +11,7 @@ from trilat_net.net import topics
 from trilat_net.net.bus import Bus
 from trilat_net.net.clock import SkewedClock
 from trilat_net.net.messages import VERSION
-from trilat_net.net.offset import exact_offset
+from trilat_net.net.offset import OffsetEstimate
 from trilat_net.net.pinging import (
     GLANCE_NS,
     PING_PACE_NS,
@@ -145,7 +145,7 @@ def test_without_other_clocks_nobody_is_asked() -> None:
     world.wait(S)
     assert world.bus.asked == 0
     assert world.pinger.knows_clocks([])
-    assert world.pinger.estimate(99) == exact_offset(0)
+    assert world.pinger.estimate(99) == OffsetEstimate.exact(0)
     assert world.pinger.estimator(99) is None
 
 

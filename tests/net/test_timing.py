@@ -16,7 +16,7 @@ from tests.net.manual_clock import ManualClock
 from trilat_net.core.step.ticks import tick_ns
 from trilat_net.net.clock import SkewedClock
 from trilat_net.net.messages import VERSION, LinkStats, PeerSample
-from trilat_net.net.offset import OffsetEstimate, OffsetEstimator, exact_offset
+from trilat_net.net.offset import OffsetEstimate, OffsetEstimator
 from trilat_net.net.timing import (
     FAULT_EVERY_NS,
     FIRST_WINDOW_NS,
@@ -214,7 +214,7 @@ def make_meter(
 ) -> tuple[LinkTimingMonitor, SentStamps]:
     sent_stamps = SentStamps(8)
     return LinkTimingMonitor(
-        PeerClock("b", 1000, 3, exact_offset(0), estimator), sent_stamps
+        PeerClock("b", 1000, 3, OffsetEstimate.exact(0), estimator), sent_stamps
     ), sent_stamps
 
 
@@ -254,7 +254,7 @@ def test_figures_cover_windows_and_faults_cover_everything() -> None:
 
 
 def test_the_newest_sample_is_echoed_once() -> None:
-    peers = [PeerClock(name, 0, 0, exact_offset(0), None) for name in ("b", "c")]
+    peers = [PeerClock(name, 0, 0, OffsetEstimate.exact(0), None) for name in ("b", "c")]
     timing = SiteTiming(0, 1000, peers, "a")
     first, two = timing.monitors
     for tick, at_ns in ((4, 50), (6, 60), (5, 70)):
@@ -279,7 +279,7 @@ def test_the_first_windows_are_short() -> None:
 
 
 def test_members_on_the_leaders_clock_need_no_steering() -> None:
-    timing = SiteTiming(5, 1000, [PeerClock("a", 5, 0, exact_offset(0), None)], "a")
+    timing = SiteTiming(5, 1000, [PeerClock("a", 5, 0, OffsetEstimate.exact(0), None)], "a")
     for k in range(0, 5000, 100):
         timing.monitors[0].receive(make_sample(k, k * 1_000_000), 5 + k * 1_000_000 + 300_000)
         assert timing.update_clocks(k + 1, 5 + k * 1_000_000 + 400_000) == []

@@ -36,7 +36,6 @@ from tests.turning import (
 )
 from trilat_net.analysis.body_turns import BodyTurns
 from trilat_net.core.step.vectors import Array
-from trilat_net.log.data_tables import to_pandas_frame
 from trilat_net.log.log_reader import Log
 from trilat_net.log.orientations import (
     align_signs,
@@ -142,7 +141,7 @@ def list_mat(log: Log, motions: dict[str, Motion], folder: Path) -> Iterator[Ser
 
 
 def list_python(log: Log, motions: dict[str, Motion], _folder: Path) -> Iterator[Series]:
-    frames = {site: to_pandas_frame(log.table(site)) for site in motions}
+    frames = {site: log.table(site).to_pandas() for site in motions}
     yield from list_table_series(lambda site, name: frames[site][name], motions)
     for site, motion in motions.items():
         yield f"{site} orientation", log[site].orientation, motion.turned

@@ -7,7 +7,7 @@ import pytest
 from tests.scenario.builders import make_six_joint_scenario
 from trilat_net.errors import ScenarioError
 from trilat_net.scenario import Expect, load_scenario, parse_scenario, read_template
-from trilat_net.scenario.expect import ExpectWindow, find_expect_problem, window_quantities
+from trilat_net.scenario.expect import ExpectWindow
 
 
 def load_expect(**keys: Any) -> Expect:
@@ -36,13 +36,8 @@ def test_other_keys_always_expect_something(keys: dict[str, Any]) -> None:
 
 
 def test_a_pair_of_limits_must_leave_room() -> None:
-    assert (
-        find_expect_problem(Expect(mean_age_min_ms=5.0, mean_age_max_ms=5.0), {"m": 2}) is None
-    )
-    assert (
-        find_expect_problem(Expect(mean_age_min_ms=5.1, mean_age_max_ms=5.0), {"m": 2})
-        is not None
-    )
+    assert Expect(mean_age_min_ms=5.0, mean_age_max_ms=5.0).find_problem({"m": 2}) is None
+    assert Expect(mean_age_min_ms=5.1, mean_age_max_ms=5.0).find_problem({"m": 2}) is not None
 
 
 def test_expectations_enter_the_canonical_text() -> None:
@@ -72,7 +67,7 @@ def test_template_names_every_key_with_valid_values() -> None:
     )
     expect = parse_scenario(text).expect
     named = [line.removeprefix("# ").split(" = ")[0] for line in commented if " = " in line]
-    window = ["from_s", "to_s", "site", *window_quantities(2)]
+    window = ["from_s", "to_s", "site", *ExpectWindow.list_quantities(2)]
     assert set(named[: -len(window)]) | {"windows"} == set(Expect.__struct_fields__)
     assert named[-len(window) :] == window
     assert [key for key, _ in expect.windows[0].limits] == window[3:]

@@ -14,7 +14,7 @@ from trilat_net.core.step.ticks import DominanceRamp, first_tick_at
 from trilat_net.errors import ScenarioError
 from trilat_net.execution import virtual
 from trilat_net.scenario import Scenario, load_scenario, parse_core_change
-from trilat_net.scenario.run_changes import LinkTables, resolve_change, to_core_change
+from trilat_net.scenario.run_changes import LinkTables, resolve_change
 
 S = 10**9
 LINK = {"at_s": 8.0, "link": "m1->s", "to": {"delay_ms": 350.0}}
@@ -100,14 +100,14 @@ def test_commands_hold_from_their_tick_at_receivers() -> None:
         scenario, {"link": "m1->s", "to": {"delay_ms": 350, "loss": 0.05}}, 123_456_789
     )
     assert (change.owner, change.start_ns) == ("s", 123_456_789)
-    change_made = to_core_change(scenario, change)
+    change_made = scenario.to_core_change(change)
     assert (change_made.peer, change_made.model) == (
         0,
         LinkModel(from_ns=123_456_789, location=350_000.0, loss_good=0.05),
     )
     change = resolve_order(scenario, {"dominance": "m2", "to": {"s": 1}, "ramp_s": 0.5}, 2 * S)
     assert change.owner == "m2"
-    assert to_core_change(scenario, change).ramp == DominanceRamp(
+    assert scenario.to_core_change(change).ramp == DominanceRamp(
         2 * S, 2_500_000_000, (0.0, 1.0)
     )
 
@@ -117,8 +117,8 @@ def test_commands_hold_from_their_tick_at_receivers() -> None:
 def test_recorded_commands_are_restored(to: dict[str, Any], from_ns: int) -> None:
     scenario = load_scenario("paper")
     to.pop("outages_s", None)
-    change = to_core_change(
-        scenario, resolve_order(scenario, {"link": "s->m1", "to": to}, from_ns)
+    change = scenario.to_core_change(
+        resolve_order(scenario, {"link": "s->m1", "to": to}, from_ns)
     )
     assert parse_core_change(scenario, "m1", change.text) == change
     assert change.model is not None
@@ -139,7 +139,7 @@ def test_commands_equal_the_script(change: dict[str, Any]) -> None:
     plain = load_scenario("free", short)
     planned = load_scenario("free", {**short, "timeline": [script]})
     written = {key: value for key, value in script.items() if key != "at_s"}
-    change_made = to_core_change(plain, resolve_order(plain, written, at_ns))
+    change_made = plain.to_core_change(resolve_order(plain, written, at_ns))
     k = first_tick_at(at_ns, 1000) - 100
     commanded = list(virtual.execute_virtual(plain, commands={"s": {k: [change_made]}}))
     scripted_run = list(virtual.execute_virtual(planned))
@@ -171,8 +171,8 @@ def test_links_with_traces_refuse_unrecordable_orders() -> None:
     with pytest.raises(ScenarioError, match="can be changed only by setting another model"):
         resolve_order(scenario, {"link": "m1->s", "to": {"loss": 0.5}})
     assert (
-        to_core_change(
-            scenario, resolve_order(scenario, {"link": "m1->s", "to": {"preset": "lan"}})
+        scenario.to_core_change(
+            resolve_order(scenario, {"link": "m1->s", "to": {"preset": "lan"}})
         ).model
         is not None
     )

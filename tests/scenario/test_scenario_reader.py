@@ -14,12 +14,12 @@ from trilat_net.core.links.delay import LinkModel
 from trilat_net.core.step.site_setup import Gains, Law, StaleAction, StaleRule
 from trilat_net.errors import ScenarioError
 from trilat_net.scenario import (
-    apply_overrides,
     list_shipped,
     load_scenario,
     parse_scenario,
     read_template,
 )
+from trilat_net.scenario.override import apply_overrides
 from trilat_net.scenario.scenario_reader import read_shipped
 
 

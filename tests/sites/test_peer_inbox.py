@@ -16,7 +16,7 @@ from trilat_net.core.links.link import AHEAD_LIMIT_NS
 from trilat_net.core.step.site_setup import LinkSetup
 from trilat_net.core.step.ticks import MAX_ARRIVALS
 from trilat_net.net.messages import VERSION
-from trilat_net.net.offset import exact_offset
+from trilat_net.net.offset import OffsetEstimate
 from trilat_net.net.timing import LinkTimingMonitor, PeerClock, SentStamps
 from trilat_net.net.wire import MAX_BYTES
 from trilat_net.scenario import load_scenario
@@ -57,7 +57,9 @@ class Desk:
         self.send = [sender.publisher(name) for name in PEERS]
         self.dropped: Counter[str] = Counter()
         self.meters = [
-            LinkTimingMonitor(PeerClock(name, EPOCH_NS, 0, exact_offset(0), None), SentStamps())
+            LinkTimingMonitor(
+                PeerClock(name, EPOCH_NS, 0, OffsetEstimate.exact(0), None), SentStamps()
+            )
             for name in PEERS
         ]
         paced = [

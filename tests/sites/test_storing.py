@@ -13,7 +13,7 @@ from tests.sites.sessions import pack_computed
 from trilat_net.errors import LogRefused
 from trilat_net.execution.verification import verify_log
 from trilat_net.log import log_writer
-from trilat_net.log.log_layout import ChannelFilter, active_path, find_parts
+from trilat_net.log.log_layout import ChannelFilter, active_path
 from trilat_net.log.log_reader import open_log
 from trilat_net.log.log_writer import LogStorage
 from trilat_net.log.mcap_reader import McapReader
@@ -99,7 +99,7 @@ def test_a_session_in_parts_is_the_session(tmp_path: Path) -> None:
     session = make_session(tmp_path, 0.5, LogStorage(path, split_ns=125 * MS))
     with pytest.raises(Exception, match="No such file"):
         session.run()  # there is no file of that name
-    names = [part.name for part in sorted(find_parts(path).values())]
+    names = [part.name for part in sorted(LogStorage(path).find_parts().values())]
     assert names == [f"run-00{n}.mcap" for n in range(1, len(names) + 1)]
     assert len(names) >= 4
     log = open_log(*(tmp_path / name for name in names))

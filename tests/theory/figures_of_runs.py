@@ -9,7 +9,7 @@ import pytest
 from trilat_studies.measure_run import RunMetrics
 
 from trilat_net.scenario import load_scenario
-from trilat_net.scenario.expect import ALL_SITES_QUANTITIES, window_quantities
+from trilat_net.scenario.expect import ALL_SITES_QUANTITIES, ExpectWindow
 
 Overrides = dict[str, Any]
 
@@ -23,7 +23,9 @@ def measure_run(
             "from_s": from_s,
             "to_s": to_s,
             "site": site,
-            **dict.fromkeys(window_quantities(2) if site else ALL_SITES_QUANTITIES, (0, 0)),
+            **dict.fromkeys(
+                ExpectWindow.list_quantities(2) if site else ALL_SITES_QUANTITIES, (0, 0)
+            ),
         }
         for from_s, to_s, site in windows
     ]

@@ -25,7 +25,7 @@ from ..core import BLEND_S, POSE, POSITION, Array
 from ..log import Ints, Log, SiteLog, choose_nearest_vectors, compute_task_errors
 from ..net import RESTING_MODES, TASK_VECTORS
 from ..records import NS_PER_S
-from ..scenario import Limits, Scenario
+from ..scenario import Scenario
 
 Bools = NDArray[np.bool_]
 RECORD_COLUMNS = ("q", "qd", "q_des", "qd_des", "tau", "tau_x", "theta_hat")
@@ -320,25 +320,6 @@ def hold_torque(tau: Array, limit_nm: Array | float, *, digital: bool) -> Array:
     return held
 
 
-def find_unlimited_rows(limits: Limits, qd_des: Array) -> Bools:
-    """Marks the records in which no speed limit restricts the motion that the arm follows.
-
-    The motion that an arm follows is called its reference. The velocity of the reference is
-    limited in each of the n coordinates.
-
-    Args:
-        limits: Limits of the arm's site, with the largest velocity of the reference.
-        qd_des: Velocity of the reference in rad/s, shape (K, n) for K records or (n,) for a
-            single record.
-
-    Returns:
-        True for each record in which every coordinate is slower than its limit, shape (K,) or
-        ().
-    """
-    is_slower = np.abs(qd_des) < limits.motion.qd_des_limit
-    return np.asarray(is_slower.all(axis=-1))
-
-
 def _find_resting_rows(modes: NDArray[Any], tick: Ints, rate_hz: int) -> Bools:
     """Marks the records in which an arm is being brought to rest, or was until shortly before.
 
@@ -396,7 +377,7 @@ def _fill_tick_grid(
     spec = scenario.sites[site_log.name]
     modes = site_log.mode[rows]
     is_running = modes == "run"
-    is_unlimited = find_unlimited_rows(spec.limits, site_log.qd_des[rows])
+    is_unlimited = spec.limits.find_unlimited_rows(site_log.qd_des[rows])
     follows: Bools = (is_running & is_unlimited)[previous_row]
     rests = _NO_ROWS
     if spec.on_stale.action == "glide":

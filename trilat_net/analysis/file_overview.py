@@ -28,7 +28,6 @@ from ..files import reading
 from ..log import (
     SESSION,
     Account,
-    ChannelInfo,
     Log,
     McapReader,
     Progress,
@@ -36,7 +35,7 @@ from ..log import (
     open_log,
     shift_progress,
 )
-from ..net import count_messages, number_message, topics
+from ..net import topics
 from ..records import NS_PER_S
 from ..results import JsonObject, Result, finite_or_none
 from ..scenario import END_WINDOW_S, list_arm_notes
@@ -101,7 +100,8 @@ class FileInventory:
     def __init__(self, paths: Sequence[Path], progress: Progress | None = None) -> None:
         self.files: list[JsonObject] = []
         self.metadata: dict[str, dict[str, str]] = {}
-        self._channel_infos: dict[str, ChannelInfo] = {}
+        # Encoding of the messages and name of their schema, by topic.
+        self._formats: dict[str, tuple[str, str]] = {}
         self._messages: defaultdict[str, _Messages] = defaultdict(
             lambda: _Messages(array("Q"), array("Q"), array("Q"))
         )
@@ -129,7 +129,11 @@ class FileInventory:
             messages.sequence.append(sequence)
             messages.size.append(len(payload))
 
-        self._channel_infos = {**reader.channels, **self._channel_infos}
+        formats = {
+            topic: (channel.encoding, channel.schema)
+            for topic, channel in reader.channels.items()
+        }
+        self._formats = {**formats, **self._formats}
         self.metadata.update(reader.metadata)
         self.files.append(
             {
@@ -169,7 +173,7 @@ class FileInventory:
         Returns:
             Plain values by topic.
         """
-        topics_in_order = dict.fromkeys([*self._channel_infos, *self._messages])
+        topics_in_order = dict.fromkeys([*self._formats, *self._messages])
         channels = {}
         for topic in topics_in_order:
             gaps = _count_gaps(
@@ -188,14 +192,7 @@ class FileInventory:
         Args:
             topic: Topic of the channel.
         """
-        unknown = ChannelInfo(
-            topic=topic,
-            encoding="",
-            schema="",
-            schema_encoding="",
-            metadata={},
-        )
-        channel = self._channel_infos.get(topic, unknown)
+        encoding, schema = self._formats.get(topic, ("", ""))
 
         messages = self._messages[topic]
         log_ns = np.frombuffer(messages.log_ns, dtype=np.uint64)
@@ -215,8 +212,8 @@ class FileInventory:
             "first_log_time_ns": first_ns,
             "last_log_time_ns": last_ns,
             "between_ms": _compute_percentiles(np.diff(signed_ns), unit=1e6),
-            "encoding": channel.encoding,
-            "schema": channel.schema,
+            "encoding": encoding,
+            "schema": schema,
         }
 
 
@@ -249,14 +246,9 @@ def _count_gaps(
     if key.channel not in (topics.STATE, topics.LINK):
         return {"missing": None, "gaps": None, "duplicates": None}
 
-    account = Account()
-    rate_hz = rates_hz[key.member]
-    for tick in sequence:
-        account.receive(number_message(key.channel, tick, rate_hz))
-    for first_tick, last_tick in absences.get(key.member, ()):
-        next_number = count_messages(key.channel, last_tick + 1, rate_hz)
-        first_number = count_messages(key.channel, first_tick, rate_hz)
-        account.mark_unpublished(next_number, first_number)
+    account = Account.of_ticks(
+        key.channel, sequence, rates_hz[key.member], absences.get(key.member, ())
+    )
     return {
         "missing": account.missing,
         "gaps": account.gaps[:MOST_LISTED_GAPS],

@@ -14,7 +14,7 @@ import numpy as np
 from ..core import TAKEN, Array
 from ..errors import UsageError
 from ..log import Ints, Log
-from ..scenario import POLICY, ProgramHand, Scenario
+from ..scenario import POLICY
 
 
 class UserShares(NamedTuple):
@@ -63,7 +63,9 @@ class SharedSlave:
         """
         log = self._log
         held_by_policy = [user for user in self.users if _is_held_by_policy(log, user)]
-        moved_by_program = [user for user in self.users if has_program_hand(log.scenario, user)]
+        moved_by_program = [
+            user for user in self.users if log.scenario.sites[user].has_program_hand
+        ]
         # the last candidate wins, and without any the name is empty
         candidates = ["", *held_by_policy, *moved_by_program]
         return candidates[-1]
@@ -114,17 +116,8 @@ def list_program_sites(log: Log) -> list[str]:
     return [
         site
         for site in log.scenario.sites
-        if has_program_hand(log.scenario, site) or _is_held_by_policy(log, site)
+        if log.scenario.sites[site].has_program_hand or _is_held_by_policy(log, site)
     ]
-
-
-def has_program_hand(scenario: Scenario, site: str) -> bool:
-    """Returns True if a program of the user operates the arm of a site (a hand of kind "own").
-
-    Such a program may react to the motion of the arm. A linearised loop does not contain this
-    reaction, unlike that of an operator whom the scenario describes.
-    """
-    return any(isinstance(hand, ProgramHand) for hand in scenario.sites[site].hands)
 
 
 def _is_held_by_policy(log: Log, site: str) -> bool:

@@ -23,7 +23,7 @@ import numpy as np
 
 from ..core import LIVE_KINDS, OWN_KINDS, SCRIPTED_KINDS, Array, TorqueKind, TorqueSource
 from ..log import Log
-from ..scenario import ActorBase, Scenario, SiteSpec
+from ..scenario import Scenario, SiteSpec
 from .aligned import AlignedRecords, Bools
 from .arm_rows import EndEffectorRows, build_arm_rows
 from .row_reductions import sum_rows
@@ -407,11 +407,11 @@ class TorqueSplit(NamedTuple):
         arm = build_arm_rows(scenario, records.site)
         end_effector = arm.place_end_effector(records.q, records.qd)
 
-        def add_torques(sources: Iterable[ActorBase], *, sampled: bool) -> Array:
+        def add_torques(actors: Iterable[TorqueSource], *, sampled: bool) -> Array:
             """Returns the sum of the torques that the models of operators or environments give.
 
             Args:
-                sources: The operators or environments.
+                actors: The operators or environments.
                 sampled: True to add only torques that are computed once per tick and then
                     constant. False to add only torques that follow the motion continuously.
 
@@ -419,8 +419,7 @@ class TorqueSplit(NamedTuple):
                 The sum in each of K records for each of n joints, shape (K, n).
             """
             total = np.zeros_like(records.q)
-            for source in sources:
-                actor = source.actor
+            for actor in actors:
                 if actor.sampled is not sampled:
                     continue
                 rows = SourceRows(actor)
@@ -441,9 +440,11 @@ class TorqueSplit(NamedTuple):
                 total = total + torque
             return total
 
-        environment_now = add_torques(spec.environment, sampled=False)
-        environment_held = add_torques(spec.environment, sampled=True)
-        operator_held = add_torques(spec.hands, sampled=True)
+        environment = [source.actor for source in spec.environment]
+        operators = [source.actor for source in spec.hands]
+        environment_now = add_torques(environment, sampled=False)
+        environment_held = add_torques(environment, sampled=True)
+        operator_held = add_torques(operators, sampled=True)
         operator_now = -records.tau_x - environment_now - environment_held - operator_held
         return TorqueSplit(
             end_effector=end_effector,

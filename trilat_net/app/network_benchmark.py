@@ -53,7 +53,6 @@ from ..net import (
     find_free_endpoints,
     read_member_keys,
 )
-from ..scenario import ConstantDelay
 
 SESSION = "benchmark"
 """Name of the session in whose key space the messages of the benchmark are published."""
@@ -381,10 +380,7 @@ class NetworkNeeds(NamedTuple):
             scenario: The scenario, which describes the arms, their links and the run.
         """
         links = list(scenario.links.values())
-        held_ms = []
-        for link in links:
-            constant_ms = link.delay_ms if isinstance(link, ConstantDelay) else 0.0
-            held_ms.append(max(link.playout_ms, constant_ms))
+        held_ms = [max(link.playout_ms, link.constant_delay_ms or 0.0) for link in links]
         rates_hz = [site.rate_hz for site in scenario.sites.values()]
         # Links whose delay the benchmark measures are analysed with a delay of 1 ms: their
         # actual delay is the result of the benchmark.

@@ -4,10 +4,12 @@ The recorder stores messages, and must not depend on the modules that interpret 
 program that starts the recorder therefore passes this function to it.
 """
 
-from recorder import ReadScenario, RecordedScenario
+from typing import Any
+
+from recorder import ReadScenario
 
 from ..hooks import find_hook
-from ..scenario import parse_embedded
+from ..scenario import Scenario, parse_embedded
 
 
 def make_scenario_reader(views_hz: float = 0.0) -> ReadScenario:
@@ -20,7 +22,7 @@ def make_scenario_reader(views_hz: float = 0.0) -> ReadScenario:
             0, the log contains no such messages.
     """
 
-    def read_scenario(text: str, source: str) -> RecordedScenario:
+    def read_scenario(text: str, source: str) -> tuple[Scenario, Any]:
         """Reads the scenario (TOML text) that a process of the session has sent.
 
         Args:
@@ -32,6 +34,6 @@ def make_scenario_reader(views_hz: float = 0.0) -> ReadScenario:
         """
         scenario = parse_embedded(text, source)
         make_views = find_hook("offer the views of a log")(scenario, views_hz)
-        return RecordedScenario(scenario, make_views)
+        return scenario, make_views
 
     return read_scenario

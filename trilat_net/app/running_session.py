@@ -40,14 +40,12 @@ from ..net import (
     Hand,
     Info,
     OrderName,
+    SessionMembers,
     State,
     SystemClock,
     connect_to_session,
-    find_members,
-    list_past_events,
     read_messages,
     read_records,
-    send_change,
 )
 from ..scenario import PictureDelay, parse_core_change
 from .input_device import Device
@@ -408,9 +406,7 @@ class RunningSession:
         Raises:
             SessionError: The site does not reply in time.
         """
-        return send_change(
-            bus=bus, clock=self._clock, session=self.name, site=site, request=request
-        )
+        return SessionMembers(bus, self._clock, self.name).send_change(site, request)
 
     def end(self) -> list[str]:
         """Ends the session for all arms at the same time, as `trilat stop --end` does.
@@ -493,9 +489,8 @@ class RunningSession:
 
         A process may reply several times. The replies end after `REPLY_TIMEOUT_S`.
         """
-        return find_members(
-            bus, self._clock, self.name, stopped=_never_stopped, timeout_s=REPLY_TIMEOUT_S
-        )
+        members = SessionMembers(bus, self._clock, self.name)
+        return members.find(stopped=_never_stopped, timeout_s=REPLY_TIMEOUT_S)
 
     def _find_running(self, bus: Bus, site: str) -> Info:
         """Waits for the reply of one site, and checks that the site runs.
@@ -777,7 +772,8 @@ class RunningSession:
             now_ns = 0  # time of the newest record, since the start of the session
             history = ShareHistory(scenario, site)
             # The weights may have been changed before this subscription.
-            for event in list_past_events(bus, self._clock, self.name, site):
+            members = SessionMembers(bus, self._clock, self.name)
+            for event in members.list_past_events(site):
                 history.add_change(event.command)
 
             def find() -> dict[str, float]:

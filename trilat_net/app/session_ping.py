@@ -32,7 +32,6 @@ from ..net import (
     Pinger,
     connect_to_session,
     default_endpoint,
-    exact_offset,
     read_messages,
 )
 
@@ -225,8 +224,9 @@ class SessionPing:
 
         estimate = trips.latest if trips else None
         if has_same_clock:
-            estimate = exact_offset(0)
-        if estimate is not None:
+            fields["offset_ns"] = 0
+            fields["bound_us"] = 0.0
+        elif estimate is not None:
             bound_ns = estimate.error_bound_ns(estimate.local_ns, estimate.offset_ns)
             fields["offset_ns"] = estimate.offset_ns
             fields["bound_us"] = bound_ns / 1000

@@ -23,12 +23,9 @@ __all__ = [
     "simulate_scenario",
     "simulate_without_operators",
     # Execution of a log
-    "LinkEffect",
     "LogCheckReport",
     "Rerun",
-    "SiteEffect",
     "check_log_files",
-    "describe_rerun_changes",
     "rerun",
     "verify_log",
     # Twins
@@ -44,7 +41,6 @@ __all__ = [
 if TYPE_CHECKING:
     from .fused import FusedRun, check_fusable, explain_not_repeatable
     from .log_checks import LogCheckReport, check_log_files
-    from .rerun_execution import describe_rerun_changes
     from .twins import LEAST_PUSH, MOST_PUSH, PUSH_RAD, SMALLEST, Push, TwinPath, Twins
     from .unwritten_run import simulate_columns
     from .verification import verify_log
@@ -56,14 +52,13 @@ if TYPE_CHECKING:
         simulate_scenario,
     )
     from .virtual_comparison import find_absent_samples, simulate_without_operators
-    from .what_if import LinkEffect, Rerun, SiteEffect, rerun
+    from .what_if import Rerun, rerun
 else:
     __getattr__ = import_on_use(
         __name__,
         {
             "fused": "FusedRun check_fusable explain_not_repeatable",
             "log_checks": "LogCheckReport check_log_files",
-            "rerun_execution": "describe_rerun_changes",
             "twins": "LEAST_PUSH MOST_PUSH PUSH_RAD Push SMALLEST TwinPath Twins",
             "unwritten_run": "simulate_columns",
             "verification": "verify_log",
@@ -71,6 +66,6 @@ else:
                 "SimulatedLog check_virtual execute_virtual record_virtual simulate_scenario"
             ),
             "virtual_comparison": "find_absent_samples simulate_without_operators",
-            "what_if": "LinkEffect Rerun SiteEffect rerun",
+            "what_if": "Rerun rerun",
         },
     )

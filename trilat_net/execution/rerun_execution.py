@@ -54,12 +54,7 @@ from .verification import (
     equal_record,
     find_first_difference,
 )
-from .virtual_network import (
-    Deliveries,
-    complete_deliveries,
-    read_deliveries,
-    retime_deliveries,
-)
+from .virtual_network import Deliveries
 
 RerunOverrides = Mapping[str, Any] | Sequence[str]
 """Changed settings, either by key or as texts "KEY=VALUE"."""
@@ -86,7 +81,7 @@ class _ChangedValue(NamedTuple):
 class RerunRequest:
     """A checked request for a rerun: which sites of a log to execute again, and how.
 
-    `resolve_rerun_request` creates it. The sites (arm controllers) that are not executed keep
+    `RerunRequest.resolve` creates it. The sites (arm controllers) that are not executed keep
     the records (results of control periods) of the log.
 
     Attributes:
@@ -115,60 +110,86 @@ class RerunRequest:
         """
         return "open loop" if self.recorded else "closed loop"
 
+    def describe_changes(self) -> list[str]:
+        """Describes which settings the rerun changes, in lines for the user.
 
-def resolve_rerun_request(
-    log: Log, replace: Sequence[str], overrides: RerunOverrides, *, closed_loop: bool
-) -> RerunRequest:
-    """Checks a user's request for a rerun, and applies its changes to the scenario of the log.
+        If several sites (arm controllers) or links are changed in the same way, they share a
+        line.
 
-    A rerun executes sites of a log again, usually with changed settings. In a closed loop, all
-    sites are executed. Otherwise the sites that are not executed keep their records.
+        Returns:
+            One line for each kind of change. Empty if nothing is changed.
+        """
+        owners: dict[tuple[str, str], list[str]] = {}
+        for subject, owner, change in _describe_changes(self):
+            owners.setdefault((subject, change), []).append(owner)
 
-    Args:
-        log: Log of a run, which contains its scenario.
-        replace: Names of the sites to execute. Empty in a closed loop.
-        overrides: Changed settings, in the form that `load_scenario` accepts.
-        closed_loop: If True, all sites are executed.
+        lines = []
+        for (subject, change), names in owners.items():
+            if subject == "link" and len(names) == len(self.scenario.links):
+                lines.append(f"every link: {change}")
+            elif subject == "link":
+                lines.append(f"{', '.join(names)}: {change}")
+            elif all(names):
+                lines.append(f"{subject} of {', '.join(names)}: {change}")
+            else:
+                lines.append(f"{subject}: {change}")
+        return lines
 
-    Raises:
-        UsageError: The sites are not named, or are named in two ways.
-        ScenarioError: There is no such site, or a change is not valid or cannot have an effect.
-    """
-    original = log.scenario
-    names = original.names
-    if closed_loop and replace:
-        raise UsageError(
-            "--closed-loop executes every site: leave out either --replace or --closed-loop"
+    @classmethod
+    def resolve(
+        cls, log: Log, replace: Sequence[str], overrides: RerunOverrides, *, closed_loop: bool
+    ) -> "RerunRequest":
+        """Checks a request for a rerun, and applies its changes to the scenario of the log.
+
+        A rerun executes sites of a log again, usually with changed settings. In a closed loop,
+        all sites are executed. Otherwise the sites that are not executed keep their records.
+
+        Args:
+            log: Log of a run, which contains its scenario.
+            replace: Names of the sites to execute. Empty in a closed loop.
+            overrides: Changed settings, in the form that `load_scenario` accepts.
+            closed_loop: If True, all sites are executed.
+
+        Raises:
+            UsageError: The sites are not named, or are named in two ways.
+            ScenarioError: There is no such site, or a change is not valid or cannot have an
+                effect.
+        """
+        original = log.scenario
+        names = original.names
+        if closed_loop and replace:
+            raise UsageError(
+                "--closed-loop executes every site: leave out either --replace or --closed-loop"
+            )
+        if not closed_loop and not replace:
+            hint = f"--replace NAME (one of {', '.join(names)}), or --closed-loop for all sites"
+            raise UsageError(f"name the sites to execute: give {hint}")
+
+        for name in replace:
+            original.find_site(name)
+        replaced = tuple(name for name in names if closed_loop or name in replace)
+        _refuse_external_sites(original, replaced)
+        recorded = tuple(name for name in names if name not in replaced)
+
+        for text in overrides:  # keys of a mapping, or texts like KEY=VALUE
+            key = text if isinstance(overrides, Mapping) else text.partition("=")[0].strip()
+            _check_key(key, replaced, recorded)
+
+        requested = load_scenario(original, overrides)
+        _check_recorded_limits(original, requested, recorded)
+        scenario = requested
+        if recorded:
+            scenario = _join_scenarios(original, requested, recorded)
+        changes = _find_changes(original, scenario)
+        requested_changes = _find_changes(original, requested)
+        return cls(
+            original=original,
+            scenario=scenario,
+            replaced=replaced,
+            recorded=recorded,
+            changes=changes,
+            without_effect=[change for change in requested_changes if change not in changes],
         )
-    if not closed_loop and not replace:
-        hint = f"--replace NAME (one of {', '.join(names)}), or --closed-loop for all sites"
-        raise UsageError(f"name the sites to execute: give {hint}")
-
-    for name in replace:
-        original.find_site(name)
-    replaced = tuple(name for name in names if closed_loop or name in replace)
-    _refuse_external_sites(original, replaced)
-    recorded = tuple(name for name in names if name not in replaced)
-
-    for text in overrides:  # keys of a mapping, or texts like KEY=VALUE
-        key = text if isinstance(overrides, Mapping) else text.partition("=")[0].strip()
-        _check_key(key, replaced, recorded)
-
-    requested = load_scenario(original, overrides)
-    _check_recorded_limits(original, requested, recorded)
-    scenario = requested
-    if recorded:
-        scenario = _join_scenarios(original, requested, recorded)
-    changes = _find_changes(original, scenario)
-    requested_changes = _find_changes(original, requested)
-    return RerunRequest(
-        original=original,
-        scenario=scenario,
-        replaced=replaced,
-        recorded=recorded,
-        changes=changes,
-        without_effect=[change for change in requested_changes if change not in changes],
-    )
 
 
 def _refuse_external_sites(original: Scenario, replaced: Sequence[str]) -> None:
@@ -309,34 +330,6 @@ def _find_changes(original: Scenario, other: Scenario) -> list[_ChangedValue]:
         for key in before | after
         if before.get(key) != after.get(key)
     ]
-
-
-def describe_rerun_changes(request: RerunRequest) -> list[str]:
-    """Describes which settings a rerun changes, in lines for the user.
-
-    If several sites (arm controllers) or links are changed in the same way, they share a line.
-
-    Args:
-        request: The checked request for the rerun.
-
-    Returns:
-        One line for each kind of change. Empty if nothing is changed.
-    """
-    owners: dict[tuple[str, str], list[str]] = {}
-    for subject, owner, change in _describe_changes(request):
-        owners.setdefault((subject, change), []).append(owner)
-
-    lines = []
-    for (subject, change), names in owners.items():
-        if subject == "link" and len(names) == len(request.scenario.links):
-            lines.append(f"every link: {change}")
-        elif subject == "link":
-            lines.append(f"{', '.join(names)}: {change}")
-        elif all(names):
-            lines.append(f"{subject} of {', '.join(names)}: {change}")
-        else:
-            lines.append(f"{subject}: {change}")
-    return lines
 
 
 def _describe_changes(request: RerunRequest) -> Iterator[tuple[str, str, str]]:
@@ -731,13 +724,13 @@ class RerunExecution:
         original = self._log.scenario
         scenario = self._request.scenario
         if not self._request.changes:
-            return read_deliveries(site_log)
+            return Deliveries.read(site_log)
 
         rates_hz = [original.sites[peer].rate_hz for peer in site_log.peers]
         new_rates_hz = [scenario.sites[peer].rate_hz for peer in site_log.peers]
         new_rate_hz = scenario.sites[name].rate_hz
         last_ticks = [self._log.last_ticks[peer] for peer in site_log.peers]
-        deliveries = complete_deliveries(site_log, rates_hz, last_ticks)
+        deliveries = Deliveries.complete(site_log, rates_hz, last_ticks)
         if site_log.rate_hz == new_rate_hz and rates_hz == new_rates_hz:
             return deliveries
 
@@ -747,8 +740,7 @@ class RerunExecution:
                 "if the records of a site begin after the start of the run, the rates of the "
                 "site and of its peers cannot be changed"
             )
-        return retime_deliveries(
-            deliveries=deliveries,
+        return deliveries.retime(
             rate_hz=site_log.rate_hz,
             new_rate_hz=new_rate_hz,
             rates_hz=rates_hz,

@@ -93,6 +93,25 @@ class RecordDifference(NamedTuple):
         location = f"{self.site}, tick {self.tick}, {self.field}"
         return f"{location}: logged {logged}, computed {computed}"
 
+    @classmethod
+    def of_law_failure(cls, failure: LawFailed) -> "RecordDifference":
+        """Describes a user's control law that fails when a log is executed again.
+
+        The law did not fail in the logged session. The site with the law (process that runs one
+        arm) cannot be executed further. The report counts the failure as a logged record
+        (result of a control period) that the new execution did not reproduce.
+
+        Args:
+            failure: The error of the control law.
+        """
+        return cls(
+            site=failure.site,
+            tick=failure.tick or 0,
+            field="record",
+            logged="is there",
+            computed=failure.problem,
+        )
+
 
 def _format_value(value: object) -> str:
     """Returns a value as a string. The text of a floating-point number also shows its bits."""
@@ -114,25 +133,6 @@ def _equal_to_tolerance(a: float, b: float) -> bool:
     should still agree to this extent.
     """
     return abs(a - b) <= TOLERANCE * (1.0 + abs(a))
-
-
-def describe_law_failure(failure: LawFailed) -> RecordDifference:
-    """Describes a user's control law that fails when a log is executed again.
-
-    The law did not fail in the logged session. The site with the law (process that runs one
-    arm) cannot be executed further. The report counts the failure as a logged record (result of
-    a control period) that the new execution did not reproduce.
-
-    Args:
-        failure: The error of the control law.
-    """
-    return RecordDifference(
-        site=failure.site,
-        tick=failure.tick or 0,
-        field="record",
-        logged="is there",
-        computed=failure.problem,
-    )
 
 
 _get_vectors = attrgetter(*STATE_VECTORS, "mem")
@@ -585,7 +585,9 @@ class _SiteVerifier:
                 result.unjudged += 1
         except LawFailed as failure:
             self._law_failed = True
-            result.add_difference(describe_law_failure(failure)._replace(tick=state.tick))
+            result.add_difference(
+                RecordDifference.of_law_failure(failure)._replace(tick=state.tick)
+            )
         except ValueError as error:
             # The log lists more changes ("cmd") than a site accepts.
             self._certain = False

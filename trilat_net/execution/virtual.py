@@ -39,12 +39,12 @@ from ..log import (
     VIZ_HZ,
     Account,
     Log,
+    LogContents,
     LogFile,
     LogWriter,
     Sink,
     collect_provenance,
     compute_virtual_boot,
-    read_contents,
 )
 from ..net import (
     SENT_TIME_SINCE,
@@ -505,24 +505,11 @@ def _find_ready(
     return 0
 
 
-def compute_boot(scenario: Scenario, site: str) -> int:
-    """Returns the number by which logs of simulations identify the start of a site.
-
-    In a live session, every start of a process gets a random number. In a simulation (virtual
-    time), the number is a function of the scenario, so that repeated runs write the same log.
-
-    Args:
-        scenario: Description of the experiment.
-        site: Name of the site.
-    """
-    return compute_virtual_boot(scenario.sha256, site)
-
-
 class _VirtualChannels(SiteChannels):
     """Channels of one site of a virtual run, written while the run is executed."""
 
     def __init__(self, scenario: Scenario, site: Site, writer: LogWriter) -> None:
-        boot = compute_boot(scenario, site.name)
+        boot = compute_virtual_boot(scenario.sha256, site.name)
         super().__init__(scenario, scenario.name, site.name, boot)
         self._writer = writer
         self._executed_site = site
@@ -721,7 +708,7 @@ class SimulatedLog(Log):
         stream = io.BytesIO()
         write(stream, 0.0)
         stream.seek(0)
-        super().__init__(read_contents(stream, "log", trusted=True))
+        super().__init__(LogContents.read(stream, "log", trusted=True))
         self._write = write
 
     def save(self, path: str | Path, *, force: bool = False) -> Path:

@@ -32,12 +32,11 @@ from .resumption import ArrivalEntry, find_recorded_hand
 from .verification import (
     PROGRESS_EVERY,
     RecordDifference,
-    describe_law_failure,
     equal_bits,
     equal_record,
     find_first_difference,
 )
-from .virtual_network import Network, RecordedNetwork, complete_deliveries, read_deliveries
+from .virtual_network import Deliveries, Network, RecordedNetwork
 
 
 class RecordComparison(NamedTuple):
@@ -118,7 +117,7 @@ def _compare_records(
             if first is None or (difference is not None and difference.tick < first.tick):
                 first = difference
     except LawFailed as failure:  # the law did not fail when the log was recorded
-        first = first or describe_law_failure(failure)
+        first = first or RecordDifference.of_law_failure(failure)
     return RecordComparison(records, identical, first)
 
 
@@ -349,8 +348,8 @@ def _read_arrivals(log: Log, name: str) -> Mapping[int, Sequence[ArrivalEntry]]:
     rates_hz = [log.scenario.sites[peer].rate_hz for peer in site_log.peers]
     ends = [log.last_ticks[peer] for peer in site_log.peers]
     with suppress(LogError):
-        return complete_deliveries(site_log, rates_hz, ends).entries
-    return read_deliveries(site_log).entries
+        return Deliveries.complete(site_log, rates_hz, ends).entries
+    return Deliveries.read(site_log).entries
 
 
 def _cut_to_records(log: Log) -> Scenario:

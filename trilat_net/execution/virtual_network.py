@@ -198,84 +198,134 @@ class Deliveries(NamedTuple):
     first: int
     last: int
 
+    @classmethod
+    def read(cls, site_log: SiteLog) -> "Deliveries":
+        """Reads from a site's records which states of other sites arrived in each tick.
 
-def read_deliveries(site_log: SiteLog) -> Deliveries:
-    """Reads from a site's records which states of other sites arrived in each tick.
+        A site is an arm controller, and a tick one of its control periods. Ticks without a
+        record are left out; `Deliveries.complete` fills them in.
 
-    A site is an arm controller, and a tick one of its control periods. Ticks without a record
-    are left out; `complete_deliveries` fills them in.
-
-    Args:
-        site_log: Records of the site, each of which lists the samples that arrived in its tick.
-    """
-    counts, rows = site_log.arrivals
-    arrivals = rows.tolist()  # those of all ticks, one after another
-    peer_count = len(site_log.peers)
-    entries: dict[int, Sequence[ArrivalEntry]] = {}
-    start = 0
-    for tick, count in zip(site_log.tick.tolist(), counts.tolist(), strict=True):
-        stop = start + count
-        # A damaged record may list a peer that the site does not have.
-        entries[tick] = [entry for entry in arrivals[start:stop] if 0 <= entry[0] < peer_count]
-        start = stop
-    return Deliveries(
-        entries=entries,
-        unrecorded=frozenset(),
-        first=min(entries, default=0),
-        last=max(entries, default=-1),
-    )
-
-
-def complete_deliveries(
-    site_log: SiteLog, rates_hz: Sequence[int], last_ticks: Sequence[int]
-) -> Deliveries:
-    """Returns the arrivals at a site for every tick from its first to its last record.
-
-    If the record of a tick is missing, the log does not say which samples arrived in it. A
-    sample that no record lists is assumed to have arrived in a tick of this kind, if such a
-    tick is possible. Three conditions must hold: the tick is after the sample was sent; it is
-    after the arrival of the last earlier sample that a record lists; and it is before the
-    arrival of the first later sample. Of several possible ticks, the tick whose delay is
-    nearest to the median delay of the link is chosen.
-
-    Args:
-        site_log: Records of the site, each of which lists the samples that arrived in its tick.
-        rates_hz: Tick rates of the sites that send samples to it (its peers), in Hz.
-        last_ticks: Last tick of each peer, in the same order.
-
-    Raises:
-        LogError: Fewer than half of the ticks have a record.
-    """
-    recorded = read_deliveries(site_log)
-    tick_count = recorded.last + 1 - recorded.first
-    if len(recorded.entries) == tick_count:
-        return recorded
-    if 2 * len(recorded.entries) < tick_count:
-        raise LogError(
-            f"{site_log.name} has records of only {len(recorded.entries)} of "
-            f"{count_nouns(tick_count, 'tick')}: too few to execute the ticks between them"
+        Args:
+            site_log: Records of the site, each of which lists the samples that arrived in its
+                tick.
+        """
+        counts, rows = site_log.arrivals
+        arrivals = rows.tolist()  # those of all ticks, one after another
+        peer_count = len(site_log.peers)
+        entries: dict[int, Sequence[ArrivalEntry]] = {}
+        start = 0
+        for tick, count in zip(site_log.tick.tolist(), counts.tolist(), strict=True):
+            stop = start + count
+            # A damaged record may list a peer that the site does not have.
+            entries[tick] = [
+                entry for entry in arrivals[start:stop] if 0 <= entry[0] < peer_count
+            ]
+            start = stop
+        return cls(
+            entries=entries,
+            unrecorded=frozenset(),
+            first=min(entries, default=0),
+            last=max(entries, default=-1),
         )
 
-    unrecorded = [
-        tick for tick in range(recorded.first, recorded.last) if tick not in recorded.entries
-    ]
-    assumed: dict[int, list[list[int]]] = {}
-    for peer, (peer_hz, end) in enumerate(zip(rates_hz, last_ticks, strict=True)):
-        arrivals = _assume_arrivals(
-            recorded=recorded,
-            unrecorded=unrecorded,
-            rate_hz=site_log.rate_hz,
-            peer=peer,
-            peer_hz=peer_hz,
-            end=end,
-        )
-        for tick, entry in arrivals:
-            assumed.setdefault(tick, []).append(entry)
+    @classmethod
+    def complete(
+        cls, site_log: SiteLog, rates_hz: Sequence[int], last_ticks: Sequence[int]
+    ) -> "Deliveries":
+        """Returns the arrivals at a site for every tick from its first to its last record.
 
-    entries = dict(recorded.entries)
-    for tick, tick_entries in assumed.items():
-        entries[tick] = sorted(tick_entries)
-    return recorded._replace(entries=entries, unrecorded=frozenset(unrecorded))
+        If the record of a tick is missing, the log does not say which samples arrived in it. A
+        sample that no record lists is assumed to have arrived in a tick of this kind, if such a
+        tick is possible. Three conditions must hold: the tick is after the sample was sent; it
+        is after the arrival of the last earlier sample that a record lists; and it is before
+        the arrival of the first later sample. Of several possible ticks, the tick whose delay
+        is nearest to the median delay of the link is chosen.
+
+        Args:
+            site_log: Records of the site, each of which lists the samples that arrived in its
+                tick.
+            rates_hz: Tick rates of the sites that send samples to it (its peers), in Hz.
+            last_ticks: Last tick of each peer, in the same order.
+
+        Raises:
+            LogError: Fewer than half of the ticks have a record.
+        """
+        recorded = Deliveries.read(site_log)
+        tick_count = recorded.last + 1 - recorded.first
+        if len(recorded.entries) == tick_count:
+            return recorded
+        if 2 * len(recorded.entries) < tick_count:
+            raise LogError(
+                f"{site_log.name} has records of only {len(recorded.entries)} of "
+                f"{count_nouns(tick_count, 'tick')}: too few to execute the ticks between them"
+            )
+
+        unrecorded = [
+            tick
+            for tick in range(recorded.first, recorded.last)
+            if tick not in recorded.entries
+        ]
+        assumed: dict[int, list[list[int]]] = {}
+        for peer, (peer_hz, end) in enumerate(zip(rates_hz, last_ticks, strict=True)):
+            arrivals = _assume_arrivals(
+                recorded=recorded,
+                unrecorded=unrecorded,
+                rate_hz=site_log.rate_hz,
+                peer=peer,
+                peer_hz=peer_hz,
+                end=end,
+            )
+            for tick, entry in arrivals:
+                assumed.setdefault(tick, []).append(entry)
+
+        entries = dict(recorded.entries)
+        for tick, tick_entries in assumed.items():
+            entries[tick] = sorted(tick_entries)
+        return recorded._replace(entries=entries, unrecorded=frozenset(unrecorded))
+
+    def retime(
+        self,
+        rate_hz: int,
+        new_rate_hz: int,
+        rates_hz: Sequence[int],
+        new_rates_hz: Sequence[int],
+    ) -> "Deliveries":
+        """Converts the arrivals of a log to arrivals for sites with other tick rates.
+
+        The network stays the same. For each sample of the new run, the last sample of the log
+        that was not sent later serves as its model. The new sample takes as long from its time
+        stamp to the tick of its arrival as the model did. If the model never arrived, the new
+        sample does not arrive either.
+
+        Args:
+            rate_hz: Tick rate of the site in the log, in Hz.
+            new_rate_hz: Tick rate of the site in the new run, in Hz.
+            rates_hz: Tick rates of its peers in the log, in Hz.
+            new_rates_hz: Tick rates of its peers in the new run, in Hz.
+        """
+        end_ns = self.last * NS_PER_S // rate_hz
+        entries: dict[int, list[ArrivalEntry]] = {}
+        for peer, (old_hz, new_hz) in enumerate(zip(rates_hz, new_rates_hz, strict=True)):
+            first_arrivals = _find_first_arrivals(self, peer)
+            for sample_tick in range(end_ns * new_hz // NS_PER_S + 1):
+                stamp_ns = sample_tick * NS_PER_S // new_hz
+                # The last sample m of the log with the stamp m * NS_PER_S // old_hz <=
+                # stamp_ns.
+                model_tick = ((stamp_ns + 1) * old_hz - 1) // NS_PER_S
+                if model_tick not in first_arrivals:
+                    continue
+                arrival_tick, latency_us = first_arrivals[model_tick]
+                arrival_ns = arrival_tick * NS_PER_S // rate_hz
+                model_stamp_ns = model_tick * NS_PER_S // old_hz
+                lag_ns = arrival_ns - model_stamp_ns
+                new_arrival_tick = _round_up_to_tick(stamp_ns + lag_ns, new_rate_hz)
+                entries.setdefault(new_arrival_tick, []).append((peer, sample_tick, latency_us))
+        return Deliveries(
+            entries=dict(entries),
+            unrecorded=frozenset(),
+            first=0,
+            last=end_ns * new_rate_hz // NS_PER_S,
+        )
 
 
 def _find_first_arrivals(deliveries: Deliveries, peer: int) -> dict[int, tuple[int, int]]:
@@ -365,48 +415,3 @@ def _assume_arrivals(
 def _round_up_to_tick(t_ns: int, rate_hz: int) -> int:
     """Returns the first tick at or after a time, in exact integer arithmetic."""
     return -(-t_ns * rate_hz // NS_PER_S)
-
-
-def retime_deliveries(
-    deliveries: Deliveries,
-    rate_hz: int,
-    new_rate_hz: int,
-    rates_hz: Sequence[int],
-    new_rates_hz: Sequence[int],
-) -> Deliveries:
-    """Converts the arrivals of a log to arrivals for sites with other tick rates.
-
-    The network stays the same. For each sample of the new run, the last sample of the log that
-    was not sent later serves as its model. The new sample takes as long from its time stamp to
-    the tick of its arrival as the model did. If the model never arrived, the new sample does
-    not arrive either.
-
-    Args:
-        deliveries: Arrivals at the site in the log.
-        rate_hz: Tick rate of the site in the log, in Hz.
-        new_rate_hz: Tick rate of the site in the new run, in Hz.
-        rates_hz: Tick rates of its peers in the log, in Hz.
-        new_rates_hz: Tick rates of its peers in the new run, in Hz.
-    """
-    end_ns = deliveries.last * NS_PER_S // rate_hz
-    entries: dict[int, list[ArrivalEntry]] = {}
-    for peer, (old_hz, new_hz) in enumerate(zip(rates_hz, new_rates_hz, strict=True)):
-        first_arrivals = _find_first_arrivals(deliveries, peer)
-        for sample_tick in range(end_ns * new_hz // NS_PER_S + 1):
-            stamp_ns = sample_tick * NS_PER_S // new_hz
-            # The last sample m of the log with the stamp m * NS_PER_S // old_hz <= stamp_ns.
-            model_tick = ((stamp_ns + 1) * old_hz - 1) // NS_PER_S
-            if model_tick not in first_arrivals:
-                continue
-            arrival_tick, latency_us = first_arrivals[model_tick]
-            arrival_ns = arrival_tick * NS_PER_S // rate_hz
-            model_stamp_ns = model_tick * NS_PER_S // old_hz
-            lag_ns = arrival_ns - model_stamp_ns
-            new_arrival_tick = _round_up_to_tick(stamp_ns + lag_ns, new_rate_hz)
-            entries.setdefault(new_arrival_tick, []).append((peer, sample_tick, latency_us))
-    return Deliveries(
-        entries=dict(entries),
-        unrecorded=frozenset(),
-        first=0,
-        last=end_ns * new_rate_hz // NS_PER_S,
-    )

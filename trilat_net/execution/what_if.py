@@ -50,15 +50,7 @@ from ..net import READABLE, State, decode
 from ..own_code import find_user_laws
 from ..records import NS_PER_S, Mode
 from ..results import Result, finite_or_none
-from .rerun_execution import (
-    RerunExecution,
-    RerunOverrides,
-    RerunRequest,
-    RerunSite,
-    RerunTick,
-    describe_rerun_changes,
-    resolve_rerun_request,
-)
+from .rerun_execution import RerunExecution, RerunOverrides, RerunRequest, RerunSite, RerunTick
 from .resumption import read_output
 from .verification import RecordDifference
 from .virtual import SiteChannels, SiteEntry, render_accounts
@@ -76,7 +68,7 @@ class LogAndRerun(NamedTuple):
     after: float
 
 
-class SiteEffect(NamedTuple):
+class _SiteEffect(NamedTuple):
     """Effect of changed settings on one arm: how a repeated run differs from the log.
 
     The figures describe a site (arm controller). They are computed from the ticks (control
@@ -126,7 +118,7 @@ class SiteEffect(NamedTuple):
     torque_max_nm: LogAndRerun | None = None
 
 
-class LinkEffect(NamedTuple):
+class _LinkEffect(NamedTuple):
     """Difference that a rerun makes to one link: how old the samples are when they are used.
 
     A link is the directed connection from one site (arm controller) to another. Ages are
@@ -189,7 +181,7 @@ class _CommonRecords(NamedTuple):
 
 def _compare_site_rerun(
     log: Log, request: RerunRequest, site: RerunSite, ticks: Sequence[RerunTick]
-) -> tuple[SiteEffect, list[LinkEffect]]:
+) -> tuple[_SiteEffect, list[_LinkEffect]]:
     """Computes how a repeated run differs at one arm, and on the links to this arm.
 
     Args:
@@ -207,7 +199,7 @@ def _compare_site_rerun(
     diverged_at_s = None
     if executed and executed[-1].mode is Mode.DIVERGED:
         diverged_at_s = executed[-1].t_ns / NS_PER_S
-    effect = SiteEffect(
+    effect = _SiteEffect(
         site.name,
         executed=len(executed),
         compared=len(records.before_rows),
@@ -289,7 +281,7 @@ def _find_largest(values: Array) -> float:
 
 def _compare_links(
     log: Log, request: RerunRequest, records: _CommonRecords
-) -> list[LinkEffect]:
+) -> list[_LinkEffect]:
     """Returns the differences of the delays on the network links to an arm in the repeated run.
 
     Args:
@@ -311,7 +303,7 @@ def _compare_links(
         after_ms = after_ms[has_ages]
         mean = LogAndRerun(float(before_ms.mean()), float(after_ms.mean()))
         largest = LogAndRerun(float(before_ms.max()), float(after_ms.max()))
-        effects.append(LinkEffect(f"{peer}->{records.before.name}", mean, largest))
+        effects.append(_LinkEffect(f"{peer}->{records.before.name}", mean, largest))
     return effects
 
 
@@ -333,8 +325,8 @@ class Rerun(Result):
     before: Log
     request: RerunRequest
     ticks: list[RerunTick]
-    sites: dict[str, SiteEffect]
-    links: dict[str, LinkEffect]
+    sites: dict[str, _SiteEffect]
+    links: dict[str, _LinkEffect]
 
     def headline(self) -> str:
         """Returns one line for the user that describes the repeated run.
@@ -342,7 +334,7 @@ class Rerun(Result):
         The line names the log, the way of execution, the sites (processes that each run one
         arm) that were executed, and the settings that were changed.
         """
-        changes = "; ".join(describe_rerun_changes(self.request)) or "nothing changed"
+        changes = "; ".join(self.request.describe_changes()) or "nothing changed"
         executed = f"{self.request.mode}, {', '.join(self.request.replaced)} executed"
         return f"{self.before.source}: {executed}, {changes}"
 
@@ -518,9 +510,9 @@ def rerun(
     """
     before = log if isinstance(log, Log) else open_log(log)
     names = [replace] if isinstance(replace, str) else list(replace)
-    request = resolve_rerun_request(before, names, set, closed_loop=closed_loop)
-    sites: dict[str, SiteEffect] = {}
-    links: dict[str, LinkEffect] = {}
+    request = RerunRequest.resolve(before, names, set, closed_loop=closed_loop)
+    sites: dict[str, _SiteEffect] = {}
+    links: dict[str, _LinkEffect] = {}
     with process.pause_gc():
         execution = RerunExecution(before, request)
         ticks = list(execution.run(progress))
@@ -564,7 +556,7 @@ def _collect_rerun_metadata(log: Log, request: RerunRequest) -> dict[str, str]:
         "rerun_of_sha256": " ".join(digests.values()),
         "rerun_of_driver": log.driver,
         EXECUTED_SITES_KEY: " ".join(request.replaced),
-        "rerun_changes": "; ".join(describe_rerun_changes(request)),
+        "rerun_changes": "; ".join(request.describe_changes()),
     }
 
 
@@ -649,7 +641,7 @@ def _describe_limits(result: Rerun) -> Iterator[str]:
         yield from _describe_site_limits(effect, log.absent_ticks(effect.site))
 
 
-def _describe_site_limits(effect: SiteEffect, absent_ticks: int) -> Iterator[str]:
+def _describe_site_limits(effect: _SiteEffect, absent_ticks: int) -> Iterator[str]:
     """Yields sentences about missing data of the log that limit the rerun of one site.
 
     A site is a process that runs one arm, a tick is a period of its control loop, and its

@@ -14,7 +14,6 @@ from ..hooks import import_on_use, register_hooks
 __all__ = [
     # Reading a log
     "UNIT_SUFFIXES",
-    "ChannelInfo",
     "Column",
     "IndexedRecords",
     "Ints",
@@ -24,15 +23,15 @@ __all__ = [
     "McapMessage",
     "McapReader",
     "Progress",
-    "RecordScanner",
     "RecordsByTick",
     "SiteLog",
     "UnwrittenLog",
     "Table",
     "compute_task_errors",
     "open_log",
+    "judge_integrity",
     "open_logs",
-    "read_contents",
+    "LogContents",
     "read_link_delays",
     "shift_progress",
     # Writing a log
@@ -62,7 +61,6 @@ __all__ = [
     "VIZ_ROOT",
     "ChannelFilter",
     "active_path",
-    "find_parts",
     # Checking, signing and recovering
     "LAST",
     "MIN_COVERAGE",
@@ -79,7 +77,6 @@ __all__ = [
     "check_signatures",
     "create_signing_keys",
     "describe_unknown_ends",
-    "judge_integrity",
     "recover",
     "sign_log",
     # Orientations
@@ -116,7 +113,6 @@ if TYPE_CHECKING:
         VIZ_ROOT,
         ChannelFilter,
         active_path,
-        find_parts,
     )
     from .log_reader import Log, open_log, open_logs, read_link_delays
     from .log_signature import check_signatures, create_signing_keys, sign_log
@@ -128,15 +124,7 @@ if TYPE_CHECKING:
         PutMessage,
         ReceiveMessage,
     )
-    from .mcap_reader import (
-        ChannelInfo,
-        McapMessage,
-        McapReader,
-        Progress,
-        read_contents,
-        shift_progress,
-    )
-    from .mcap_records import RecordScanner
+    from .mcap_reader import LogContents, McapMessage, McapReader, Progress, shift_progress
     from .mcap_writer import McapWriter, Sink
     from .message_identity import compute_virtual_boot
     from .orientations import (
@@ -169,15 +157,12 @@ else:
             "log_layout": (
                 "ACTIVE_SUFFIX ALL_CHANNELS CHANNEL_TYPES ChannelFilter EXECUTED_SITES_KEY "
                 "MAX_TIME_NS RERUN_DRIVER SCENARIO SESSION SITE_CHANNELS VIZ_ROOT "
-                "active_path find_parts"
+                "active_path"
             ),
             "log_reader": "Log open_log open_logs read_link_delays",
             "log_signature": "check_signatures create_signing_keys sign_log",
             "log_writer": "LogParts LogStorage LogWriter MakeViews PutMessage ReceiveMessage",
-            "mcap_reader": (
-                "ChannelInfo McapMessage McapReader Progress read_contents shift_progress"
-            ),
-            "mcap_records": "RecordScanner",
+            "mcap_reader": "LogContents McapMessage McapReader Progress shift_progress",
             "mcap_writer": "McapWriter Sink",
             "message_identity": "compute_virtual_boot",
             "orientations": (

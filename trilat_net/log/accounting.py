@@ -26,6 +26,7 @@ from itertools import islice
 from typing import NamedTuple
 
 from ..errors import count_nouns
+from ..net import count_messages, number_message
 
 
 class RangeSet:
@@ -184,6 +185,32 @@ class Account:
         self._newest = -1
         self._last_arrival_ns: int | None = None
         self._gaps = RangeSet(MAX_GAPS)
+
+    @classmethod
+    def of_ticks(
+        cls,
+        channel: str,
+        ticks: Sequence[int],
+        rate_hz: int,
+        absences: Sequence[tuple[int, int]],
+    ) -> "Account":
+        """Counts the messages of a site in one channel of a log by their ticks.
+
+        Args:
+            channel: Name of the channel, of the records or of the link statistics.
+            ticks: Tick of every message, in the order of the file.
+            rate_hz: Tick rate of the site, in Hz.
+            absences: Ticks that the site did not execute, as spans (first, last). They are not
+                missing.
+        """
+        account = cls()
+        for tick in ticks:
+            account.receive(number_message(channel, tick, rate_hz))
+        for first_tick, last_tick in absences:
+            next_number = count_messages(channel, last_tick + 1, rate_hz)
+            first_number = count_messages(channel, first_tick, rate_hz)
+            account.mark_unpublished(next_number, first_number)
+        return account
 
     def receive(self, number: int, arrived_ns: int | None = None) -> bool:
         """Counts a message that arrived from its sender without a request.

@@ -33,12 +33,7 @@ from ..recorded_change import count_skipped_ticks
 from ..scenario import Scenario
 from .log_layout import CHANNEL_TYPES, MAX_TIME_NS, RECORDER_CHANNELS, SITE_CHANNELS, VIZ_ROOT
 from .mcap_records import MESSAGE_HEAD, OP_MESSAGE, UnreadableRecord, iterate_records
-from .message_identity import (
-    AnyMessage,
-    MessageIdentity,
-    compute_virtual_boot,
-    identify_message,
-)
+from .message_identity import AnyMessage, MessageIdentity, compute_virtual_boot
 
 _CDR_HEAD = b"\x00\x01"
 """First bytes of a message that was written for viewers, in the encoding of ROS 2."""
@@ -65,59 +60,59 @@ class MessageOrigins(NamedTuple):
     epochs_ns: set[int]
     boots: set[tuple[str, int]]
 
+    @classmethod
+    def find(cls, data: bytes, most: int = _SAMPLED_MESSAGES) -> "MessageOrigins":
+        """Determines the sessions and senders of the first messages of a chunk.
 
-def find_origins(data: bytes, most: int = _SAMPLED_MESSAGES) -> MessageOrigins:
-    """Determines the sessions and senders of the first messages of a chunk.
+        A damaged file may contain a chunk, a block of messages, of another file. Two facts
+        reveal such a chunk: the start time (epoch) of the session, and the boots of the
+        senders, random numbers that identify the starts of their processes. A message shows the
+        epoch in one of two ways:
 
-    A damaged file may contain a chunk, a block of messages, of another file. Two facts reveal
-    such a chunk: the start time (epoch) of the session, and the boots of the senders, random
-    numbers that identify the starts of their processes. A message shows the epoch in one of two
-    ways:
+        - An event that announces the start of a session states the epoch.
+        - A record (result of one period of a control loop) or statistics message states its
+          sending time after the epoch, and is stored with its sending time in Unix time. The
+          difference is the epoch.
 
-    - An event that announces the start of a session states the epoch.
-    - A record (result of one period of a control loop) or statistics message states its sending
-      time after the epoch, and is stored with its sending time in Unix time. The difference is
-      the epoch.
+        Sessions in virtual time start at 0.
 
-    Sessions in virtual time start at 0.
+        Args:
+            data: The unpacked chunk.
+            most: Largest number of messages to decode.
 
-    Args:
-        data: The unpacked chunk.
-        most: Largest number of messages to decode.
-
-    Returns:
-        The start times and the senders. Empty if no message can be decoded.
-    """
-    epochs_ns: set[int] = set()
-    boots: set[tuple[str, int]] = set()
-    decoded = 0
-    for opcode, begin, end in iterate_records(data):
-        if opcode != OP_MESSAGE or end - begin < MESSAGE_HEAD.size:
-            continue
-        if decoded >= most:
-            break
-        decoded += 1
-        _channel, _sequence, _log_ns, publish_ns = MESSAGE_HEAD.unpack_from(data, begin)
-        payload = data[begin + MESSAGE_HEAD.size : end]
-        # The type of the message is unknown, so all types are tried. A payload can be decoded
-        # only as its own type. Any other type raises a WireError.
-        kinds: tuple[Any, ...] = (State, LinkStats, Event)
-        for kind in kinds:
-            with suppress(WireError):
-                message: AnyMessage = decode(payload, kind, READABLE)
-                # The rate affects only the number of the message, which is not used here.
-                any_rate_hz = 1
-                identity = identify_message(message, any_rate_hz)
-                boots.add((identity.sender, message.boot))
-                sent_since_epoch_ns = identity.sent_ns
-                if isinstance(message, Event):
-                    states_epoch = bool(message.epoch_unix_ns)
-                    if states_epoch:
-                        epochs_ns.add(message.epoch_unix_ns)
-                elif sent_since_epoch_ns is not None and publish_ns:
-                    # A stored time of 0 proves nothing.
-                    epochs_ns.add(publish_ns - sent_since_epoch_ns)
-    return MessageOrigins(epochs_ns, boots)
+        Returns:
+            The start times and the senders. Empty if no message can be decoded.
+        """
+        epochs_ns: set[int] = set()
+        boots: set[tuple[str, int]] = set()
+        decoded = 0
+        for opcode, begin, end in iterate_records(data):
+            if opcode != OP_MESSAGE or end - begin < MESSAGE_HEAD.size:
+                continue
+            if decoded >= most:
+                break
+            decoded += 1
+            _channel, _sequence, _log_ns, publish_ns = MESSAGE_HEAD.unpack_from(data, begin)
+            payload = data[begin + MESSAGE_HEAD.size : end]
+            # The type of the message is unknown, so that all types are tried. A payload can be
+            # decoded as its own type only. Any other type raises a WireError.
+            kinds: tuple[Any, ...] = (State, LinkStats, Event)
+            for kind in kinds:
+                with suppress(WireError):
+                    message: AnyMessage = decode(payload, kind, READABLE)
+                    # The rate affects only the number of the message, which is not used here.
+                    any_rate_hz = 1
+                    identity = MessageIdentity.of_message(message, any_rate_hz)
+                    boots.add((identity.sender, message.boot))
+                    sent_since_epoch_ns = identity.sent_ns
+                    if isinstance(message, Event):
+                        states_epoch = bool(message.epoch_unix_ns)
+                        if states_epoch:
+                            epochs_ns.add(message.epoch_unix_ns)
+                    elif sent_since_epoch_ns is not None and publish_ns:
+                        # A stored time of 0 proves nothing.
+                        epochs_ns.add(publish_ns - sent_since_epoch_ns)
+        return cls(epochs_ns, boots)
 
 
 def has_foreign_boots(about: Mapping[str, str], boots: set[tuple[str, int]]) -> bool:
@@ -219,7 +214,7 @@ class ContentCheck:
                 message: AnyMessage = decode(payload, kind, READABLE)
             except WireError:
                 continue
-            identity = identify_message(message, 1)
+            identity = MessageIdentity.of_message(message, 1)
             topic = "/" + topics.key(self._session, identity.sender, identity.channel)
             return topic if self.owns_channel(topic) else ""
         return ""
@@ -306,7 +301,7 @@ class ContentCheck:
             message = decode(payload, kind, READABLE, layout)
         except WireError as error:
             raise UnreadableRecord(f"a message of {topic} cannot be read: {error}") from None
-        return message, identify_message(message, rate_hz)
+        return message, MessageIdentity.of_message(message, rate_hz)
 
     def _check_session_message(
         self, topic: str, sequence: int, publish_ns: int, payload: bytes
@@ -369,7 +364,7 @@ class ContentCheck:
         # Decoding messages is slow, and the boots of live sessions prove nothing.
         if self._about.get("driver") != _VIRTUAL_DRIVER:
             return
-        origins = find_origins(data, _CHECKED_MESSAGES)
+        origins = MessageOrigins.find(data, _CHECKED_MESSAGES)
         if has_foreign_boots(self._about, origins.boots):
             raise UnreadableRecord("a chunk belongs to another run")
 

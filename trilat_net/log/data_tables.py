@@ -196,6 +196,22 @@ class Table:
             all_series.append(series)
         return cast("polars.DataFrame", pl.DataFrame(all_series))
 
+    def to_pandas(self) -> "pandas.DataFrame":
+        """Converts a table of a log to a pandas data frame with the same columns.
+
+        Missing values become None in a column of texts, and NaN in a column of numbers.
+
+        Raises:
+            UsageError: pandas is not installed.
+        """
+        values: dict[str, Any] = {}
+        for column in self.columns:
+            if column.is_text:
+                values[column.name] = column.rows(0, len(column.values))
+            else:
+                values[column.name] = column.numbers()
+        return import_extra("pandas", "frames", "data frames").DataFrame(values)
+
 
 # An entry of the section "Attributes:" in a docstring: name of the field and its meaning.
 _FIELD = re.compile(r"^ {4}(\w+): (.*(?:\n {8,}.*)*)", re.MULTILINE)
@@ -861,23 +877,3 @@ def _to_text(value: str | Mapping[str, Any]) -> str:
     if isinstance(value, str):
         return value
     return json.dumps(value, sort_keys=True) if value else ""
-
-
-def to_pandas_frame(table: Table) -> "pandas.DataFrame":
-    """Converts a table of a log to a pandas data frame with the same columns.
-
-    Missing values become None in a column of texts, and NaN in a column of numbers.
-
-    Args:
-        table: The table.
-
-    Raises:
-        UsageError: pandas is not installed.
-    """
-    values: dict[str, Any] = {}
-    for column in table.columns:
-        if column.is_text:
-            values[column.name] = column.rows(0, len(column.values))
-        else:
-            values[column.name] = column.numbers()
-    return import_extra("pandas", "frames", "data frames").DataFrame(values)

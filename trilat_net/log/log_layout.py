@@ -10,7 +10,6 @@ Invariant:
       The file states the filter.
 """
 
-import glob
 import re
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass
@@ -23,7 +22,7 @@ from ..net import Event, LinkStats, RecorderStats, State, matches_key, topics
 
 ACTIVE_SUFFIX = ".active"
 """Suffix of a log's file name while the log is being recorded."""
-_PART_STEM = re.compile(r"(.+)-(\d{3,})")
+PART_STEM = re.compile(r"(.+)-(\d{3,})")
 """Stem of a part's file name: stem of the log's name, and number of the part."""
 _CHUNK = re.compile(r"\*\*?|(?:\$\*|[^*$#?])+", re.DOTALL)
 """Valid part of a Zenoh key expression, between slashes."""
@@ -73,29 +72,6 @@ def part_path(path: Path, number: int) -> Path:
     return path.with_name(f"{path.stem}-{number:03}{path.suffix}") if number else path
 
 
-def find_parts(path: Path) -> dict[int, Path]:
-    """Finds the existing files of a log that may be divided into parts.
-
-    Finished files and files that are still being recorded both count.
-
-    Args:
-        path: Name of the log. It counts as part 1 if a file of this name exists.
-
-    Returns:
-        The files, by the number of the part. Empty if there are none.
-    """
-    parts: dict[int, Path] = {}
-    for file in (path, active_path(path)):
-        if file.exists():
-            parts.setdefault(1, file)
-    for file in sorted(path.parent.glob(f"{glob.escape(path.stem)}-*")):
-        finished = file.with_name(file.name.removesuffix(ACTIVE_SUFFIX))
-        match = _PART_STEM.fullmatch(finished.stem)
-        if match and match[1] == path.stem and finished.suffix == path.suffix:
-            parts.setdefault(int(match[2]), file)
-    return parts
-
-
 @dataclass(frozen=True, slots=True)
 class ChannelFilter:
     """Selects the channels of a session that are recorded, by key expressions of Zenoh.
@@ -126,7 +102,7 @@ class ChannelFilter:
     def facts(self) -> Mapping[str, str]:
         """Converts the filter to texts, which the metadata of a log contain.
 
-        `parse_filter_facts` converts the texts to a filter again.
+        `ChannelFilter.parse_facts` converts the texts to a filter again.
 
         Returns:
             The key expressions under "include" and "exclude", separated by spaces. Each entry
@@ -162,26 +138,27 @@ class ChannelFilter:
             exclude=tuple(expression.strip("/") for expression in exclude),
         )
 
+    @classmethod
+    def parse_facts(cls, about: Mapping[str, str]) -> "ChannelFilter":
+        """Reads from the metadata of a log which channels were recorded.
+
+        The metadata contain the texts that `ChannelFilter.facts` returns.
+
+        Args:
+            about: Metadata of the session.
+
+        Returns:
+            The filter of the channels. It accepts all channels if the metadata contain no
+            filter.
+        """
+        return cls(
+            include=tuple(about.get("include", "").split()),
+            exclude=tuple(about.get("exclude", "").split()),
+        )
+
 
 ALL_CHANNELS = ChannelFilter()
 """The filter that records all channels."""
-
-
-def parse_filter_facts(about: Mapping[str, str]) -> ChannelFilter:
-    """Reads from the metadata of a log which channels were recorded.
-
-    The metadata contain the texts that `ChannelFilter.facts` returns.
-
-    Args:
-        about: Metadata of the session.
-
-    Returns:
-        The filter of the channels. It accepts all channels if the metadata contain no filter.
-    """
-    return ChannelFilter(
-        include=tuple(about.get("include", "").split()),
-        exclude=tuple(about.get("exclude", "").split()),
-    )
 
 
 VIZ_ROOT = "/viz/"

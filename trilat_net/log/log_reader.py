@@ -57,7 +57,7 @@ from ..net import (
     decode,
     topics,
 )
-from ..own_code import LawFiles, allow_logged_code
+from ..own_code import LawFiles, allow_logged_code, find_user_laws
 from ..records import NS_PER_S
 from ..results import Result
 from ..scenario import (
@@ -77,17 +77,16 @@ from .data_tables import (
     build_events_table,
     build_link_table,
     build_state_table,
-    to_pandas_frame,
 )
 from .log_layout import (
     ACCOUNTS,
     EXECUTED_SITES_KEY,
     PART,
     RERUN_DRIVER,
+    ChannelFilter,
     describe_unfinished,
-    parse_filter_facts,
 )
-from .mcap_reader import ChannelMessages, LogContents, Progress, read_contents, shift_progress
+from .mcap_reader import ChannelMessages, LogContents, Progress, shift_progress
 from .merge import identify_session, merge_parts
 from .record_columns import Ints
 from .session_accounts import SessionAccounts
@@ -251,7 +250,7 @@ class Log(Result, Mapping[str, SiteLog]):
             name: Name of the table, see `table`. If it is empty, the frame has a row per site.
             kind: Kind of the table, see `table`.
         """
-        return to_pandas_frame(self.table(name, kind)) if name else super().to_frame()
+        return self.table(name, kind).to_pandas() if name else super().to_frame()
 
     def plot(
         self,
@@ -409,6 +408,15 @@ class Log(Result, Mapping[str, SiteLog]):
         return f"{name} joint {joint + 1} reached {speed} at {diverged_s:.3f} s"
 
     @property
+    def may_run_user_laws(self) -> bool:
+        """True if every control law of the run that is a user's class may run.
+
+        Whoever permitted the laws of a log also permitted what computes its run again, for
+        example copies of the run that start slightly displaced (twins).
+        """
+        return all(law.allowed for law in find_user_laws(self.scenario))
+
+    @property
     def failed_hands(self) -> list[str]:
         """Sentences about programs that failed while they moved an arm, for reports on the log.
 
@@ -542,7 +550,7 @@ class Log(Result, Mapping[str, SiteLog]):
         is_one_of_several_parts = bool(self.part) and len(self.sources) == 1
         if is_one_of_several_parts:
             return ()  # the events may be in a later part
-        channel_filter = parse_filter_facts(self.session)
+        channel_filter = ChannelFilter.parse_facts(self.session)
         ended_sites = {event.member for event in self.events if event.kind == "end"}
         unknown_ends = []
         for site in self.sites:
@@ -1055,7 +1063,7 @@ def _read_parts(
         for (stream, name), size in zip(files, sizes, strict=True):
             with _convert_errors(name):
                 shifted = shift_progress(progress, bytes_before, sum(sizes))
-                parts.append(read_contents(stream, name, shifted))
+                parts.append(LogContents.read(stream, name, shifted))
             bytes_before += size
     return parts
 

@@ -13,6 +13,7 @@ Invariant (L5):
       two messages.
 """
 
+import glob
 import json
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
@@ -392,6 +393,26 @@ class LogStorage:
         """
         return self.split_bytes is not None or self.split_ns is not None
 
+    def find_parts(self) -> dict[int, Path]:
+        """Finds the existing files of the log, which may be divided into parts.
+
+        Finished files and files that are still being recorded both count.
+
+        Returns:
+            The files, by the number of the part. A file with the name of the log counts as part
+            1. Empty if there are none.
+        """
+        parts: dict[int, Path] = {}
+        for file in (self.path, log_layout.active_path(self.path)):
+            if file.exists():
+                parts.setdefault(1, file)
+        for file in sorted(self.path.parent.glob(f"{glob.escape(self.path.stem)}-*")):
+            finished = file.with_name(file.name.removesuffix(log_layout.ACTIVE_SUFFIX))
+            match = log_layout.PART_STEM.fullmatch(finished.stem)
+            if match and match[1] == self.path.stem and finished.suffix == self.path.suffix:
+                parts.setdefault(int(match[2]), file)
+        return parts
+
     def find_first_part(self) -> tuple[int, str]:
         """Decides with which file the writing begins, and checks that its name is free.
 
@@ -411,7 +432,7 @@ class LogStorage:
                 "--continue keeps the existing files and --force replaces them; give only one "
                 "of these options"
             )
-        parts = log_layout.find_parts(self.path)
+        parts = self.find_parts()
         if self.carry_on and parts:
             last = max(parts)
             return last + 1, parts[last].name.removesuffix(log_layout.ACTIVE_SUFFIX)
@@ -468,7 +489,7 @@ class LogParts:
         # All parts of a replaced log are removed, because remaining parts would seem to belong
         # to the new log.
         if storage.force and storage.splits:
-            for number in (0, *log_layout.find_parts(storage.path)):
+            for number in (0, *storage.find_parts()):
                 path = log_layout.part_path(storage.path, number)
                 path.unlink(missing_ok=True)
                 log_layout.active_path(path).unlink(missing_ok=True)

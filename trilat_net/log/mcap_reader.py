@@ -1,7 +1,7 @@
 """Reads MCAP files chunk by chunk, and collects the messages of a log by topic.
 
 An MCAP file stores messages in compressed chunks. Each message belongs to a channel, which has
-a topic (a name). `McapReader` reads any MCAP file. `read_contents` uses it to read a log of
+a topic (a name). `McapReader` reads any MCAP file. `LogContents.read` uses it to read a log of
 trilat-net, which contains the messages of a session, completely.
 
 Invariant:
@@ -198,7 +198,7 @@ class _MessageBlock(NamedTuple):
 def _make_single_block(message: McapMessage) -> _MessageBlock:
     """Returns a block of one message."""
     length = len(message.payload)
-    run = chunk_walk.allocate_run(1)
+    run = chunk_walk.MessageRun.allocate(1)
     run.ends[0] = length
     run.log_ns.view(np.uint64)[0] = message.log_time_ns
     run.publish_ns.view(np.uint64)[0] = message.publish_time_ns
@@ -274,7 +274,7 @@ class McapReader:
         # number: `_slots` has the number of the channel of each slot.
         self._slots: list[int] = []
         self._slot_of_channel = np.full(chunk_walk.MOST_CHANNELS, -1, np.int32)
-        self._run = chunk_walk.allocate_run(0, chunk_walk.CAPACITY)
+        self._run = chunk_walk.MessageRun.allocate(0, chunk_walk.CAPACITY)
 
         # Memory that may still be used, for all messages and for each channel, in bytes.
         self._memory_left = max(KEPT_BYTES, KEPT_RATIO * self.size) if kept else None
@@ -993,43 +993,49 @@ class LogContents:
             return self.sources[0]
         return f"{self.sources[0]} and {more} more {'parts' if more > 1 else 'part'}"
 
+    @classmethod
+    def read(
+        cls,
+        stream: BinaryIO,
+        name: str,
+        progress: Progress | None = None,
+        *,
+        trusted: bool = False,
+    ) -> "LogContents":
+        """Reads everything in one file of a log into memory, without decoding the messages.
 
-def read_contents(
-    stream: BinaryIO, name: str, progress: Progress | None = None, *, trusted: bool = False
-) -> LogContents:
-    """Reads everything in one file of a log into memory, without decoding the messages.
+        Args:
+            stream: The file, opened for reading.
+            name: Name of the file for error messages.
+            progress: Function that is called after every record of the file.
+            trusted: True if this program has just written the file. The memory for the messages
+                is then not limited. The limit protects against files that were made to do harm,
+                but a file in which arms hardly move may exceed it, because it is compressed so
+                well.
 
-    Args:
-        stream: The file, opened for reading.
-        name: Name of the file for error messages.
-        progress: Function that is called after every record of the file.
-        trusted: True if this program has just written the file. The memory for the messages is
-            then not limited. The limit protects against files that were made to do harm, but a
-            file in which arms hardly move may exceed it, because it is compressed so well.
+        Raises:
+            LogError: The file is not an MCAP file, or not a log of trilat-net.
+        """
+        reader = McapReader(stream, name, progress, kept=not trusted)
+        channels: dict[str, ChannelMessages] = {}
+        for block in reader.blocks(_is_log_topic):
+            channel = channels.setdefault(block.topic, ChannelMessages())
+            channel.add_block(block)
+        _check_head(reader, name)
 
-    Raises:
-        LogError: The file is not an MCAP file, or not a log of trilat-net.
-    """
-    reader = McapReader(stream, name, progress, kept=not trusted)
-    channels: dict[str, ChannelMessages] = {}
-    for block in reader.blocks(_is_log_topic):
-        channel = channels.setdefault(block.topic, ChannelMessages())
-        channel.add_block(block)
-    _check_head(reader, name)
-
-    damaged = [f"{name}: {damage}" for damage in reader.damaged]
-    is_first_part = reader.metadata.get(PART, {}).get("index", "1") == "1"
-    return LogContents(
-        sources=(name,),
-        session=reader.metadata[SESSION],
-        scenario=reader.attachments[SCENARIO],
-        metadata=reader.metadata,
-        channels=channels,
-        complete=reader.complete and not damaged and is_first_part,
-        ended=reader.complete,
-        damaged=damaged,
-        chain=reader.judge_digest(),
-    )
+        damaged = [f"{name}: {damage}" for damage in reader.damaged]
+        is_first_part = reader.metadata.get(PART, {}).get("index", "1") == "1"
+        return cls(
+            sources=(name,),
+            session=reader.metadata[SESSION],
+            scenario=reader.attachments[SCENARIO],
+            metadata=reader.metadata,
+            channels=channels,
+            complete=reader.complete and not damaged and is_first_part,
+            ended=reader.complete,
+            damaged=damaged,
+            chain=reader.judge_digest(),
+        )
 
 
 def _is_log_topic(topic: str) -> bool:

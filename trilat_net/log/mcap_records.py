@@ -100,40 +100,40 @@ class ChunkHead(NamedTuple):
     compression: str
     data_offset: int
 
+    @classmethod
+    def parse(cls, content: bytes, length: int) -> "ChunkHead":
+        """Decodes the head of a chunk (compressed block of messages), and checks its lengths.
 
-def parse_chunk_head(content: bytes, length: int) -> ChunkHead:
-    """Decodes the head of a chunk (compressed block of messages), and checks its lengths.
+        Args:
+            content: Content of the chunk. Its first `_MAX_HEAD_BYTES` bytes suffice.
+            length: Length of the whole content, in bytes.
 
-    Args:
-        content: Content of the chunk. Its first `_MAX_HEAD_BYTES` bytes suffice.
-        length: Length of the whole content, in bytes.
+        Raises:
+            UnreadableRecord: The head is incomplete or contradicts the length.
+        """
+        try:
+            start_ns, end_ns, size, crc, name_bytes = _FIXED_HEAD.unpack_from(content)
+            (packed_bytes,) = _SIZE.unpack_from(content, _FIXED_HEAD.size + name_bytes)
+            compression = content[_FIXED_HEAD.size : _FIXED_HEAD.size + name_bytes].decode()
+        except (struct.error, UnicodeDecodeError):
+            raise UnreadableRecord("a chunk has no valid header") from None
 
-    Raises:
-        UnreadableRecord: The head is incomplete or contradicts the length.
-    """
-    try:
-        start_ns, end_ns, size, crc, name_bytes = _FIXED_HEAD.unpack_from(content)
-        (packed_bytes,) = _SIZE.unpack_from(content, _FIXED_HEAD.size + name_bytes)
-        compression = content[_FIXED_HEAD.size : _FIXED_HEAD.size + name_bytes].decode()
-    except (struct.error, UnicodeDecodeError):
-        raise UnreadableRecord("a chunk has no valid header") from None
-
-    # The compressed records, which follow the head, extend to the end of the chunk.
-    data_offset = _FIXED_HEAD.size + name_bytes + _SIZE.size
-    stated_length = data_offset + packed_bytes
-    if stated_length != length:
-        raise UnreadableRecord(
-            f"a chunk of {count_nouns(length, 'byte')} states a length of "
-            f"{count_nouns(stated_length, 'byte')}"
+        # The compressed records, which follow the head, extend to the end of the chunk.
+        data_offset = _FIXED_HEAD.size + name_bytes + _SIZE.size
+        stated_length = data_offset + packed_bytes
+        if stated_length != length:
+            raise UnreadableRecord(
+                f"a chunk of {count_nouns(length, 'byte')} states a length of "
+                f"{count_nouns(stated_length, 'byte')}"
+            )
+        return cls(
+            start_ns=start_ns,
+            end_ns=end_ns,
+            size=size,
+            crc=crc,
+            compression=compression,
+            data_offset=data_offset,
         )
-    return ChunkHead(
-        start_ns=start_ns,
-        end_ns=end_ns,
-        size=size,
-        crc=crc,
-        compression=compression,
-        data_offset=data_offset,
-    )
 
 
 def unpack_chunk(content: bytes) -> bytes:
@@ -151,7 +151,7 @@ def unpack_chunk(content: bytes) -> bytes:
     Raises:
         UnreadableRecord: The chunk cannot be unpacked, or its size or its checksum is wrong.
     """
-    head = parse_chunk_head(content, len(content))
+    head = ChunkHead.parse(content, len(content))
     limit = max(MAX_UNPACKED_BYTES, MAX_UNPACKED_RATIO * len(content))
     if head.size > limit:
         raise UnreadableRecord(
@@ -529,7 +529,7 @@ class RecordScanner:
         content = self.read(
             frame.offset + RECORD_HEAD_BYTES, min(frame.length, _MAX_HEAD_BYTES)
         )
-        return parse_chunk_head(content, frame.length)
+        return ChunkHead.parse(content, frame.length)
 
     def _find_chunk(self, offset: int) -> int | None:
         """Finds the first readable chunk at or after an offset.

@@ -49,6 +49,59 @@ class MessageIdentity(NamedTuple):
     sequence: int
     sent_ns: int | None
 
+    @classmethod
+    def of_message(cls, message: AnyMessage, rate_hz: int) -> "MessageIdentity":
+        """Determines the sender, the channel and the number of a message from its content.
+
+        Args:
+            message: The decoded message.
+            rate_hz: Tick rate of the sender, in Hz. It is needed to number statistics, which
+                are not sent in every tick. It has no effect on other messages.
+
+        Returns:
+            The identity of the message.
+        """
+        match message:
+            case State():
+                sent_ns = message.sent_ns if message.v >= SENT_TIME_SINCE else message.t_ns
+                return cls(
+                    sender=message.site,
+                    channel=topics.STATE,
+                    number=message.tick,
+                    sequence=message.tick,
+                    sent_ns=sent_ns,
+                )
+            case LinkStats():
+                number = number_message(topics.LINK, message.tick, rate_hz)
+                return cls(
+                    sender=message.site,
+                    channel=topics.LINK,
+                    number=number,
+                    sequence=message.tick,
+                    sent_ns=message.t_ns,
+                )
+            case Event():
+                # Events before the epoch have no time. The recorder stamps its own events when
+                # it receives them.
+                is_stamped = message.t_ns >= 0 and message.member != topics.RECORDER
+                event_ns = message.t_ns if is_stamped else None
+                sequence = max(0, message.n)
+                return cls(
+                    sender=message.member,
+                    channel=topics.EVENT,
+                    number=message.n,
+                    sequence=sequence,
+                    sent_ns=event_ns,
+                )
+            case RecorderStats():
+                return cls(
+                    sender=topics.RECORDER,
+                    channel=topics.STATS,
+                    number=-1,
+                    sequence=-1,
+                    sent_ns=None,
+                )
+
 
 def compute_virtual_boot(scenario_sha256: str, site: str) -> int:
     """Computes the boot of a site (arm controller) in a run in virtual time.
@@ -66,56 +119,3 @@ def compute_virtual_boot(scenario_sha256: str, site: str) -> int:
     """
     digest = hashlib.sha256(f"{scenario_sha256}/{site}".encode()).digest()
     return int.from_bytes(digest[:8], "big")
-
-
-def identify_message(message: AnyMessage, rate_hz: int) -> MessageIdentity:
-    """Determines the sender, the channel and the number of a message from its content.
-
-    Args:
-        message: The decoded message.
-        rate_hz: Tick rate of the sender, in Hz. It is needed to number statistics, which are
-            not sent in every tick. It has no effect on other messages.
-
-    Returns:
-        The identity of the message.
-    """
-    match message:
-        case State():
-            sent_ns = message.sent_ns if message.v >= SENT_TIME_SINCE else message.t_ns
-            return MessageIdentity(
-                sender=message.site,
-                channel=topics.STATE,
-                number=message.tick,
-                sequence=message.tick,
-                sent_ns=sent_ns,
-            )
-        case LinkStats():
-            number = number_message(topics.LINK, message.tick, rate_hz)
-            return MessageIdentity(
-                sender=message.site,
-                channel=topics.LINK,
-                number=number,
-                sequence=message.tick,
-                sent_ns=message.t_ns,
-            )
-        case Event():
-            # Events before the epoch have no time. The recorder stamps its own events when it
-            # receives them.
-            is_stamped = message.t_ns >= 0 and message.member != topics.RECORDER
-            event_ns = message.t_ns if is_stamped else None
-            sequence = max(0, message.n)
-            return MessageIdentity(
-                sender=message.member,
-                channel=topics.EVENT,
-                number=message.n,
-                sequence=sequence,
-                sent_ns=event_ns,
-            )
-        case RecorderStats():
-            return MessageIdentity(
-                sender=topics.RECORDER,
-                channel=topics.STATS,
-                number=-1,
-                sequence=-1,
-                sent_ns=None,
-            )

@@ -50,7 +50,7 @@ from .mcap_writer import McapWriter
 from .provenance import collect_provenance
 from .recovery_survey import RecoverySurvey
 from .running_digest import DIGESTS, RECOVERED, DigestState
-from .session_accounts import SessionAccounts, open_session_accounts
+from .session_accounts import SessionAccounts
 from .torn_chunk import TornChunk
 
 _UNOPENED = "other MCAP programs open the new file, commands of trilat-net do not"
@@ -346,7 +346,7 @@ class _FileCopy:
         version = collect_provenance()["version_trilat-net"]
         library = f"{survey.library or 'unknown'}, recovered by trilat-net {version}"
         self._out = McapWriter(file, library, survey.profile)
-        self._accounts = open_session_accounts(survey.metadata, survey.attachments)
+        self._accounts = SessionAccounts.open(survey.metadata, survey.attachments)
         # Check of messages by their content. None for files of other programs, and if there is
         # no readable scenario, which the check needs.
         self._content = _create_content_check(survey, self._accounts)

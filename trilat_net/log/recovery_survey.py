@@ -25,13 +25,15 @@ from bisect import bisect_left
 from collections import Counter, defaultdict
 from collections.abc import Sequence
 from contextlib import suppress
+from pathlib import Path
 from typing import Any
 
 from mcap.opcode import Opcode
 
+from ..files import reading
 from ..net import topics
 from . import mcap_records
-from .content_check import MessageOrigins, find_origins, has_foreign_boots
+from .content_check import MessageOrigins, has_foreign_boots
 from .log_layout import ACCOUNTS, PART, SCENARIO, SESSION
 from .mcap_records import ChunkHead, RecordFrame, UnreadableRecord
 from .torn_chunk import PAGE_BYTES
@@ -53,6 +55,8 @@ class RecoverySurvey:
         scanner: Scanner that finds the records of the file.
 
     Attributes:
+        is_finished: True if the file has an end mark.
+        trailing_bytes: Number of bytes behind the end mark.
         profile: Profile in the header of the MCAP file.
         library: Program that wrote the file, as stated in the header.
         definitions: Schemas and channels that are defined outside of chunks.
@@ -73,6 +77,8 @@ class RecoverySurvey:
 
     def __init__(self, scanner: mcap_records.RecordScanner) -> None:
         """Reads a damaged file once, and selects those parts of it that belong to one log."""
+        self.is_finished = scanner.finished
+        self.trailing_bytes = scanner.trailing
         self.profile = ""
         self.library = ""
         self.metadata: dict[str, dict[str, str]] = {}
@@ -108,6 +114,26 @@ class RecoverySurvey:
         self.why_empty = ""
         if not (has_messages or is_torn_chunk or self.metadata or self.attachments):
             self.why_empty = self._explain_empty()
+
+    @classmethod
+    def of_unfinished_file(cls, path: Path) -> "RecoverySurvey | None":
+        """Reads a file for what can be recovered if its end is missing or damaged.
+
+        Args:
+            path: The file.
+
+        Returns:
+            The survey. None if the file ends as it should.
+
+        Raises:
+            LogError: The file cannot be read.
+        """
+        with reading(path) as stream:
+            scanner = mcap_records.RecordScanner(stream)
+            if scanner.ends:
+                return None
+            # The scan for intact records takes longer than that for the end.
+            return cls(scanner)
 
     def _read_records(self) -> bool:
         """Reads all records of the damaged file except messages, such as schemas and channels.
@@ -251,7 +277,7 @@ class RecoverySurvey:
         for frame, head in self._chunks[:_SAMPLED_CHUNKS]:
             with suppress(UnreadableRecord):
                 data = mcap_records.unpack_chunk(self._scanner.content(frame))
-                origins = find_origins(data)
+                origins = MessageOrigins.find(data)
                 self.is_session_log |= bool(origins.boots) or _names_session(data)
                 has_checksum = bool(head.crc)
                 if has_checksum:

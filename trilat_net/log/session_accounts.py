@@ -470,32 +470,32 @@ class SessionAccounts:
                 ticks = count_nouns(self._ticks[site], "tick")
                 yield f"{site}: its end is unknown; its last record is {last}, of {ticks}"
 
+    @classmethod
+    def open(
+        cls, metadata: Mapping[str, Mapping[str, str]], attachments: Mapping[str, bytes]
+    ) -> "SessionAccounts | None":
+        """Prepares the counting of a session's messages, before a file of it is read.
 
-def open_session_accounts(
-    metadata: Mapping[str, Mapping[str, str]], attachments: Mapping[str, bytes]
-) -> SessionAccounts | None:
-    """Prepares the counting of a session's messages, before a file of it is read.
+        Args:
+            metadata: Metadata of the file, by name. They state the session.
+            attachments: Attachments of the file, by name. One of them is the scenario.
 
-    Args:
-        metadata: Metadata of the file, by name. They state the session.
-        attachments: Attachments of the file, by name. One of them is the scenario.
+        Returns:
+            The object, which has counted no message yet. None if the file is not a log of
+            trilat-net.
+        """
+        session_facts = metadata.get(SESSION, {})
+        try:
+            scenario = parse_embedded(attachments[SCENARIO].decode(), SCENARIO)
+            session = session_facts["session"]
+            version = int(session_facts["schema_version"])
+        except (KeyError, ValueError, ScenarioError):
+            return None
 
-    Returns:
-        The object, which has counted no message yet. None if the file is not a log of
-        trilat-net.
-    """
-    session_facts = metadata.get(SESSION, {})
-    try:
-        scenario = parse_embedded(attachments[SCENARIO].decode(), SCENARIO)
-        session = session_facts["session"]
-        version = int(session_facts["schema_version"])
-    except (KeyError, ValueError, ScenarioError):
-        return None
-
-    part_number = metadata.get(PART, {}).get("index", "1")
-    return SessionAccounts(
-        session,
-        scenario,
-        continued=part_number != "1",
-        events=version >= _EVENTS_NUMBERED_SINCE,
-    )
+        part_number = metadata.get(PART, {}).get("index", "1")
+        return cls(
+            session,
+            scenario,
+            continued=part_number != "1",
+            events=version >= _EVENTS_NUMBERED_SINCE,
+        )

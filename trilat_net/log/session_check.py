@@ -38,14 +38,14 @@ from .log_layout import (
     SCENARIO,
     SESSION,
     VIZ_ROOT,
+    ChannelFilter,
     describe_unfinished,
-    parse_filter_facts,
 )
 from .log_reader import Log
 from .mcap_check import FileCheck
 from .mcap_reader import ChannelInfo, McapMessage, McapReader, Progress, shift_progress
 from .mcap_records import ScannedRecord
-from .message_identity import AnyMessage, identify_message
+from .message_identity import AnyMessage, MessageIdentity
 from .ros2 import cdr
 from .running_digest import DigestState, Integrity
 from .session_accounts import SessionAccounts
@@ -277,7 +277,7 @@ class _ChannelCheck:
             self._add("schema", offset, str(error))
             return
 
-        identity = identify_message(message, self.rate_hz)
+        identity = MessageIdentity.of_message(message, self.rate_hz)
         number = identity.number
         sequence = identity.sequence
         if self.kind == topics.STATS:
@@ -755,7 +755,7 @@ class _SessionCheck:
         parts of a log is checked, or if the recorder was told not to record events.
         """
         session = self._about["session"]
-        channel_filter = parse_filter_facts(self._about)
+        channel_filter = ChannelFilter.parse_facts(self._about)
         names = self._scenario.names if self._scenario else ()
         event_topics = [topics.key(session, name, topics.EVENT) for name in names]
         are_events_recorded = all(channel_filter.accepts(topic) for topic in event_topics)

@@ -28,7 +28,7 @@ from ..recorded_change import count_skipped_ticks
 from ..records import NS_PER_S, Layout
 from . import record_columns
 from .orientations import align_signs, compute_quaternion_parts, compute_quaternions
-from .packed.indexed_records import index_records
+from .packed.indexed_records import IndexedRecords
 from .packed.packed_messages import PackedMessages
 from .record_columns import Ints
 
@@ -381,7 +381,7 @@ class SiteLog:
 
         # If all records have the usual layout, their fields are read without decoding them.
         self.payloads = PackedMessages.pack(payloads)
-        self.indexed = index_records(self.payloads, name, peers, layout)
+        self.indexed = IndexedRecords.of_payloads(self.payloads, name, peers, layout)
         if self.indexed is None:
             self.tick = self._read(record_columns.decode_ticks)
         else:

@@ -31,7 +31,6 @@ from .mcap_records import (
     ChunkHead,
     RecordScanner,
     UnreadableRecord,
-    parse_chunk_head,
 )
 
 PAGE_BYTES = 4096
@@ -85,7 +84,7 @@ class TornChunk(NamedTuple):
         _, length = RECORD_HEAD.unpack(record_head)
         begin = offset + RECORD_HEAD_BYTES
         content = scanner.read(begin, _MAX_SALVAGE_BYTES)
-        head = parse_chunk_head(content, length)
+        head = ChunkHead.parse(content, length)
         if head.end_ns < head.start_ns:
             raise UnreadableRecord("the end time of a chunk is before its start time")
 

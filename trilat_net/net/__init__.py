@@ -31,7 +31,6 @@ __all__ = [
     "QueryInbox",
     "RouterSilent",
     "StampedInbox",
-    "UnknownHost",
     "ZenohBus",
     "check_hosts",
     "default_endpoint",
@@ -82,6 +81,7 @@ __all__ = [
     "ChangeRequest",
     "Event",
     "HandMessage",
+    "HandSender",
     "HandViewMessage",
     "Info",
     "LinkStats",
@@ -120,10 +120,8 @@ __all__ = [
     "Pinger",
     "SiteTiming",
     "SystemClock",
+    "SiteStandIn",
     "answer_backfill",
-    "answer_pings",
-    "describe_clocks",
-    "exact_offset",
     "find_turn_ns",
     "make_system_clock",
     # Joining and finding a session
@@ -135,26 +133,21 @@ __all__ = [
     "SessionJoin",
     "connect_to_session",
     "describe_member",
-    "find_members",
-    "list_past_events",
-    "liveliness_token",
+    "SessionMembers",
     "new_boot",
     "open_playback_bus",
     "read_messages",
     "read_records",
-    "refuse_running_session",
-    "send_change",
     # Programs outside a session
     "ArmClient",
     "Hand",
     "SiteClient",
-    "SiteSender",
     "SwitchClient",
 ]
 
 if TYPE_CHECKING:
     from . import messages, topics
-    from .arm_client import ArmClient, Hand, SiteClient, SiteSender, SwitchClient
+    from .arm_client import ArmClient, Hand, HandSender, SiteClient, SwitchClient
     from .bus import Bus, Inbox, Query, QueryInbox, StampedInbox, matches_key
     from .clock import Clock, SystemClock, make_system_clock
     from .connection import (
@@ -171,14 +164,11 @@ if TYPE_CHECKING:
     )
     from .discovery import (
         REPLY_TIMEOUT_S,
+        SessionMembers,
         connect_to_session,
-        find_members,
-        list_past_events,
         open_playback_bus,
-        refuse_running_session,
-        send_change,
     )
-    from .host_names import UnknownHost, check_hosts
+    from .host_names import check_hosts
     from .known_sites import make_site_known, stop_at_once
     from .member_keys import (
         AUTHORITY,
@@ -198,7 +188,6 @@ if TYPE_CHECKING:
         LateSites,
         MemberQuery,
         describe_member,
-        liveliness_token,
         new_boot,
         read_messages,
         read_records,
@@ -224,8 +213,8 @@ if TYPE_CHECKING:
         TickNumber,
         json_schema,
     )
-    from .offset import OffsetEstimator, OffsetLimit, exact_offset
-    from .pinging import PING_PACE_NS, Pinger, answer_backfill, answer_pings, describe_clocks
+    from .offset import OffsetEstimator, OffsetLimit
+    from .pinging import PING_PACE_NS, Pinger, answer_backfill
     from .requests import (
         BACKFILL_BYTES,
         BACKFILL_MESSAGES,
@@ -241,6 +230,7 @@ if TYPE_CHECKING:
         PeerSeen,
     )
     from .session import SessionJoin
+    from .site_stand_in import SiteStandIn
     from .timing import (
         ClockNotice,
         LinkTimingMonitor,
@@ -274,7 +264,7 @@ else:
     __getattr__ = import_on_use(
         __name__,
         {
-            "arm_client": "ArmClient Hand SiteClient SiteSender SwitchClient",
+            "arm_client": "ArmClient Hand HandSender SiteClient SwitchClient",
             "bus": "Bus Inbox Query QueryInbox StampedInbox matches_key",
             "clock": "Clock SystemClock make_system_clock",
             "connection": (
@@ -282,33 +272,31 @@ else:
                 "find_endpoint_addresses find_free_endpoints is_loopback "
                 "reserve_session_endpoints run_router"
             ),
-            "discovery": (
-                "REPLY_TIMEOUT_S connect_to_session find_members list_past_events "
-                "open_playback_bus refuse_running_session send_change"
-            ),
-            "host_names": "UnknownHost check_hosts",
+            "discovery": "REPLY_TIMEOUT_S SessionMembers connect_to_session open_playback_bus",
+            "host_names": "check_hosts",
             "known_sites": "make_site_known stop_at_once",
             "member_keys": (
                 "AUTHORITY CERTIFICATE HERE MEMBERS MemberKeys PRIVATE_KEY add_keys "
                 "create_keys read_member_keys renew_keys"
             ),
             "membership": (
-                "Epoch EventPublisher LateSites MemberQuery describe_member "
-                "liveliness_token new_boot read_messages read_records"
+                "Epoch EventPublisher LateSites MemberQuery describe_member new_boot "
+                "read_messages read_records"
             ),
             "messages": (
                 "Event HALTED_MODES Info LinkStats MODES MODE_WORDS ModeMeaning PeerSample "
                 "READABLE RESTING_MODES RecorderStats SENT_TIME_SINCE STATE_VECTORS Stamp "
                 "State TASK_VECTORS TickNumber VERSION json_schema messages"
             ),
-            "offset": "OffsetEstimator OffsetLimit exact_offset",
-            "pinging": "PING_PACE_NS Pinger answer_backfill answer_pings describe_clocks",
+            "offset": "OffsetEstimator OffsetLimit",
+            "pinging": "PING_PACE_NS Pinger answer_backfill",
             "requests": (
                 "ArmEnable ArmMeasurement BACKFILL_BYTES BACKFILL_MESSAGES Backfill "
                 "BackfillRequest ChangeReply ChangeRequest HandMessage HandViewMessage "
                 "OrderName PeerSeen"
             ),
             "session": "SessionJoin",
+            "site_stand_in": "SiteStandIn",
             "timing": (
                 "ClockNotice LinkTimingMonitor LoopStats PeerClock SiteTiming find_turn_ns"
             ),

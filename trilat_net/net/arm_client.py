@@ -41,7 +41,7 @@ from .clock import Clock, SystemClock
 from .connection import Connection
 from .membership import new_boot, read_messages
 from .messages import Event, State
-from .requests import ArmEnable, ArmMeasurement, HandMessage, Request
+from .requests import ArmEnable, ArmMeasurement, DirectMessage, HandMessage
 from .wire import decode, encode, split_states
 from .zenoh_config import OPERATOR
 
@@ -68,10 +68,10 @@ _DERIVATIVE_STEP_S = 1e-6
 """Step of the numerical derivative of the arm's pose, in s."""
 
 
-R = TypeVar("R", bound=Request)
+R = TypeVar("R", bound=DirectMessage)
 
 
-class SiteSender:
+class _SiteSender:
     """Sends numbered messages to one channel of a site.
 
     A site is a process that runs one arm and its control loop. The messages of a sender are
@@ -135,28 +135,30 @@ class SiteSender:
         """
         self._publish(encode(message))
 
-    @classmethod
-    def for_hand(
-        cls,
+
+class HandSender(_SiteSender):
+    """Sends the messages of an operator to the site of an arm.
+
+    The operator is the person or program that moves the arm. A random number in 1 ... 2^32 - 1
+    identifies the operator's program. The records of the site store this number as a float,
+    which represents such numbers exactly. In a record, the number 0 means that no operator
+    moves the arm.
+
+    Args:
+        bus: Network connection of the operator's program.
+        clock: Clock of this process.
+        session: Name of the session.
+        site: Name of the site.
+    """
+
+    def __init__(
+        self,
         bus: Bus,
         clock: Clock,
         session: str,
         site: str,
-    ) -> "SiteSender":
-        """Returns an object that sends the messages of an operator to the site of an arm.
-
-        The operator is the person or program that moves the arm. A random number in 1 ... 2^32
-        - 1 identifies the operator's program. The records of the site store this number as a
-        float, which represents such numbers exactly. In a record, the number 0 means that no
-        operator moves the arm.
-
-        Args:
-            bus: Network connection of the operator's program.
-            clock: Clock of this process.
-            session: Name of the session.
-            site: Name of the site.
-        """
-        return SiteSender(
+    ) -> None:
+        super().__init__(
             bus=bus,
             clock=clock,
             session=session,
@@ -164,6 +166,18 @@ class SiteSender:
             channel=topics.HAND,
             boot=new_boot() % (2**32 - 1) + 1,
         )
+
+    def move(self, source: str, **fields: object) -> HandMessage:
+        """Sends a target or a force to the site, or releases its arm.
+
+        Args:
+            source: Name of the operator for people.
+            **fields: Further fields of `HandMessage`.
+
+        Returns:
+            The message that was sent.
+        """
+        return self.send(HandMessage, source=source, **fields)
 
 
 class SiteClient:
@@ -326,7 +340,7 @@ class _OutsideClient(SiteClient):
     ) -> None:
         """Subscribes to the messages of a site (arm controller), and opens a channel to it."""
         super().__init__(bus, clock, session, site)
-        self._sender = SiteSender(
+        self._sender = _SiteSender(
             bus=bus,
             clock=clock,
             session=session,
@@ -516,7 +530,7 @@ class Hand(SiteClient):
         self._compute_pose = compute_pose
         self._source = source
 
-        self._sender = SiteSender.for_hand(bus, clock, session, site)
+        self._sender = HandSender(bus, clock, session, site)
         # The newest message, which a thread repeats, so that the site knows that this program
         # still runs. The lock keeps the two threads from sending at the same time.
         self._message: HandMessage | None = None
@@ -594,7 +608,7 @@ class Hand(SiteClient):
             is_gripping = self._message is not None
             self._message = None
             if is_gripping:
-                self._sender.send(HandMessage, source=self._source, grip=False)
+                self._sender.move(self._source, grip=False)
 
     @property
     def holds(self) -> bool:
@@ -728,9 +742,7 @@ class Hand(SiteClient):
             raise UsageError(f"the numbers of {action} must be finite, not {coordinates}")
         field = "force" if permitted_action == "push" else "target"
         with self._lock:
-            self._message = self._sender.send(
-                HandMessage, source=self._source, **{field: coordinates}
-            )
+            self._message = self._sender.move(self._source, **{field: coordinates})
             return self._sender.number
 
     def _repeat_messages(self) -> None:

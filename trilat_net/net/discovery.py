@@ -32,7 +32,7 @@ from .requests import (
     BackfillRequest,
     ChangeReply,
     ChangeRequest,
-    Request,
+    DirectMessage,
 )
 from .wire import decode, encode
 
@@ -53,44 +53,150 @@ It raises `ScenarioError` if the text is not a scenario.
 """
 
 
-def find_members(
-    bus: Bus,
-    clock: Clock,
-    session: str,
-    *,
-    stopped: Callable[[], bool],
-    timeout_s: float | None,
-) -> Iterator[Info]:
-    """Queries the members of a session, and yields their identities as they arrive.
+class SessionMembers:
+    """The members of a running session, which are queried over an open connection.
 
-    The query is repeated until the search ends, because a reply may be lost. The identity of a
-    member (process of a session) is therefore yielded repeatedly.
+    A member is a process of the session, for example a site (arm controller).
 
     Args:
         bus: Network connection that reaches the session.
         clock: Clock of the caller.
         session: Name of the session.
-        stopped: Function that returns True to end the search.
-        timeout_s: Duration of the search, in s. If None, there is no limit.
-
-    Yields:
-        The identity of a member, as soon as a reply has arrived.
-
-    Raises:
-        SessionError: The time is over, and none of the replies that arrived could be decoded.
     """
-    query = MemberQuery(bus, clock, session)
-    has_readable_reply = False
-    begun_ns = clock.monotonic_ns()
-    timeout_ns = math.inf if timeout_s is None else timeout_s * 1e9
-    while not stopped() and clock.monotonic_ns() - begun_ns < timeout_ns:
-        for info in query.poll():
-            has_readable_reply = True
-            yield info
-        clock.sleep_until(clock.monotonic_ns() + POLL_NS)
-    if query.unreadable and not has_readable_reply and not stopped():
-        member, reason = next(iter(query.unreadable.items()))
-        raise SessionError(f"the reply of {member} cannot be read: {reason}")
+
+    def __init__(self, bus: Bus, clock: Clock, session: str) -> None:
+        self._bus = bus
+        self._clock = clock
+        self._session = session
+
+    def find(
+        self,
+        *,
+        stopped: Callable[[], bool],
+        timeout_s: float | None,
+    ) -> Iterator[Info]:
+        """Queries the members of a session, and yields their identities as they arrive.
+
+        The query is repeated until the search ends, because a reply may be lost. The identity
+        of a member (process of a session) is therefore yielded repeatedly.
+
+        Args:
+            stopped: Function that returns True to end the search.
+            timeout_s: Duration of the search, in s. If None, there is no limit.
+
+        Yields:
+            The identity of a member, as soon as a reply has arrived.
+
+        Raises:
+            SessionError: The time is over, and none of the replies that arrived could be
+                decoded.
+        """
+        query = MemberQuery(self._bus, self._clock, self._session)
+        has_readable_reply = False
+        begun_ns = self._clock.monotonic_ns()
+        timeout_ns = math.inf if timeout_s is None else timeout_s * 1e9
+        while not stopped() and self._clock.monotonic_ns() - begun_ns < timeout_ns:
+            for info in query.poll():
+                has_readable_reply = True
+                yield info
+            self._clock.sleep_until(self._clock.monotonic_ns() + POLL_NS)
+        if query.unreadable and not has_readable_reply and not stopped():
+            member, reason = next(iter(query.unreadable.items()))
+            raise SessionError(f"the reply of {member} cannot be read: {reason}")
+
+    def send_change(
+        self,
+        site: str,
+        request: ChangeRequest,
+    ) -> ChangeReply:
+        """Sends a request to a site of a running session, and waits for the reply.
+
+        If the members of the session have keys, changes can be requested only with the keys of
+        the operator. Every member may send the order to stop.
+
+        Args:
+            site: Name of the site.
+            request: The requested change, or an order such as "stop".
+
+        Returns:
+            The reply of the site, accepted or refused.
+
+        Raises:
+            SessionError: The site does not reply.
+        """
+        channel = topics.STOP if request.order == "stop" else topics.SET
+        payload = self._query_once(topics.key(self._session, site, channel), request)
+        if payload is None:
+            hint = "; in a session with keys, only the operator may request changes"
+            raise SessionError(
+                f"{site} did not answer; the records of {site} show whether the change was made"
+                f"{'' if channel == topics.STOP else hint}"
+            )
+
+        try:
+            reply = decode(payload, ChangeReply)
+        except WireError as error:
+            raise SessionError(f"the reply of {site} cannot be read: {error}") from None
+
+        if request.order == "stop" and not reply.accepted and request.source is not UNSET:
+            # A site with an older version of this program does not know the field `source`, and
+            # refuses the whole request. Its arm must stop as well.
+            return self.send_change(site, msgspec.structs.replace(request, source=UNSET))
+        return reply
+
+    def list_past_events(
+        self,
+        site: str,
+    ) -> Iterator[Event]:
+        """Queries a site for the events that it has published, and yields them in order.
+
+        The first event is the oldest one that the site (arm controller) still stores. The
+        iteration ends early if the site does not reply.
+
+        Args:
+            site: Name of the site.
+        """
+        key = topics.key(self._session, site, topics.PAST)
+        first = 0
+        published = 1
+        with suppress(WireError):  # a reply of another program ends the iteration
+            while first < published:
+                request = BackfillRequest(
+                    channel="event", first=first, last=first + BACKFILL_MESSAGES - 1
+                )
+                reply = self._query_once(key, request)
+                backfill = None if reply is None else decode(reply, Backfill)
+                if backfill is None or not backfill.payloads:
+                    return
+
+                for payload in backfill.payloads:
+                    yield decode(payload, Event)
+                first = backfill.first + len(backfill.payloads)
+                published = backfill.made
+
+    def _query_once(
+        self,
+        key: str,
+        request: DirectMessage,
+    ) -> bytes | None:
+        """Sends a request to other processes once, and waits for the first reply.
+
+        Args:
+            key: Key under which the receiver accepts requests, see `topics.key`.
+            request: The request.
+
+        Returns:
+            The payload of the reply. None if no reply arrives within `REPLY_TIMEOUT_S`.
+        """
+        replies = self._bus.query(key, encode(request))
+        deadline_ns = self._clock.monotonic_ns() + int(REPLY_TIMEOUT_S * 1e9)
+        while self._clock.monotonic_ns() < deadline_ns:
+            self._clock.sleep_until(self._clock.monotonic_ns() + POLL_NS)
+            reply = replies.poll()
+            if reply is not None:
+                _key, payload = reply
+                return payload
+        return None
 
 
 @contextmanager
@@ -200,7 +306,8 @@ def _query_sites(
     Raises:
         SessionError: No member with a scenario replies in time.
     """
-    for info in find_members(bus, clock, session, stopped=stopped, timeout_s=timeout_s):
+    members = SessionMembers(bus, clock, session)
+    for info in members.find(stopped=stopped, timeout_s=timeout_s):
         try:
             if info.scenario:
                 return parse_site_names(info.scenario)
@@ -216,122 +323,6 @@ def _query_sites(
         f"within {timeout_s:g} s; check the name of the session, or name other endpoints with "
         "--connect"
     )
-
-
-def send_change(
-    bus: Bus,
-    clock: Clock,
-    session: str,
-    site: str,
-    request: ChangeRequest,
-) -> ChangeReply:
-    """Sends a request to a site of a running session, and waits for the reply.
-
-    If the members of the session have keys, changes can be requested only with the keys of the
-    operator. Every member may send the order to stop.
-
-    Args:
-        bus: Network connection that reaches the site.
-        clock: Clock of the caller.
-        session: Name of the session.
-        site: Name of the site.
-        request: The requested change, or an order such as "stop".
-
-    Returns:
-        The reply of the site, accepted or refused.
-
-    Raises:
-        SessionError: The site does not reply.
-    """
-    channel = topics.STOP if request.order == "stop" else topics.SET
-    payload = _query_once(bus, clock, topics.key(session, site, channel), request)
-    if payload is None:
-        hint = "; in a session with keys, only the operator may request changes"
-        raise SessionError(
-            f"{site} did not answer; the records of {site} show whether the change was made"
-            f"{'' if channel == topics.STOP else hint}"
-        )
-
-    try:
-        reply = decode(payload, ChangeReply)
-    except WireError as error:
-        raise SessionError(f"the reply of {site} cannot be read: {error}") from None
-
-    if request.order == "stop" and not reply.accepted and request.source is not UNSET:
-        # A site with an older version of this program does not know the field `source`, and
-        # refuses the whole request. Its arm must stop as well.
-        return send_change(
-            bus=bus,
-            clock=clock,
-            session=session,
-            site=site,
-            request=msgspec.structs.replace(request, source=UNSET),
-        )
-    return reply
-
-
-def _query_once(
-    bus: Bus,
-    clock: Clock,
-    key: str,
-    request: Request,
-) -> bytes | None:
-    """Sends a request to other processes once, and waits for the first reply.
-
-    Args:
-        bus: Network connection that reaches the receiver.
-        clock: Clock of the caller.
-        key: Key under which the receiver accepts requests, see `topics.key`.
-        request: The request.
-
-    Returns:
-        The payload of the reply. None if no reply arrives within `REPLY_TIMEOUT_S`.
-    """
-    replies = bus.query(key, encode(request))
-    deadline_ns = clock.monotonic_ns() + int(REPLY_TIMEOUT_S * 1e9)
-    while clock.monotonic_ns() < deadline_ns:
-        clock.sleep_until(clock.monotonic_ns() + POLL_NS)
-        reply = replies.poll()
-        if reply is not None:
-            _key, payload = reply
-            return payload
-    return None
-
-
-def list_past_events(
-    bus: Bus,
-    clock: Clock,
-    session: str,
-    site: str,
-) -> Iterator[Event]:
-    """Queries a running site for the events that it has published, and yields them in order.
-
-    The first event is the oldest one that the site (arm controller) still stores. The iteration
-    ends early if the site does not reply.
-
-    Args:
-        bus: Network connection that reaches the site.
-        clock: Clock of the caller.
-        session: Name of the session.
-        site: Name of the site.
-    """
-    key = topics.key(session, site, topics.PAST)
-    first = 0
-    published = 1
-    with suppress(WireError):  # a reply of another program ends the iteration
-        while first < published:
-            request = BackfillRequest(
-                channel="event", first=first, last=first + BACKFILL_MESSAGES - 1
-            )
-            reply = _query_once(bus, clock, key, request)
-            backfill = None if reply is None else decode(reply, Backfill)
-            if backfill is None or not backfill.payloads:
-                return
-
-            for payload in backfill.payloads:
-                yield decode(payload, Event)
-            first = backfill.first + len(backfill.payloads)
-            published = backfill.made
 
 
 def open_playback_bus(
@@ -356,11 +347,11 @@ def open_playback_bus(
         The connection. None if `stopped` returned True.
 
     Raises:
-        SessionError: The port is in use by a running session of the same name.
+        SessionError: A session of the same name is running.
         UsageError: An endpoint cannot be used.
     """
     try:
-        return connection.open_bus(clock=clock, stopped=stopped, timeout_s=None, say=say)
+        bus = connection.open_bus(clock=clock, stopped=stopped, timeout_s=None, say=say)
     except UsageError:
         if not connection.listen:
             raise
@@ -371,6 +362,12 @@ def open_playback_bus(
             with closing(session_bus):
                 refuse_running_session(session_bus, clock, session, stopped)
         raise
+    if bus is not None:
+        with ExitStack() as stack:
+            stack.enter_context(closing(bus))
+            refuse_running_session(bus, clock, session, stopped)
+            stack.pop_all()  # the connection stays open
+    return bus
 
 
 def refuse_running_session(
@@ -390,7 +387,8 @@ def refuse_running_session(
     Raises:
         SessionError: A site (arm controller) of that session replies.
     """
-    for info in find_members(bus, clock, session, stopped=stopped, timeout_s=_NAME_CHECK_S):
+    members = SessionMembers(bus, clock, session)
+    for info in members.find(stopped=stopped, timeout_s=_NAME_CHECK_S):
         if info.member == topics.RECORDER:
             continue
         state = "is waiting to begin"

@@ -143,24 +143,24 @@ class OffsetEstimate(NamedTuple):
         error_below = offset_ns - self.low_ns - passed_s * lower_drift
         return max(0, math.ceil(max(error_above, error_below)))
 
+    @classmethod
+    def exact(cls, offset_ns: int) -> "OffsetEstimate":
+        """Returns the estimate of a constant offset that is known exactly.
 
-def exact_offset(offset_ns: int) -> OffsetEstimate:
-    """Returns the estimate of a constant offset that is known exactly.
+        Such an offset exists between two readings of the same clock.
 
-    Such an offset exists between two readings of the same clock.
-
-    Args:
-        offset_ns: The offset, the other clock minus the local clock, in ns.
-    """
-    return OffsetEstimate(
-        local_ns=0,
-        offset_ns=offset_ns,
-        drift=0.0,
-        low_ns=offset_ns,
-        high_ns=offset_ns,
-        drift_low=0.0,
-        drift_high=0.0,
-    )
+        Args:
+            offset_ns: The offset, the other clock minus the local clock, in ns.
+        """
+        return cls(
+            local_ns=0,
+            offset_ns=offset_ns,
+            drift=0.0,
+            low_ns=offset_ns,
+            high_ns=offset_ns,
+            drift_low=0.0,
+            drift_high=0.0,
+        )
 
 
 def format_offset(offset_ns: int, bound_ns: int) -> str:

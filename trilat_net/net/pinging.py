@@ -18,7 +18,7 @@ from . import topics
 from .bus import Bus, Inbox, Query
 from .clock import Clock
 from .messages import Info
-from .offset import OffsetEstimate, OffsetEstimator, OffsetLimit, exact_offset, format_offset
+from .offset import OffsetEstimate, OffsetEstimator, OffsetLimit, format_offset
 from .requests import Backfill, BackfillRequest, Pong
 from .wire import decode, encode
 
@@ -349,7 +349,7 @@ class Pinger:
         """
         trips = self.trips.get(boot)
         if trips is None or trips.latest is None:
-            return exact_offset(0)
+            return OffsetEstimate.exact(0)
         return trips.latest
 
     def estimator(self, boot: int) -> OffsetEstimator | None:
@@ -387,26 +387,24 @@ class Pinger:
             return min(GLANCE_NS, otherwise_ns)
         return otherwise_ns
 
+    def describe_clocks(self, boots: Mapping[str, int], local_ns: int) -> list[str]:
+        """Describes the clocks of the members on other machines, for the user.
 
-def describe_clocks(pinger: Pinger, boots: Mapping[str, int], local_ns: int) -> list[str]:
-    """Describes the clocks of the members on other machines, for the user.
+        Members on this machine use the same clock and are left out.
 
-    Members on this machine use the same clock and are left out.
+        Args:
+            boots: Boot of each member, the number that identifies the start of its process, by
+                name.
+            local_ns: Time on the local clock for which the offsets are stated, in ns.
 
-    Args:
-        pinger: Round trips to the members.
-        boots: Boot of each member, the number that identifies the start of its process, by
-            name.
-        local_ns: Time on the local clock for which the offsets are stated, in ns.
-
-    Returns:
-        One sentence for each member on another machine.
-    """
-    texts = []
-    for name, boot in boots.items():
-        if boot in pinger.trips:
-            estimate = pinger.estimate(boot)
-            offset_ns = estimate.extrapolate_ns(local_ns)
-            offset = format_offset(offset_ns, estimate.error_bound_ns(local_ns, offset_ns))
-            texts.append(f"clock of {name}: another one, {offset}")
-    return texts
+        Returns:
+            One sentence for each member on another machine.
+        """
+        texts = []
+        for name, boot in boots.items():
+            if boot in self.trips:
+                estimate = self.estimate(boot)
+                offset_ns = estimate.extrapolate_ns(local_ns)
+                offset = format_offset(offset_ns, estimate.error_bound_ns(local_ns, offset_ns))
+                texts.append(f"clock of {name}: another one, {offset}")
+        return texts

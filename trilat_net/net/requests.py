@@ -29,7 +29,7 @@ BACKFILL_BYTES = 40_000
 """Largest total size of the messages in one `Backfill`, unless one message alone is larger."""
 
 
-class Request(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+class DirectMessage(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """Base class of requests between processes, of replies to them, and of measurements.
 
     Every message contains the version of the schema, so that a process with another version of
@@ -39,7 +39,7 @@ class Request(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
     v: int = VERSION
 
 
-class Pong(Request, frozen=True, kw_only=True):
+class Pong(DirectMessage, frozen=True, kw_only=True):
     """Reply of a process to a ping, with two of the four time stamps of a round trip.
 
     The time stamps serve to measure the offset between two clocks.
@@ -64,7 +64,7 @@ OrderName = Literal["", "stop", "enable", "reset"]
 """Orders that a site accepts from users. The empty text stands for no order."""
 
 
-class ChangeRequest(Request, frozen=True, kw_only=True):
+class ChangeRequest(DirectMessage, frozen=True, kw_only=True):
     """Request to an arm controller (site) to change a setting from its next tick on.
 
     A tick is a control period. The changes are those that a scenario can contain in its
@@ -94,7 +94,7 @@ class ChangeRequest(Request, frozen=True, kw_only=True):
     source: Annotated[str, Meta(max_length=64)] | UnsetType = UNSET
 
 
-class ChangeReply(Request, frozen=True, kw_only=True):
+class ChangeReply(DirectMessage, frozen=True, kw_only=True):
     """Reply of an arm controller (site) to a request for a change (`ChangeRequest`).
 
     Attributes:
@@ -112,7 +112,7 @@ class ChangeReply(Request, frozen=True, kw_only=True):
     tick: int = -1
 
 
-class BackfillRequest(Request, frozen=True, kw_only=True):
+class BackfillRequest(DirectMessage, frozen=True, kw_only=True):
     """Request of a recorder to a site to send again messages that were lost on the way.
 
     A record is the result of one tick of a control loop, and its number is that of the tick.
@@ -128,7 +128,7 @@ class BackfillRequest(Request, frozen=True, kw_only=True):
     last: TickNumber
 
 
-class Backfill(Request, frozen=True, kw_only=True):
+class Backfill(DirectMessage, frozen=True, kw_only=True):
     """Reply to a request for lost messages, with the messages as they were published.
 
     They are consecutive. The request is a `BackfillRequest`.
@@ -152,7 +152,7 @@ class Backfill(Request, frozen=True, kw_only=True):
     made: TickNumber
 
 
-class ArmMeasurement(Request, frozen=True, kw_only=True):
+class ArmMeasurement(DirectMessage, frozen=True, kw_only=True):
     """One measurement of a real arm, which its driver sends to the controller (site).
 
     Attributes:
@@ -186,7 +186,7 @@ class ArmMeasurement(Request, frozen=True, kw_only=True):
             )
 
 
-class ArmEnable(Request, frozen=True, kw_only=True):
+class ArmEnable(DirectMessage, frozen=True, kw_only=True):
     """Report on whether somebody holds the dead-man switch of an external arm.
 
     The program of the switch sends it at least ten times a second.
@@ -207,7 +207,7 @@ class ArmEnable(Request, frozen=True, kw_only=True):
     sent_ns: Instant
 
 
-class HandMessage(Request, frozen=True, kw_only=True):
+class HandMessage(DirectMessage, frozen=True, kw_only=True):
     """Target or force with which an operator, a person or a program, moves an arm.
 
     The message is sent when the target or force changes, and repeated within `SILENCE_NS`, so
@@ -237,7 +237,7 @@ class HandMessage(Request, frozen=True, kw_only=True):
     sent_ns: Instant
 
 
-class PeerSeen(Request, frozen=True, kw_only=True):
+class PeerSeen(DirectMessage, frozen=True, kw_only=True):
     """State of a peer's arm, as received by the site whose arm an operator's program moves.
 
     The state is delayed by the network. The fields are those of `PeerView`.
@@ -252,7 +252,7 @@ class PeerSeen(Request, frozen=True, kw_only=True):
     tau_x: list[float]
 
 
-class HandViewMessage(Request, frozen=True, kw_only=True):
+class HandViewMessage(DirectMessage, frozen=True, kw_only=True):
     """State of a site in one control period, for the program that acts as its operator.
 
     The operator program of the user runs in another process, and decides how the arm of the

@@ -43,7 +43,6 @@ from .offset import (
     OffsetEstimator,
     OffsetLimit,
     SlewedOffset,
-    exact_offset,
     format_offset,
 )
 from .topics import ticks_per_stats
@@ -543,7 +542,7 @@ class SiteTiming:
         """
         monitor = self.monitors[index]
         clock = monitor.peer._replace(
-            epoch_ns=epoch_ns, estimate=exact_offset(0), estimator=None
+            epoch_ns=epoch_ns, estimate=OffsetEstimate.exact(0), estimator=None
         )
         if bound_ns is None:
             monitor.admit(clock)

@@ -38,7 +38,7 @@ from .messages import (
     RecorderStats,
     State,
 )
-from .requests import BACKFILL_BYTES, ArmMeasurement, Backfill, HandMessage, Request
+from .requests import BACKFILL_BYTES, ArmMeasurement, Backfill, DirectMessage, HandMessage
 
 MAX_BYTES = 65_536
 """Largest payload of a message, in bytes. `Info` and `Backfill` may be larger."""
@@ -51,7 +51,7 @@ SAMPLE_BYTES = 2_048
 _NUMBER_BYTES = 9
 """Size of an encoded floating-point number, in bytes."""
 
-_Sendable = LinkStats | Event | Info | RecorderStats | Request
+_Sendable = LinkStats | Event | Info | RecorderStats | DirectMessage
 _MESSAGE_KINDS: list[type[msgspec.Struct]] = [
     State,
     PeerSample,
@@ -61,7 +61,8 @@ _MESSAGE_KINDS: list[type[msgspec.Struct]] = [
     RecorderStats,
 ]
 _DECODERS = {
-    kind: msgspec.msgpack.Decoder(kind) for kind in [*_MESSAGE_KINDS, *Request.__subclasses__()]
+    kind: msgspec.msgpack.Decoder(kind)
+    for kind in [*_MESSAGE_KINDS, *DirectMessage.__subclasses__()]
 }
 _SIZE_LIMITS: dict[type[msgspec.Struct], int] = {
     Info: MAX_INFO_BYTES,

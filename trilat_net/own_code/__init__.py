@@ -26,19 +26,16 @@ __all__ = [
     "allow_own_code",
     "find_user_laws",
     "list_imported_code",
-    "may_run_user_laws",
     # Import
     "CLASS_PATTERN",
-    "CodeConsent",
     "CodeConsents",
     "CodeKey",
     "ImportedLaw",
-    "NamedCode",
     "Watch",
     "allowed_code",
     "allowing_any_settings",
     "call_directly",
-    "import_class",
+    "import_named_class",
     "make_own_instance",
     "name_law_classes",
     "read_code",
@@ -56,21 +53,18 @@ if TYPE_CHECKING:
         allow_logged_code,
         allow_own_code,
         find_user_laws,
+        import_named_class,
         list_imported_code,
-        may_run_user_laws,
     )
     from .imported_code import (
         CLASS_PATTERN,
-        CodeConsent,
         CodeConsents,
         CodeKey,
         ImportedLaw,
-        NamedCode,
         Watch,
         allowed_code,
         allowing_any_settings,
         call_directly,
-        import_class,
         name_law_classes,
         read_code,
     )
@@ -82,12 +76,11 @@ else:
             "class_arguments": "make_own_instance",
             "code_consent": (
                 "LawFiles allow_logged_code allow_own_code find_user_laws "
-                "list_imported_code may_run_user_laws"
+                "import_named_class list_imported_code"
             ),
             "imported_code": (
-                "CLASS_PATTERN CodeConsent CodeConsents CodeKey ImportedLaw NamedCode Watch "
-                "allowed_code allowing_any_settings call_directly import_class "
-                "name_law_classes read_code"
+                "CLASS_PATTERN CodeConsents CodeKey ImportedLaw Watch allowed_code "
+                "allowing_any_settings call_directly name_law_classes read_code"
             ),
             "sent_channel": "build_channel check_sends parse_classes read_sends",
         },

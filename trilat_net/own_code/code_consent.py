@@ -35,9 +35,7 @@ from .imported_code import (
     ScenarioWithCode,
     allowed_code,
     check_class,
-    describe_new_settings,
     describe_setting,
-    find_consent,
     read_code,
     remembered_settings,
 )
@@ -47,23 +45,33 @@ LawFiles = str | Path | Sequence[str | Path]
 """Path of a file with a user's code, or several such paths."""
 
 
-def list_imported_code(scenarios: Iterable[ScenarioWithCode]) -> list[NamedCode]:
-    """Returns the users' Python classes that would run as part of the given experiments.
-
-    These are control laws, operators (programs that move an arm) and plants (programs that
-    compute the motion of an arm).
+def list_imported_code(scenarios: Iterable[ScenarioWithCode]) -> list[tuple[str, str]]:
+    """Returns the users' Python classes that experiments name, and that would run with them.
 
     Args:
         scenarios: Descriptions of the experiments.
+
+    Returns:
+        The different classes, each as its name, such as "mylaws:Spring", with the SHA-256 of
+        its file.
     """
-    imported = []
-    for scenario in scenarios:
-        for site in scenario.sites.values():
-            candidates = (site.control, *site.hands, site.plant)
-            imported += [
-                candidate for candidate in candidates if isinstance(candidate, NamedCode)
-            ]
-    return imported
+    named = [code for scenario in scenarios for code in _list_named_code(scenario)]
+    return list(dict.fromkeys((code.code, code.source_sha256) for code in named))
+
+
+def _list_named_code(scenario: ScenarioWithCode) -> list[NamedCode]:
+    """Returns the entries of a scenario that name a user's class.
+
+    These are control laws, operators (programs that move an arm) and plants (programs that
+    compute the motion of an arm).
+    """
+    named: list[NamedCode] = []
+    for site in scenario.sites.values():
+        for candidate in (site.control, *site.hands, site.plant):
+            kind: object = type(candidate)
+            if _names_code(kind):
+                named.append(candidate)
+    return named
 
 
 @cache
@@ -102,18 +110,34 @@ def allow_own_code(
     """
     earlier_consents: dict[tuple[str, str], CodeConsent] = {}
     if changed_from is not None:
-        for key in map(CodeKey.of, list_imported_code([changed_from])):
-            consent = find_consent(key)
+        for key in map(CodeKey.of, _list_named_code(changed_from)):
+            consent = key.find_consent()
             if consent is not None:
                 earlier_consents[key.code, key.sha256] = consent
 
-    for key in map(CodeKey.of, list_imported_code([scenario])):
+    for key in map(CodeKey.of, _list_named_code(scenario)):
         earlier_consent = earlier_consents.get((key.code, key.sha256))
         if codes is None or key.code in codes:
             allowed_code[key] = CodeConsent(None, key.sha256)
         elif earlier_consent is not None:
             allowed_code[key] = earlier_consent
     return scenario
+
+
+def import_named_class(code: str, path: str) -> Any:
+    """Imports a control law that a user of this process names, and thereby permits to run.
+
+    Args:
+        code: Module and class, as in "mylaws:Spring".
+        path: Name of the option or key that contains the class, for error messages.
+
+    Raises:
+        ScenarioError: The class does not exist, or its file raises an error.
+    """
+    sha256 = read_code(code, path).sha256
+    key = CodeKey(code, sha256, "{}")
+    allowed_code[key] = CodeConsent(None, sha256)
+    return key.import_class(path)
 
 
 class _RememberedFile(msgspec.Struct):
@@ -154,7 +178,7 @@ def allow_logged_code(
     files = [Path(law)] if isinstance(law, str | Path) else list(map(Path, law))
     if (other_version or remember) and not files:
         raise UsageError("--other-version and --remember need a file: give --law FILE, too")
-    logged = {CodeKey.of(imported): imported for imported in list_imported_code([scenario])}
+    logged = {CodeKey.of(imported): imported for imported in _list_named_code(scenario)}
 
     # If the log names no user's code, the store is not read.
     remembered = _read_store() if logged else {}
@@ -343,18 +367,6 @@ def find_user_laws(scenario: ScenarioWithCode) -> list[_LoggedUserLaw]:
     return [_inspect_user_law(key, law, sites[key]) for key, law in laws.items()]
 
 
-def may_run_user_laws(scenario: ScenarioWithCode) -> bool:
-    """Returns True if every control law in an experiment that is a user's class may run.
-
-    A permission for the laws of a log also covers repetitions of its run, for example copies of
-    the run that start slightly displaced (twins).
-
-    Args:
-        scenario: Scenario of a log.
-    """
-    return all(law.allowed for law in find_user_laws(scenario))
-
-
 def _inspect_user_law(key: CodeKey, law: ImportedLaw, sites: tuple[str, ...]) -> _LoggedUserLaw:
     """Finds the file of a user's control law, and whether the law may run.
 
@@ -365,7 +377,7 @@ def _inspect_user_law(key: CodeKey, law: ImportedLaw, sites: tuple[str, ...]) ->
         law: The law in the scenario.
         sites: Names of the sites (arm controllers) that it controls.
     """
-    consent = find_consent(key)
+    consent = key.find_consent()
     sha256 = ""
     file = None
     with suppress(ScenarioError):
@@ -387,5 +399,5 @@ def _inspect_user_law(key: CodeKey, law: ImportedLaw, sites: tuple[str, ...]) ->
         allowed=is_allowed,
         file=file,
         changed=_compare_hashes(key, sha256) if is_changed else "",
-        other_settings="" if is_allowed else describe_new_settings(key),
+        other_settings="" if is_allowed else key.describe_new_settings(),
     )

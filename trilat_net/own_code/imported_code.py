@@ -9,7 +9,7 @@ Invariant:
     - A scenario contains the hash of the file that defines a class. If a run is repeated from
       its log, the hash shows whether the code is still the code that ran.
     - Looking up a class by its name runs no code, not even that of the enclosing packages.
-    - `import_class` is the only way to run code of users. It imports a class only if
+    - `CodeKey.import_class` is the only way to run code of users. It imports a class only if
       `allowed_code` contains a permission, and if the file still has the permitted hash and
       defines a class of that name.
     - A permission includes the arguments of the class. Harmless code may do harm with other
@@ -26,7 +26,7 @@ from contextlib import contextmanager
 from importlib.machinery import ModuleSpec, PathFinder, SourceFileLoader
 from importlib.util import module_from_spec, spec_from_file_location
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, NamedTuple, Protocol, cast, runtime_checkable
+from typing import Annotated, Any, ClassVar, NamedTuple, Protocol, cast
 
 from msgspec import Meta, field
 
@@ -67,7 +67,6 @@ def call_directly(_k: int, function: Callable[[], Any]) -> Any:
     return function()
 
 
-@runtime_checkable
 class NamedCode(Protocol):
     """Interface of an entry of a scenario that names a user's class.
 
@@ -165,6 +164,97 @@ class CodeKey(NamedTuple):
             json.dumps(named.settings, sort_keys=True, default=str),
         )
 
+    def find_consent(self) -> "CodeConsent | None":
+        """Returns the permission under which a user's class may run with its arguments.
+
+        The result is None if nobody has permitted the class, its present file or its arguments.
+
+        Returns:
+            The permission. None if the code may not run.
+        """
+        return allowed_code.get(self) or allowed_code.get(self._replace(settings=ANY_SETTINGS))
+
+    def describe_new_settings(self) -> str:
+        """Explains why a user's class that was permitted before is refused with new arguments.
+
+        A permission applies only to certain arguments of a class. The text states how the
+        arguments of the refused code differ from permitted ones. If several sets of arguments
+        were permitted, those with the fewest differences are compared.
+
+        Returns:
+            Part of a sentence. Empty if the code was not permitted with any arguments.
+        """
+        allowed_settings = {
+            allowed.settings
+            for allowed in allowed_code
+            if (allowed.code, allowed.sha256) == (self.code, self.sha256)
+            and allowed.settings != ANY_SETTINGS
+        }
+        # Permissions that a person has stored permanently count as well.
+        class_name = self.code.partition(":")[2]
+        allowed_settings |= set(remembered_settings.get((self.sha256, class_name), ()))
+
+        settings = json.loads(self.settings)
+        differences = [
+            _list_differences(json.loads(text), settings) for text in sorted(allowed_settings)
+        ]
+        smallest_difference = min(differences, key=len, default=[])
+        if not smallest_difference:
+            return ""
+        return f"it was allowed with other settings, but here {', '.join(smallest_difference)}"
+
+    def import_class(self, path: str, method: str = "torque") -> Any:
+        """Imports a user's class from its permitted file.
+
+        The file must be the file that a person permitted. It is checked before any of its code
+        runs.
+
+        Args:
+            path: Path of the key in the scenario, for error messages.
+            method: Method that the class must have.
+
+        Raises:
+            CodeWithheld: There is no permission.
+            ScenarioError: The file differs from the permitted one, or does not define such a
+                class; none of its code has run in these cases. Also raised if the code raises
+                an error while it is imported.
+        """
+        code = self.code
+        module, _, name = code.partition(":")
+        consent = self.find_consent()
+        if consent is None:
+            difference = self.describe_new_settings()
+            reason = f" ({difference})" if difference else ""
+            raise CodeWithheld(
+                f"{code} is external code, which may not run{reason}: allow its file with "
+                "--law FILE (in Python: tn.open_log(..., law=FILE))",
+                path=path,
+            )
+
+        source = read_code(code, path, consent.file)
+        if source.sha256 != consent.sha256:
+            raise ScenarioError(
+                f"the file of {code} has changed: its hash is not the permitted one; restore "
+                f"the file, or write {code!r} in the scenario again to use the present file",
+                path=path,
+            )
+        check_class(source, code, path, method)
+
+        search_folder = None
+        if consent.file is not None:
+            search_folder = _find_import_folder(module, source.file)
+        with _searching(search_folder):
+            try:
+                if consent.file is not None:
+                    imported = _execute(module, source)
+                else:
+                    imported = _import(module, source.sha256)
+            # The user's code may raise any exception.
+            except (Exception, SystemExit) as error:
+                problem = f"{module} cannot be imported: {describe_exception(error)}"
+                raise ScenarioError(problem, path=path) from None
+        return getattr(imported, name)
+
 
 class CodeConsent(NamedTuple):
     """Permission of a person to run the code of one Python file, which a scenario names.
@@ -190,20 +280,6 @@ what differs if code is refused; they permit nothing.
 """
 
 
-def find_consent(key: CodeKey) -> CodeConsent | None:
-    """Returns the permission under which a user's class may run with its arguments.
-
-    The result is None if nobody has permitted the class, its present file or its arguments.
-
-    Args:
-        key: Class, hash of its file and arguments.
-
-    Returns:
-        The permission. None if the code may not run.
-    """
-    return allowed_code.get(key) or allowed_code.get(key._replace(settings=ANY_SETTINGS))
-
-
 @contextmanager
 def allowing_any_settings(allowed: CodeConsents) -> Iterator[None]:
     """Permits code with any arguments, inside the `with` block.
@@ -226,39 +302,6 @@ def allowing_any_settings(allowed: CodeConsents) -> Iterator[None]:
     finally:
         for key in added_permissions:
             allowed_code.pop(key, None)
-
-
-def describe_new_settings(key: CodeKey) -> str:
-    """Explains why a user's class that was permitted before is refused with new arguments.
-
-    A permission applies only to certain arguments of a class. The text states how the arguments
-    of the refused code differ from permitted ones. If several sets of arguments were permitted,
-    those with the fewest differences are compared.
-
-    Args:
-        key: The refused class, with the hash of its file and its arguments.
-
-    Returns:
-        Part of a sentence. Empty if the code was not permitted with any arguments.
-    """
-    allowed_settings = {
-        allowed.settings
-        for allowed in allowed_code
-        if (allowed.code, allowed.sha256) == (key.code, key.sha256)
-        and allowed.settings != ANY_SETTINGS
-    }
-    # Permissions that a person has stored permanently count as well.
-    class_name = key.code.partition(":")[2]
-    allowed_settings |= set(remembered_settings.get((key.sha256, class_name), ()))
-
-    settings = json.loads(key.settings)
-    differences = [
-        _list_differences(json.loads(text), settings) for text in sorted(allowed_settings)
-    ]
-    smallest_difference = min(differences, key=len, default=[])
-    if not smallest_difference:
-        return ""
-    return f"it was allowed with other settings, but here {', '.join(smallest_difference)}"
 
 
 def _list_differences(
@@ -335,7 +378,7 @@ class ImportedLaw(LawSettings, frozen=True, tag_field="law", tag="own"):
 
         def make(context: LawContext) -> UserLaw:
             path = f"sites.{context.site}.control"
-            kind = import_class(CodeKey.of(self), f"{path}.law")
+            kind = CodeKey.of(self).import_class(f"{path}.law")
             # The class is checked before any of its code is called.
             check_law_class(
                 kind=kind, code=self.code, context=context, sites=sites, scheme=scheme
@@ -455,60 +498,6 @@ def _find_spec(module: str) -> ModuleSpec | None:
         if not is_package and name != module:
             return None
     return spec
-
-
-def import_class(key: CodeKey, path: str, method: str = "torque") -> Any:
-    """Imports a user's class from its permitted file.
-
-    The file must be the file that a person permitted. It is checked before any of its code
-    runs.
-
-    Args:
-        key: The class, with the hash of its file and its arguments.
-        path: Path of the key in the scenario, for error messages.
-        method: Method that the class must have.
-
-    Raises:
-        CodeWithheld: There is no permission.
-        ScenarioError: The file differs from the permitted one, or does not define such a class;
-            none of its code has run in these cases. Also raised if the code raises an error
-            while it is imported.
-    """
-    code = key.code
-    module, _, name = code.partition(":")
-    consent = find_consent(key)
-    if consent is None:
-        difference = describe_new_settings(key)
-        reason = f" ({difference})" if difference else ""
-        raise CodeWithheld(
-            f"{code} is external code, which may not run{reason}: allow its file with "
-            "--law FILE (in Python: tn.open_log(..., law=FILE))",
-            path=path,
-        )
-
-    source = read_code(code, path, consent.file)
-    if source.sha256 != consent.sha256:
-        raise ScenarioError(
-            f"the file of {code} has changed: its hash is not the permitted one; restore the "
-            f"file, or write {code!r} in the scenario again to use the present file",
-            path=path,
-        )
-    check_class(source, code, path, method)
-
-    search_folder = None
-    if consent.file is not None:
-        search_folder = _find_import_folder(module, source.file)
-    with _searching(search_folder):
-        try:
-            if consent.file is not None:
-                imported = _execute(module, source)
-            else:
-                imported = _import(module, source.sha256)
-        # The user's code may raise any exception.
-        except (Exception, SystemExit) as error:
-            problem = f"{module} cannot be imported: {describe_exception(error)}"
-            raise ScenarioError(problem, path=path) from None
-    return getattr(imported, name)
 
 
 def _find_import_folder(module: str, file: Path) -> Path:

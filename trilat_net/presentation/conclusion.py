@@ -22,7 +22,7 @@ from ..analysis import JointError, certify_run
 from ..errors import CodeWithheld, LawFailed, RunFailed, ScenarioError, join_arguments
 from ..execution import check_log_files, simulate_without_operators
 from ..log import MIN_COVERAGE, CheckReport, Finding, Log, Progress, SiteLog
-from ..own_code import allowed_code, may_run_user_laws
+from ..own_code import allowed_code
 from ..scenario import END_WINDOW_S
 from ..workers import worker_pool
 from . import terminal_output
@@ -159,7 +159,7 @@ def conclude(
         allowed = dict(allowed_code)
         check = pool.submit(check_log_files, log.sources, min_coverage, allowed)
         twin = _run_without_operators(log)
-        own_laws = may_run_user_laws(log.scenario)
+        own_laws = log.may_run_user_laws
         certificate = certify_run(log, min_coverage=min_coverage, own_laws=own_laws)
         # A record that cannot be read raises here, before anything is written.
         run_lines = format_run_lines(log)

@@ -31,7 +31,7 @@ from ..analysis import (
     measure_undelayed_error,
 )
 from ..errors import count_nouns
-from ..execution import LinkEffect, LogCheckReport, Rerun, SiteEffect, describe_rerun_changes
+from ..execution import LogCheckReport, Rerun
 from ..log import Log, LogCheckResult, Recovery
 from ..results import Result
 from .plot_signals import shared_unit
@@ -394,7 +394,7 @@ def compose_rerun(rerun: Rerun) -> Iterator[Block]:
     recorded = f"; {', '.join(request.recorded)} as recorded" if request.recorded else ""
     yield f"{request.mode}: {', '.join(request.replaced)} executed afresh{recorded}"
 
-    changes = describe_rerun_changes(request)
+    changes = request.describe_changes()
     for line in changes or ["nothing is changed: this is the experiment of the log"]:
         yield f"  {line}"
 
@@ -430,13 +430,12 @@ def compose_rerun(rerun: Rerun) -> Iterator[Block]:
             "e: error from what the site had received of its peers, which a longer delay "
             "need not raise"
         )
-    for effect in rerun.sites.values():
-        rate_hz = request.scenario.sites[effect.site].rate_hz
-        for line in _describe_site_effect(effect, rate_hz):
-            yield f"{effect.site}: {line}"
-    for link in rerun.links.values():
+    for site in rerun.sites:
+        for line in _describe_site_effect(rerun, site):
+            yield f"{site}: {line}"
+    for name, link in rerun.links.items():
         if link.differs:
-            yield _describe_link_effect(link)
+            yield _describe_link_effect(rerun, name)
     yield from (f"note: {note}" for note in rerun.notes)
 
 
@@ -474,15 +473,17 @@ def _name_sample(tick: object) -> str:
     return "none" if tick == -1 else f"that of tick {tick}"
 
 
-def _describe_site_effect(effect: SiteEffect, rate_hz: int) -> list[str]:
+def _describe_site_effect(rerun: Rerun, site: str) -> list[str]:
     """Returns lines about the differences between the log of an arm and its repeated execution.
 
     The lines state the largest deviation of the joint angles, and the first value that differs.
 
     Args:
-        effect: The differences.
-        rate_hz: Tick rate of the site, which converts ticks to times.
+        rerun: Result of the new execution.
+        site: Name of the site, the process of the arm.
     """
+    effect = rerun.sites[site]
+    rate_hz = rerun.request.scenario.sites[site].rate_hz
     lines = []
     if effect.q_max_rad:
         largest_text = f"{effect.q_max_rad:.3g} rad off the log, at {effect.q_max_at_s:.3f} s"
@@ -507,8 +508,9 @@ def _describe_site_effect(effect: SiteEffect, rate_hz: int) -> list[str]:
     return lines
 
 
-def _describe_link_effect(link: LinkEffect) -> str:
+def _describe_link_effect(rerun: Rerun, name: str) -> str:
     """Returns a sentence that compares the ages of a link's samples in log and rerun."""
+    link = rerun.links[name]
     mean_ms = link.age_mean_ms
     max_ms = link.age_max_ms
     before = f"{mean_ms.before:.4g} ms old on average, {max_ms.before:.4g} ms at most"

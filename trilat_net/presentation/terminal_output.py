@@ -383,18 +383,13 @@ def warn_if_unfinished(path: Path) -> None:
     Raises:
         LogError: The file cannot be read.
     """
-    from ..files import reading
-    from ..log import RecordScanner, RecoverySurvey
+    from ..log import RecoverySurvey
 
-    with reading(path) as stream:
-        scanner = RecordScanner(stream)
-        if scanner.ends:
-            return
-        # The file is scanned for intact records, which takes longer, only if its end is
-        # damaged.
-        survey = RecoverySurvey(scanner)
-    if scanner.finished:
-        trailing = count_nouns(scanner.trailing, "byte follows", "bytes follow")
+    survey = RecoverySurvey.of_unfinished_file(path)
+    if survey is None:
+        return
+    if survey.is_finished:
+        trailing = count_nouns(survey.trailing_bytes, "byte follows", "bytes follow")
         print_note(
             f"{path}: was finished, and {trailing} its end mark, which other programs may "
             f"refuse; make a file without them with: trilat log recover {path}"

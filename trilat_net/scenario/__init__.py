@@ -19,7 +19,6 @@ __all__ = [
     "ExperimentText",
     "SimulatedArm",
     "TracePoint",
-    "apply_overrides",
     "check_outside_arms",
     "embedded_names_reader",
     "import_trace",
@@ -31,7 +30,6 @@ __all__ = [
     "new_plant",
     "parse_embedded",
     "parse_scenario",
-    "read_source",
     "read_template",
     "reseed_scenario",
     "split_assignment",
@@ -43,25 +41,19 @@ __all__ = [
     "TASK_AXES",
     "ArmModel",
     "Change",
-    "Limits",
     "Scenario",
     "SiteSpec",
     "check_finite",
-    "field_names",
     "is_distribution",
     "is_number",
-    "read_arm",
     # Links and delays
     "ConstantDelay",
     "LinkBase",
-    "NoDelay",
     "PictureDelay",
     "draw_used_samples",
     # Operators and environments
     "FAILED_HAND",
     "POLICY",
-    "ActorBase",
-    "Chirp",
     "DeviceSettings",
     "HandPlayer",
     "HandSite",
@@ -71,24 +63,19 @@ __all__ = [
     "OwnPlant",
     "PlantContext",
     "PlantPlayer",
-    "ProgramHand",
     "ViscousEnvironment",
     "Wall",
     "make_hand_players",
-    "make_hand_program",
     "make_plant_players",
     # Changes during a run
     "LinkTables",
     "find_requester",
-    "make_site_order",
     "parse_core_change",
     "resolve_change",
-    "to_core_change",
     # Expectations
     "ALL_SITES_QUANTITIES",
     "END_WINDOW_S",
     "Expect",
-    "ExpectWindow",
     # Descriptions
     "IRREVERSIBLE_SHARES",
     "ScenarioDifference",
@@ -104,10 +91,10 @@ __all__ = [
 ]
 
 if TYPE_CHECKING:
-    from .arms import TASK_AXES, ArmModel, read_arm
+    from .arms import TASK_AXES, ArmModel
     from .change import Change, describe_event, find_requester
     from .delay_models import LinkBase
-    from .delay_models.kernel_delays import ConstantDelay, NoDelay
+    from .delay_models.kernel_delays import ConstantDelay
     from .delay_traces import TracePoint, import_trace
     from .describe import (
         IRREVERSIBLE_SHARES,
@@ -121,13 +108,11 @@ if TYPE_CHECKING:
         list_arm_notes,
         list_law_situations,
     )
-    from .expect import ALL_SITES_QUANTITIES, END_WINDOW_S, Expect, ExpectWindow
-    from .key_checks import check_finite, field_names, is_distribution, is_number
+    from .expect import ALL_SITES_QUANTITIES, END_WINDOW_S, Expect
+    from .key_checks import check_finite, is_distribution, is_number
     from .laws import BUILT_IN, LAWS
     from .link_presets import GRID_LOSSES_PERCENT, GRID_ROUND_TRIPS_MS
-    from .operators import ActorBase
     from .operators.kernel_operators import (
-        Chirp,
         DeviceSettings,
         JointSpring,
         LiveHand,
@@ -140,20 +125,12 @@ if TYPE_CHECKING:
         POLICY,
         HandPlayer,
         HandSite,
-        ProgramHand,
         make_hand_players,
-        make_hand_program,
     )
-    from .override import apply_overrides, split_assignment
+    from .override import split_assignment
     from .own_plant import OwnPlant
     from .plant_player import PlantContext, PlantPlayer, make_plant_players
-    from .run_changes import (
-        LinkTables,
-        make_site_order,
-        parse_core_change,
-        resolve_change,
-        to_core_change,
-    )
+    from .run_changes import LinkTables, parse_core_change, resolve_change
     from .sample_uses import PictureDelay, draw_used_samples
     from .scenario_reader import (
         ExperimentText,
@@ -162,55 +139,50 @@ if TYPE_CHECKING:
         load_scenario,
         parse_embedded,
         parse_scenario,
-        read_source,
         read_template,
         reseed_scenario,
     )
     from .scenario_types import Scenario
     from .simulated_arm import SimulatedArm
-    from .site_spec import Limits, SiteSpec
+    from .site_spec import SiteSpec
     from .skeletons import name_skeleton_class, new_hand, new_law, new_plant
     from .validate import check_outside_arms
 else:
     __getattr__ = import_on_use(
         __name__,
         {
-            "arms": "ArmModel TASK_AXES read_arm",
+            "arms": "ArmModel TASK_AXES",
             "change": "Change describe_event find_requester",
             "delay_models": "LinkBase",
-            "delay_models.kernel_delays": "ConstantDelay NoDelay",
+            "delay_models.kernel_delays": "ConstantDelay",
             "delay_traces": "TracePoint import_trace",
             "describe": (
                 "IRREVERSIBLE_SHARES ScenarioDifference compare_scenarios describe_law "
                 "describe_law_conditions describe_scenario describe_value flatten_table "
                 "list_arm_notes list_law_situations"
             ),
-            "expect": "ALL_SITES_QUANTITIES END_WINDOW_S Expect ExpectWindow",
-            "key_checks": "check_finite field_names is_distribution is_number",
+            "expect": "ALL_SITES_QUANTITIES END_WINDOW_S Expect",
+            "key_checks": "check_finite is_distribution is_number",
             "laws": "BUILT_IN LAWS",
             "link_presets": "GRID_LOSSES_PERCENT GRID_ROUND_TRIPS_MS",
-            "operators": "ActorBase",
             "operators.kernel_operators": (
-                "Chirp DeviceSettings JointSpring LiveHand Multisine ViscousEnvironment Wall"
+                "DeviceSettings JointSpring LiveHand Multisine ViscousEnvironment Wall"
             ),
             "operators.program_hand": (
-                "FAILED_HAND HandPlayer HandSite POLICY ProgramHand make_hand_players "
-                "make_hand_program"
+                "FAILED_HAND HandPlayer HandSite POLICY make_hand_players"
             ),
-            "override": "apply_overrides split_assignment",
+            "override": "split_assignment",
             "own_plant": "OwnPlant",
             "plant_player": "PlantContext PlantPlayer make_plant_players",
-            "run_changes": (
-                "LinkTables make_site_order parse_core_change resolve_change to_core_change"
-            ),
+            "run_changes": "LinkTables parse_core_change resolve_change",
             "sample_uses": "PictureDelay draw_used_samples",
             "scenario_reader": (
                 "ExperimentText embedded_names_reader list_shipped load_scenario "
-                "parse_embedded parse_scenario read_source read_template reseed_scenario"
+                "parse_embedded parse_scenario read_template reseed_scenario"
             ),
             "scenario_types": "Scenario",
             "simulated_arm": "SimulatedArm",
-            "site_spec": "Limits SiteSpec",
+            "site_spec": "SiteSpec",
             "skeletons": "name_skeleton_class new_hand new_law new_plant",
             "validate": "check_outside_arms",
         },

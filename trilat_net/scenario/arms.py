@@ -148,6 +148,43 @@ class Arm(fields.Frozen, frozen=True):
         values = {name: getattr(self, name) for name in ArmLinks._fields}
         return ArmLinks(**values)
 
+    def read_chain(self, urdf_texts: Mapping[str, str]) -> UrdfChain:
+        """Reads the joints between the base and the tip of the arm from its URDF file.
+
+        URDF is the usual XML format for the links and joints of a robot. Nothing is read from
+        disk here: the texts of the files are an argument.
+
+        Args:
+            urdf_texts: Texts of the URDF files of the scenario, by name.
+
+        Raises:
+            ScenarioError: There is no such file, or it cannot be used. The error contains the
+                path of a key below that of the arm.
+        """
+        if self.urdf not in urdf_texts:
+            raise ScenarioError(f"{self.urdf!r} is not a file of the scenario", path="urdf")
+        for key in ("payload_com_m", "payload_inertia_kg_m2"):
+            if any(getattr(self, key)) and not self.payload_kg:
+                raise ScenarioError("needs the mass of the payload: set payload_kg", path=key)
+        payload = UrdfPayload(self.payload_kg, self.payload_com_m, self.payload_inertia_kg_m2)
+        try:
+            return _read_cached(
+                text=urdf_texts[self.urdf],
+                base=self.base,
+                tip=self.tip,
+                payload=payload if self.payload_kg else None,
+                links=tuple(self.links.items()),
+                balance=self.balance_inertia,
+            )
+        except ScenarioError as error:
+            if error.path:
+                raise
+            # The message of `read_urdf` begins with its subject, for example "tip: ...".
+            subject, _, problem = error.problem.partition(": ")
+            if subject in _KEYS_OF_SUBJECTS:
+                raise ScenarioError(problem, path=_KEYS_OF_SUBJECTS[subject]) from None
+            raise ScenarioError(f"{self.urdf}: {error.problem}", path="urdf") from None
+
 
 def start_margin(joint: ChainJoint) -> float:
     """Returns how far beyond its stops and position limits a joint may start, in rad or m.
@@ -494,6 +531,87 @@ class ArmModel(NamedTuple):
         """
         return self._dynamics.find_inertia(q)
 
+    def compute_rest_gains(
+        self,
+        q0: Vector,
+        law_damping: Array,
+        limit_nm: Vector,
+        rate_hz: int,
+        *,
+        known: bool,
+    ) -> RestGains:
+        """Computes the gains with which an arm is brought to rest by damping.
+
+        M is the inertia matrix of the arm. The joint i gets the damping B = M_ii / T, where T
+        is a time constant. Because the joints are coupled, the fastest motion of the arm
+        decays with the rate lambda / T, where lambda is the largest eigenvalue of diag(M) M^-1.
+        T is chosen so that the time constant T / lambda of this motion is at least
+        `BRAKE_TICKS` ticks. If the inertia of the arm is not known, B is the damping of the
+        control law, for joints for which it is positive.
+
+        Args:
+            q0: Start pose, for which the inertia of a chain is computed. The inertia of the
+                planar arm is that of the stretched pose.
+            law_damping: Damping of the control law for each joint, in N m s/rad, shape (n,).
+            limit_nm: Largest torque, in N m, as one number or one per joint.
+            rate_hz: Tick rate of the site, in Hz.
+            known: False if the parameters of the model are not those of the arm.
+        """
+        if self.chain is None:
+            a, b, c = self.theta[:3].tolist()
+            M = np.array([[a + 2.0 * b, c + b], [c + b, c]])
+        else:
+            M = self.inertia(np.array(q0))
+        inertia = np.diag(M)
+
+        # diag(M) M^-1 has the eigenvalues of the symmetric diag(M)^(1/2) M^-1 diag(M)^(1/2).
+        root = np.sqrt(inertia)
+        symmetric = root * np.linalg.inv(M) * root[:, None]
+        fastest = np.linalg.eigvalsh(symmetric)[-1]
+        # Eigenvalues differ in the last bit between machines; whole milliseconds do not.
+        rounded_s = math.ceil(1e3 * BRAKE_TICKS * fastest / rate_hz) * 1e-3
+        time_s = max(BRAKE_S, rounded_s)
+        if not known:
+            time_s = UNKNOWN_BRAKE_S
+            inertia = np.where(law_damping > 0.0, law_damping * time_s, inertia)
+        damping = inertia / time_s
+        limits_nm = np.broadcast_to(limit_nm, inertia.shape)
+        deceleration = BRAKE_TORQUE_SHARE * limits_nm / inertia
+        return RestGains(tuple(damping.tolist()), time_s, tuple(deceleration.tolist()))
+
+    def bound_estimates(self, gains: Gains, limit_nm: Vector, g_m_s2: float) -> Gains:
+        """Adds bounds to the gains of an adaptive control law, for the parameters it estimates.
+
+        The motors must be able to hold the arm against gravity, which bounds the parameters.
+        Let T be the largest torque of a joint, g the gravitational acceleration, and l the
+        length of a link (for a chain, the reach of the arm):
+
+        - a first moment (mass times distance) is at most T / g;
+        - a second moment (moment of inertia) is at most l T / g;
+        - the mass of a link is at most T / g divided by the mean length of the links;
+        - masses, and second moments about an axis, are not negative.
+
+        The bounds are widened so that they include the first estimate. Gains that have bounds
+        already, and gains of other laws, are returned unchanged.
+
+        Args:
+            gains: Gains of the control law, with the first estimate of the parameters.
+            limit_nm: Largest torque, in N m, as one number or one per joint.
+            g_m_s2: Gravitational acceleration, in m/s^2. Without gravity, no bounds are added.
+        """
+        has_box = np.isfinite(gains.low).any()
+        if gains.law is not Law.ADAPTIVE or has_box or g_m_s2 == 0.0:
+            return gains
+        if self.chain is None:
+            low, high = _bound_planar_parameters(self, limit_nm, g_m_s2)
+        else:
+            low, high = _bound_chain_parameters(self, self.chain, np.max(limit_nm), g_m_s2)
+        first_estimate = np.broadcast_to(gains.theta_hat0, high.shape)
+        return gains._replace(
+            low=tuple(np.minimum(low, first_estimate).tolist()),
+            high=tuple(np.maximum(high, first_estimate).tolist()),
+        )
+
 
 def _is_positive_definite(theta: Array) -> bool:
     """Returns True if the inertia matrix of the planar arm is positive definite in any pose.
@@ -536,7 +654,7 @@ def build_arm(arm: Arm, task: Task, urdf_texts: Mapping[str, str], chains: bool)
             inertia matrix. The error contains the path of a key below that of the arm.
     """
     if arm.urdf:
-        return _build_chain_model(arm, task, read_arm(arm, urdf_texts))
+        return _build_chain_model(arm, task, arm.read_chain(urdf_texts))
     theta = theta_from_links(arm.planar_links())
     if not _is_positive_definite(theta):
         raise ScenarioError(
@@ -593,45 +711,6 @@ def _build_planar_chain(arm: Arm, task: Task) -> ChainSetup:
     elbow = shoulder._replace(origin_m=(arm.l1_m, 0.0, 0.0))
     joints, gravity = _place_base(arm, (shoulder, elbow), (0.0, -arm.g_m_s2, 0.0))
     return ChainSetup(joints, gravity, (arm.l2_m, 0.0, 0.0), task=task.setup)
-
-
-def read_arm(arm: Arm, urdf_texts: Mapping[str, str]) -> UrdfChain:
-    """Reads the joints between the base and the tip of an arm from its URDF file.
-
-    URDF is the usual XML format for the links and joints of a robot. Nothing is read from disk
-    here: the texts of the files are an argument.
-
-    Args:
-        arm: Table of the arm in the scenario, which names the file, the base and the tip.
-        urdf_texts: Texts of the URDF files of the scenario, by name.
-
-    Raises:
-        ScenarioError: There is no such file, or it cannot be used. The error contains the path
-            of a key below that of the arm.
-    """
-    if arm.urdf not in urdf_texts:
-        raise ScenarioError(f"{arm.urdf!r} is not a file of the scenario", path="urdf")
-    for key in ("payload_com_m", "payload_inertia_kg_m2"):
-        if any(getattr(arm, key)) and not arm.payload_kg:
-            raise ScenarioError("needs the mass of the payload: set payload_kg", path=key)
-    payload = UrdfPayload(arm.payload_kg, arm.payload_com_m, arm.payload_inertia_kg_m2)
-    try:
-        return _read_cached(
-            text=urdf_texts[arm.urdf],
-            base=arm.base,
-            tip=arm.tip,
-            payload=payload if arm.payload_kg else None,
-            links=tuple(arm.links.items()),
-            balance=arm.balance_inertia,
-        )
-    except ScenarioError as error:
-        if error.path:
-            raise
-        # The message of `read_urdf` begins with its subject, for example "tip: ...".
-        subject, _, problem = error.problem.partition(": ")
-        if subject in _KEYS_OF_SUBJECTS:
-            raise ScenarioError(problem, path=_KEYS_OF_SUBJECTS[subject]) from None
-        raise ScenarioError(f"{arm.urdf}: {error.problem}", path="urdf") from None
 
 
 _KEYS_OF_SUBJECTS = {"base": "base", "tip": "tip", "payload": "payload_inertia_kg_m2"}
@@ -773,91 +852,6 @@ UNKNOWN_BRAKE_S = 0.1
 """Time constant for an arm whose inertia is not known, in s."""
 BRAKE_TORQUE_SHARE = 0.5
 """Fraction of the largest torque that is used to decelerate the reference."""
-
-
-def compute_rest_gains(
-    arm: ArmModel,
-    q0: Vector,
-    law_damping: Array,
-    limit_nm: Vector,
-    rate_hz: int,
-    *,
-    known: bool,
-) -> RestGains:
-    """Computes the gains with which an arm is brought to rest by damping.
-
-    M is the inertia matrix of the arm. The joint i gets the damping B = M_ii / T, where T is a
-    time constant. Because the joints are coupled, the fastest motion of the arm decays with the
-    rate lambda / T, where lambda is the largest eigenvalue of diag(M) M^-1. T is chosen so that
-    the time constant T / lambda of this motion is at least `BRAKE_TICKS` ticks. If the inertia
-    of the arm is not known, B is the damping of the control law, for joints for which it is
-    positive.
-
-    Args:
-        arm: Model of the arm, which contains its inertia.
-        q0: Start pose, for which the inertia of a chain is computed. The inertia of the planar
-            arm is that of the stretched pose.
-        law_damping: Damping of the control law for each joint, in N m s/rad, shape (n,).
-        limit_nm: Largest torque, in N m, as one number or one per joint.
-        rate_hz: Tick rate of the site, in Hz.
-        known: False if the parameters of the model are not those of the arm.
-    """
-    if arm.chain is None:
-        a, b, c = arm.theta[:3].tolist()
-        M = np.array([[a + 2.0 * b, c + b], [c + b, c]])
-    else:
-        M = arm.inertia(np.array(q0))
-    inertia = np.diag(M)
-
-    # diag(M) M^-1 has the eigenvalues of the symmetric diag(M)^(1/2) M^-1 diag(M)^(1/2).
-    root = np.sqrt(inertia)
-    symmetric = root * np.linalg.inv(M) * root[:, None]
-    fastest = np.linalg.eigvalsh(symmetric)[-1]
-    # Eigenvalues differ in the last bit between machines; whole milliseconds do not.
-    rounded_s = math.ceil(1e3 * BRAKE_TICKS * fastest / rate_hz) * 1e-3
-    time_s = max(BRAKE_S, rounded_s)
-    if not known:
-        time_s = UNKNOWN_BRAKE_S
-        inertia = np.where(law_damping > 0.0, law_damping * time_s, inertia)
-    damping = inertia / time_s
-    limits_nm = np.broadcast_to(limit_nm, inertia.shape)
-    deceleration = BRAKE_TORQUE_SHARE * limits_nm / inertia
-    return RestGains(tuple(damping.tolist()), time_s, tuple(deceleration.tolist()))
-
-
-def bound_estimates(gains: Gains, arm: ArmModel, limit_nm: Vector, g_m_s2: float) -> Gains:
-    """Adds bounds to the gains of an adaptive control law, for the parameters it estimates.
-
-    The motors must be able to hold the arm against gravity, which bounds the parameters. Let T
-    be the largest torque of a joint, g the gravitational acceleration, and l the length of a
-    link (for a chain, the reach of the arm):
-
-    - a first moment (mass times distance) is at most T / g;
-    - a second moment (moment of inertia) is at most l T / g;
-    - the mass of a link is at most T / g divided by the mean length of the links;
-    - masses, and second moments about an axis, are not negative.
-
-    The bounds are widened so that they include the first estimate. Gains that have bounds
-    already, and gains of other laws, are returned unchanged.
-
-    Args:
-        gains: Gains of the control law, with the first estimate of the parameters.
-        arm: Model of the arm, which contains its lengths.
-        limit_nm: Largest torque, in N m, as one number or one per joint.
-        g_m_s2: Gravitational acceleration, in m/s^2. Without gravity, no bounds are added.
-    """
-    has_box = np.isfinite(gains.low).any()
-    if gains.law is not Law.ADAPTIVE or has_box or g_m_s2 == 0.0:
-        return gains
-    if arm.chain is None:
-        low, high = _bound_planar_parameters(arm, limit_nm, g_m_s2)
-    else:
-        low, high = _bound_chain_parameters(arm, arm.chain, np.max(limit_nm), g_m_s2)
-    first_estimate = np.broadcast_to(gains.theta_hat0, high.shape)
-    return gains._replace(
-        low=tuple(np.minimum(low, first_estimate).tolist()),
-        high=tuple(np.maximum(high, first_estimate).tolist()),
-    )
 
 
 def _bound_planar_parameters(

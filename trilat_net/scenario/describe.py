@@ -28,7 +28,7 @@ from ..core import (
 )
 from ..errors import count_nouns
 from ..laws import ArmLoad, LawSettings, LawSituation, StabilityCondition
-from .arms import TASK_AXES, Arm, read_arm
+from .arms import TASK_AXES, Arm
 from .delay_models import LinkBase
 from .operators.kernel_operators import (
     Chirp,
@@ -341,7 +341,7 @@ def _describe_arms(scenario: Scenario) -> list[str]:
     """Returns lines about each different arm with a URDF file: its joints, limits and notes."""
     lines: list[str] = []
     for arm, owners in _group_chains(scenario):
-        chain = read_arm(arm, scenario.urdf)
+        chain = arm.read_chain(scenario.urdf)
         model = scenario.arms[owners[0]]
         mass_kg = sum(joint.inertia[0] for joint in chain.joints)
         joints = count_nouns(len(chain.joints), "joint")
@@ -402,7 +402,7 @@ def list_arm_notes(scenario: Scenario) -> list[str]:
     notes = []
     for arm, owners in _group_chains(scenario):
         subject = f"arm of {', '.join(owners)}"
-        notes += [f"{subject}: {note}" for note in read_arm(arm, scenario.urdf).notes]
+        notes += [f"{subject}: {note}" for note in arm.read_chain(scenario.urdf).notes]
     return notes + _list_start_notes(scenario)
 
 
@@ -423,7 +423,7 @@ def _list_stop_notes(scenario: Scenario, name: str) -> list[str]:
     """
     spec = scenario.sites[name]
     units = scenario.arms[name].joint_units("rad")
-    joints = read_arm(spec.arm, scenario.urdf).joints
+    joints = spec.arm.read_chain(scenario.urdf).joints
     notes = []
     for joint, start, unit in zip(joints, spec.q0_rad, units, strict=True):
         excess = max(joint.lower - start, start - joint.upper)

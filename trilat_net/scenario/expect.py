@@ -23,7 +23,7 @@ from msgspec import Meta
 from ..errors import ScenarioError, count_nouns, suggest_nearest
 from ..fields import Joints, KeyProblem, NotNegative, Positive, Real, TomlTable
 from ..records import MAX_JOINTS
-from .arms import Arm, read_arm
+from .arms import Arm
 from .key_checks import check_keys, field_names
 
 WindowTime = Annotated[float, Meta(ge=0.0, le=86_400.0)]
@@ -108,27 +108,27 @@ class ExpectWindow(_JointPart, frozen=True, kw_only=True):
             if limits is not None:
                 yield key, limits
 
+    @staticmethod
+    def list_quantities(joints: int) -> tuple[str, ...]:
+        """Returns the names of the quantities that can be limited in a part of a run (window).
+
+        They include quantities of each joint, so their number depends on the arm.
+
+        Args:
+            joints: Number of joints of the arm, which decides how many quantities such as
+                q1_rad exist.
+        """
+        quantities = []
+        for key in _QUANTITIES:
+            number = _JOINT_QUANTITY.match(key)
+            if number is None or int(number[1]) <= joints:
+                quantities.append(key)
+        return tuple(quantities)
+
 
 _WINDOW_KEYS = field_names(ExpectWindow)
 _QUANTITIES = tuple(key for key in _WINDOW_KEYS if key not in ("from_s", "to_s", "site"))
 _JOINT_QUANTITY = re.compile(r"(?:q|push)(\d+)_")
-
-
-def window_quantities(joints: int) -> tuple[str, ...]:
-    """Returns the names of the quantities that can be limited in a part of a run (window).
-
-    They include quantities of each joint, so their number depends on the arm.
-
-    Args:
-        joints: Number of joints of the arm, which decides how many quantities such as q1_rad
-            exist.
-    """
-    quantities = []
-    for key in _QUANTITIES:
-        number = _JOINT_QUANTITY.match(key)
-        if number is None or int(number[1]) <= joints:
-            quantities.append(key)
-    return tuple(quantities)
 
 
 def complete_expect(
@@ -150,7 +150,7 @@ def complete_expect(
     joint_names = {}
     for name, site in sites.items():
         if site["arm"].get("urdf"):
-            chain = read_arm(msgspec.convert(site["arm"], Arm), urdf_texts)
+            chain = msgspec.convert(site["arm"], Arm).read_chain(urdf_texts)
             joint_names[name] = tuple(joint.name for joint in chain.joints)
     return {**written, "windows": _number_window_joints(written["windows"], joint_names)}
 
@@ -242,14 +242,14 @@ def _find_window_problem(
 
     limits = dict(window.limits)
     if not limits:
-        valid = window_quantities(max(joint_counts.values()))
+        valid = ExpectWindow.list_quantities(max(joint_counts.values()))
         return KeyProblem("", f"expects nothing; the possible keys are {', '.join(valid)}")
     for key, (least, most) in limits.items():
         if not window.site and key not in ALL_SITES_QUANTITIES:
             return KeyProblem("site", f"is missing: {key} belongs to a single site; {sites}")
         if window.site:
             joints = joint_counts[window.site]
-            if key not in window_quantities(joints):
+            if key not in ExpectWindow.list_quantities(joints):
                 return KeyProblem(
                     key, f"there is no such joint: the arm has {count_nouns(joints, 'joint')}"
                 )
@@ -337,54 +337,52 @@ class Expect(
         tolerances = {"synchronised_rad": 0.01, "end_pose_within_rad": 0.01}
         return msgspec.structs.replace(self, **tolerances) != Expect()
 
+    def find_problem(self, joint_counts: Mapping[str, int]) -> KeyProblem | None:
+        """Returns the reason why no run could satisfy the expectations of an experiment.
 
-def find_expect_problem(expect: Expect, joint_counts: Mapping[str, int]) -> KeyProblem | None:
-    """Returns the reason why no run could satisfy the expectations of an experiment.
+        For example, an expected end pose must have as many angles as the arm has joints. The
+        problem is reported when the experiment is loaded, and not after a long run.
 
-    For example, an expected end pose must have as many angles as the arm has joints. The
-    problem is reported when the experiment is loaded, and not after a long run.
+        Args:
+            joint_counts: Number of joints of each site's arm, by the name of the site.
 
-    Args:
-        expect: The expectations.
-        joint_counts: Number of joints of each site's arm, by the name of the site.
+        Returns:
+            The reason, with the path of its key below `expect`. None if a run may satisfy them.
+        """
+        for name, pose in self.end_pose_rad.items():
+            key = f"end_pose_rad.{name}"
+            if name not in joint_counts:
+                return KeyProblem(
+                    key, f"there is no such site; the sites are {', '.join(joint_counts)}"
+                )
+            joints = joint_counts[name]
+            if len(pose) != joints:
+                return KeyProblem(
+                    key,
+                    f"must be a list of length {joints}, one angle per joint, but has length "
+                    f"{len(pose)}",
+                )
 
-    Returns:
-        The reason, with the path of its key below `expect`. None if a run may satisfy them.
-    """
-    for name, pose in expect.end_pose_rad.items():
-        key = f"end_pose_rad.{name}"
-        if name not in joint_counts:
-            return KeyProblem(
-                key, f"there is no such site; the sites are {', '.join(joint_counts)}"
-            )
-        joints = joint_counts[name]
-        if len(pose) != joints:
-            return KeyProblem(
-                key,
-                f"must be a list of length {joints}, one angle per joint, but has length "
-                f"{len(pose)}",
-            )
+        for n, window in enumerate(self.windows):
+            problem = _find_window_problem(window, joint_counts)
+            if problem is not None:
+                return problem._replace(key=f"windows[{n}].{problem.key}".rstrip("."))
 
-    for n, window in enumerate(expect.windows):
-        problem = _find_window_problem(window, joint_counts)
-        if problem is not None:
-            return problem._replace(key=f"windows[{n}].{problem.key}".rstrip("."))
+        for metric, (low, high) in self.metrics.items():
+            if low > high:
+                return KeyProblem(
+                    f"metrics.{metric}", f"must be [least, most], but is [{low:g}, {high:g}]"
+                )
 
-    for metric, (low, high) in expect.metrics.items():
-        if low > high:
-            return KeyProblem(
-                f"metrics.{metric}", f"must be [least, most], but is [{low:g}, {high:g}]"
-            )
-
-    for min_key, max_key in (
-        ("peak_error_min_rad", "peak_error_max_rad"),
-        ("end_error_min_rad", "end_error_max_rad"),
-        ("mean_age_min_ms", "mean_age_max_ms"),
-    ):
-        least = getattr(expect, min_key)
-        most = getattr(expect, max_key)
-        if least is not None and most is not None and least > most:
-            return KeyProblem(
-                min_key, f"must be at most {max_key} = {most:g}, but is {least:g}"
-            )
-    return None
+        for min_key, max_key in (
+            ("peak_error_min_rad", "peak_error_max_rad"),
+            ("end_error_min_rad", "end_error_max_rad"),
+            ("mean_age_min_ms", "mean_age_max_ms"),
+        ):
+            least = getattr(self, min_key)
+            most = getattr(self, max_key)
+            if least is not None and most is not None and least > most:
+                return KeyProblem(
+                    min_key, f"must be at most {max_key} = {most:g}, but is {least:g}"
+                )
+        return None

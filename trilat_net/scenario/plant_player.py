@@ -19,7 +19,7 @@ import numpy as np
 
 from ..core import Array, PlantState
 from ..errors import PlantFailed, ScenarioError, count_nouns, describe_exception
-from ..own_code import CodeKey, Watch, call_directly, import_class, make_own_instance
+from ..own_code import CodeKey, Watch, call_directly, make_own_instance
 from .own_plant import OwnPlant
 from .scenario_types import Scenario
 
@@ -118,7 +118,7 @@ class PlantPlayer:
         self._code = plant.code
         self._watch = watch
         self.rate_hz = spec.rate_hz
-        kind = import_class(CodeKey.of(plant), path, plant.method)
+        kind = CodeKey.of(plant).import_class(path, plant.method)
         if plant.bodies and not hasattr(kind, "poses"):
             raise ScenarioError(
                 f"{plant.code} has no method poses(), which must return the poses of the "

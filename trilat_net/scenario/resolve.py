@@ -35,7 +35,7 @@ from .link_tables import change_link, complete_link_tables
 from .named_files import NamedFiles, use_unix_line_ends
 from .site_tables import complete_site_tables
 from .validate import find_row_problem
-from .written_tables import WrittenChange, check_tables
+from .written_tables import WrittenChange, WrittenScenario
 
 
 def resolve_scenario(tables: TomlTable, folder: Path | None) -> TomlTable:
@@ -54,7 +54,7 @@ def resolve_scenario(tables: TomlTable, folder: Path | None) -> TomlTable:
     Raises:
         ScenarioError: A key is unknown, missing or wrong. The error contains its path.
     """
-    written = check_tables(tables)
+    written = WrittenScenario.check(tables)
     files = NamedFiles.of_arms(tables, written.urdf, folder)
     draws = Draws(written.seed, written.drawn)
     # The tables of sites are completed as they were written and not as typed values, because

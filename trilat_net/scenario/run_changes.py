@@ -18,14 +18,14 @@ from typing import Any
 
 import msgspec
 
-from ..core import CoreChange, LifeOrder
+from ..core import CoreChange
 from ..errors import ScenarioError
 from ..records import NS_PER_S
 from .change import Change
 from .delay_models import LinkBase
 from .refusals import check_table
 from .resolve import complete_target, resolve_dominance_row
-from .scenario_types import Scenario, SiteOrder
+from .scenario_types import Scenario
 from .validate import check_change, check_links_memory
 from .written_tables import WrittenChange
 
@@ -102,57 +102,6 @@ def resolve_change(
     return complete
 
 
-def make_site_order(
-    scenario: Scenario, site: str, order: SiteOrder, from_ns: int, ticks: int = 0
-) -> Change:
-    """Converts a command to an arm's process, such as stop, to a change of the run.
-
-    In this form it can be sent and logged like a change of the network.
-
-    Args:
-        scenario: Description of the experiment.
-        site: Name of the site that must carry out the command.
-        order: The command, for example "stop".
-        from_ns: Time of the control period in which the site carries it out, in ns after the
-            common start time of all sites.
-        ticks: For the command "overrun": number of control periods that the site missed.
-
-    Raises:
-        ScenarioError: The site cannot stop and go on smoothly, because its setting
-            `on_stale.action` is not "glide".
-    """
-    action = scenario.sites[site].on_stale.action
-    if action != "glide":
-        raise ScenarioError(
-            f"{site} has on_stale.action = {action!r}, but only a site with 'glide' can stop "
-            "and go on without a jump; to end the whole session, use trilat stop --end"
-        )
-    return Change(at_s=from_ns / NS_PER_S, site=site, order=order, ticks=ticks)
-
-
-def to_core_change(scenario: Scenario, change: Change) -> CoreChange:
-    """Converts a change during a run to the form that the compiled control loop reads.
-
-    Args:
-        scenario: Description of the experiment.
-        change: Change of a link or of the weights with which a site follows the others, or a
-            command to a site.
-    """
-    text = msgspec.json.encode(change).decode()
-    site = change.owner
-    if change.order:
-        return CoreChange(text, order=LifeOrder[change.order.upper()], skipped=change.ticks)
-    if change.dominance:
-        ramp = scenario.ramp(site, change.to, change.start_ns, change.ramp_s)
-        return CoreChange(text, ramp=ramp)
-    sender = change.link.partition("->")[0]
-    return CoreChange(
-        text,
-        peer=scenario.peers(site).index(sender),
-        model=change.after.to_core_model(change.start_ns),
-    )
-
-
 def parse_core_change(scenario: Scenario, site: str, text: str) -> CoreChange:
     """Converts the text of a change in a log to the form that the compiled control loop reads.
 
@@ -193,8 +142,8 @@ def parse_core_change(scenario: Scenario, site: str, text: str) -> CoreChange:
 
     if is_order:
         # called only to check the change
-        make_site_order(scenario, site, change.order, change.start_ns)
+        scenario.make_site_order(site, change.order, change.start_ns)
     check_change(change, "cmd")
     if change.dominance:
         resolve_dominance_row(change.to, list(scenario.names), change.dominance, "cmd.to")
-    return to_core_change(scenario, change)
+    return scenario.to_core_change(change)

@@ -187,6 +187,19 @@ class ExperimentText(NamedTuple):
     text: str
     folder: Path | None
 
+    def read_tables(self, overrides: Sequence[str]) -> dict[str, Any]:
+        """Returns the tables of the text, with some values replaced but without any checks.
+
+        Args:
+            overrides: Texts KEY=VALUE, each of which replaces one value of the description.
+
+        Raises:
+            ScenarioError: An override is not valid.
+        """
+        tables = tomllib.loads(self.text)
+        apply_overrides(tables, overrides)
+        return tables
+
     def load(self, overrides: Sequence[str] = ()) -> Scenario:
         """Converts the text to a complete scenario, after some of its values were replaced.
 
@@ -227,7 +240,7 @@ class ExperimentText(NamedTuple):
             return ExperimentText(f"./{name}.toml", text, Path())
         if isinstance(source, str) and "\n" in source:
             return ExperimentText("./scenario.toml", source, Path())
-        text, folder = read_source(source)
+        text, folder = _read_source(source)
         return ExperimentText(str(source), text, folder)
 
 
@@ -246,7 +259,7 @@ def reseed_scenario(scenario: Scenario, seed: int) -> Scenario:
     return load_scenario(scenario, {"seed": seed}) if scenario.seed != seed else scenario
 
 
-def read_source(source: str | Path) -> tuple[str, Path]:
+def _read_source(source: str | Path) -> tuple[str, Path]:
     """Reads the TOML text of a scenario from the package or from a file.
 
     Args:

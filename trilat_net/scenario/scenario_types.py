@@ -25,9 +25,11 @@ from msgspec import Meta
 from ..core import (
     ArmLinks,
     Array,
+    CoreChange,
     DominanceRamp,
     Gains,
     LawChannel,
+    LifeOrder,
     LinkSetup,
     MotionLimits,
     RestGains,
@@ -43,16 +45,8 @@ from ..fields import Frozen
 from ..laws import SentVectorSpecs
 from ..own_code import build_channel
 from ..recorded_change import SiteOrder as SiteOrder
-from ..records import Layout
-from .arms import (
-    START_MARGIN_RAD,
-    Arm,
-    ArmModel,
-    bound_estimates,
-    build_arm,
-    compute_rest_gains,
-    start_margin,
-)
+from ..records import NS_PER_S, Layout
+from .arms import START_MARGIN_RAD, Arm, ArmModel, build_arm, start_margin
 from .change import Change
 from .delay_models import Link, LinkBase
 from .distributions import Distribution
@@ -664,7 +658,7 @@ class Scenario(Frozen, frozen=True, dict=True):
         gains = spec.control.gains(arm.theta)
         if spec.on_stale.action != "glide":
             return gains
-        return bound_estimates(gains, arm, spec.limits.tau_limit_nm, spec.arm.g_m_s2)
+        return arm.bound_estimates(gains, spec.limits.tau_limit_nm, spec.arm.g_m_s2)
 
     def _rest_gains(self, site: str) -> RestGains:
         """Returns the gains of the controller that brings an arm to rest.
@@ -678,8 +672,7 @@ class Scenario(Frozen, frozen=True, dict=True):
         gains = spec.control.linear_gains(arm.theta) or spec.control.gains(arm.theta)
         # the damping that the law of the site already has, on each joint
         law_damping: Array = np.zeros(arm.counts.joints) + gains.Kp + gains.d
-        return compute_rest_gains(
-            arm=arm,
+        return arm.compute_rest_gains(
             q0=spec.q0_rad,
             law_damping=law_damping,
             limit_nm=spec.limits.tau_limit_nm,
@@ -777,6 +770,53 @@ class Scenario(Frozen, frozen=True, dict=True):
             for change in self.timeline
             if change.dominance == site
         ]
+
+    def make_site_order(
+        self, site: str, order: SiteOrder, from_ns: int, ticks: int = 0
+    ) -> Change:
+        """Converts a command to an arm's process, such as stop, to a change of the run.
+
+        In this form it can be sent and logged like a change of the network.
+
+        Args:
+            site: Name of the site that must carry out the command.
+            order: The command, for example "stop".
+            from_ns: Time of the control period in which the site carries it out, in ns after
+                the common start time of all sites.
+            ticks: For the command "overrun": number of control periods that the site missed.
+
+        Raises:
+            ScenarioError: The site cannot stop and go on smoothly, because its setting
+                `on_stale.action` is not "glide".
+        """
+        action = self.sites[site].on_stale.action
+        if action != "glide":
+            raise ScenarioError(
+                f"{site} has on_stale.action = {action!r}, but only a site with 'glide' can "
+                "stop and go on without a jump; to end the whole session, use trilat stop --end"
+            )
+        return Change(at_s=from_ns / NS_PER_S, site=site, order=order, ticks=ticks)
+
+    def to_core_change(self, change: Change) -> CoreChange:
+        """Converts a change during a run to the form that the compiled control loop reads.
+
+        Args:
+            change: Change of a link or of the weights with which a site follows the others, or
+                a command to a site.
+        """
+        text = msgspec.json.encode(change).decode()
+        site = change.owner
+        if change.order:
+            return CoreChange(text, order=LifeOrder[change.order.upper()], skipped=change.ticks)
+        if change.dominance:
+            ramp = self.ramp(site, change.to, change.start_ns, change.ramp_s)
+            return CoreChange(text, ramp=ramp)
+        sender = change.link.partition("->")[0]
+        return CoreChange(
+            text,
+            peer=self.peers(site).index(sender),
+            model=change.after.to_core_model(change.start_ns),
+        )
 
     def without_hands(self) -> "Scenario":
         """Returns the same experiment without the persons or programs who move the arms.

@@ -10,9 +10,11 @@ Invariant:
 import math
 from typing import Annotated, Any, Literal
 
+import numpy as np
 from msgspec import Meta
+from numpy.typing import NDArray
 
-from ..core import MotionLimits, StaleAction, StaleRule
+from ..core import Array, MotionLimits, StaleAction, StaleRule
 from ..fields import Frozen, Joints, Positive, PositiveJoints, RateHz, Real
 from ..own_code import ImportedLaw
 from ..records import MAX_JOINTS
@@ -21,6 +23,7 @@ from .delay_models import Link
 from .laws import ChosenLaw
 from .operators import Environment, Operator
 from .operators.kernel_operators import LiveHand
+from .operators.program_hand import ProgramHand
 from .own_plant import OwnPlant
 
 
@@ -144,6 +147,23 @@ class Limits(Frozen, frozen=True):
             tau_rate=_or_infinity(self.tau_rate_limit_nm_s),
         )
 
+    def find_unlimited_rows(self, qd_des: Array) -> NDArray[np.bool_]:
+        """Marks the records in which no speed limit restricts the motion that the arm follows.
+
+        The motion that an arm follows is called its reference. Its velocity is limited in each
+        of the n coordinates.
+
+        Args:
+            qd_des: Velocity of the reference in rad/s, shape (K, n) for K records or (n,) for a
+                single record.
+
+        Returns:
+            True for each record in which every coordinate is slower than its limit, shape (K,)
+            or ().
+        """
+        is_slower = np.abs(qd_des) < self.motion.qd_des_limit
+        return np.asarray(is_slower.all(axis=-1))
+
 
 class SiteSpec(Frozen, frozen=True):
     """Description of a site in a scenario: an arm with its control loop.
@@ -195,6 +215,15 @@ class SiteSpec(Frozen, frozen=True):
         """
         law: Any = self.control
         return law.code if isinstance(law, ImportedLaw) else str(law.tag)
+
+    @property
+    def has_program_hand(self) -> bool:
+        """True if a program of the user operates the arm (a hand of kind "own").
+
+        Such a program may react to the motion of the arm. A linearised loop does not contain
+        this reaction, unlike that of an operator whom the scenario describes.
+        """
+        return any(isinstance(hand, ProgramHand) for hand in self.hands)
 
     def find_live_hand(self, *, is_open: bool = False) -> LiveHand | None:
         """Finds the operator of the site who may move the arm while the session runs.

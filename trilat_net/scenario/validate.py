@@ -37,9 +37,7 @@ from . import operators
 from .arms import START_MARGIN_M, START_MARGIN_RAD, TASK_AXES, start_margin
 from .change import Change
 from .delay_models import Link
-from .delay_models.kernel_delays import ConstantDelay
 from .distributions import dotted_key
-from .expect import find_expect_problem
 from .operators import kernel_operators
 from .operators.program_hand import ProgramHand
 from .refusals import convert_drawn, refuse
@@ -264,7 +262,7 @@ def build_scenario(resolved: TomlTable) -> Scenario:
         check_links_memory(scenario, name)
 
     joint_counts = {name: model.counts.joints for name, model in scenario.arms.items()}
-    problem = find_expect_problem(scenario.expect, joint_counts)
+    problem = scenario.expect.find_problem(joint_counts)
     if problem is not None:
         raise ScenarioError(problem.problem, path=f"expect.{problem.key}")
 
@@ -702,7 +700,7 @@ def _check_stale_rules(scenario: Scenario) -> None:
             continue
         for peer in peers:
             link = scenario.links[f"{peer}->{name}"]
-            constant_ms = link.delay_ms if isinstance(link, ConstantDelay) else 0.0
+            constant_ms = link.constant_delay_ms or 0.0
             delay_ms = max(link.playout_ms, constant_ms)
             follows = scenario.dominance[name].get(peer, 0.0) > 0.0
             if follows and delay_ms >= rule.age_ms:

@@ -159,31 +159,31 @@ class WrittenScenario(Frozen, frozen=True, kw_only=True):
         default_factory=dict
     )
 
+    @classmethod
+    def check(cls, tables: TomlTable) -> "WrittenScenario":
+        """Refuses a scenario file with an unknown key, or a value of a wrong type or range.
 
-def check_tables(tables: TomlTable) -> WrittenScenario:
-    """Refuses a scenario file with an unknown key, or with a value of a wrong type or range.
+        Conditions that involve several tables are checked later.
 
-    Conditions that involve several tables are checked later.
+        Args:
+            tables: Tables of the file as its author wrote them.
 
-    Args:
-        tables: Tables of the file as its author wrote them.
+        Returns:
+            The tables as typed values, with the defaults of the whole scenario.
 
-    Returns:
-        The tables as typed values, with the defaults of the whole scenario.
-
-    Raises:
-        ScenarioError: A key is unknown or missing, or a value has a wrong type or range.
-    """
-    check_finite(tables, "")
-    try:
-        written = msgspec.convert(tables, WrittenScenario)
-    except msgspec.ValidationError as error:
-        sites = tables.get("sites")
-        site_paths = [f"sites.{name}" for name in sites] if isinstance(sites, dict) else []
-        paths = [*site_paths, *list_group_paths()]
-        raise refuse(error, tables, WrittenScenario, "", paths) from None
-    _check_site_names(written.sites)
-    return written
+        Raises:
+            ScenarioError: A key is unknown or missing, or a value has a wrong type or range.
+        """
+        check_finite(tables, "")
+        try:
+            written = msgspec.convert(tables, WrittenScenario)
+        except msgspec.ValidationError as error:
+            sites = tables.get("sites")
+            site_paths = [f"sites.{name}" for name in sites] if isinstance(sites, dict) else []
+            paths = [*site_paths, *list_group_paths()]
+            raise refuse(error, tables, WrittenScenario, "", paths) from None
+        _check_site_names(written.sites)
+        return written
 
 
 def _check_site_names(names: Collection[str]) -> None:

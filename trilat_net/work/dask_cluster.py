@@ -27,8 +27,8 @@ from ..core import compute_fingerprint
 from ..errors import RunFailed, ScenarioError, UsageError
 from ..files import import_extra
 from ..log import collect_provenance
-from ..net import SystemClock, UnknownHost, check_hosts
-from ..own_code import NamedCode, read_code
+from ..net import SystemClock, check_hosts
+from ..own_code import read_code
 from ..package_names import PACKAGE_COMMANDS
 
 CONNECT_S = 10.0
@@ -225,11 +225,12 @@ class DaskCluster:
         self._last_worker_ns = -1
         try:
             check_hosts([address])
+        except UsageError as unknown_host:
+            raise UsageError(f"--on {unknown_host}") from None
+        try:
             self._client = _import_distributed().Client(
                 address, timeout=CONNECT_S, set_as_default=False
             )
-        except UnknownHost as unknown:
-            raise UsageError(f"--on {unknown}") from None
         except (OSError, ValueError, TypeError) as error:  # TimeoutError is an OSError
             reason = str(error).splitlines()[0]
             raise UsageError(
@@ -260,14 +261,15 @@ class DaskCluster:
         workers = self._client.scheduler_info()["workers"]
         return sum(worker["nthreads"] for worker in workers.values())
 
-    def require(self, laws: Sequence[NamedCode]) -> WorkerRequirements:
+    def require(self, laws: Sequence[tuple[str, str]]) -> WorkerRequirements:
         """Determines the requirements of a study, and checks all workers of the cluster.
 
         A worker must have the same program, arithmetic and versions of packages as this
         process, and the files of all imported control laws. Otherwise, results would differ.
 
         Args:
-            laws: Imported control laws that the items of the study need.
+            laws: Name of each imported class that the items of the study need, with the SHA-256
+                of its file.
 
         Returns:
             The requirements, against which later workers check themselves.
@@ -284,8 +286,7 @@ class DaskCluster:
                 f"start some with: dask worker {self.address}"
             ) from None
 
-        files = tuple(dict.fromkeys((law.code, law.source_sha256) for law in laws))
-        required = WorkerRequirements(describe_worker(), files)
+        required = WorkerRequirements(describe_worker(), tuple(laws))
         # Dask itself reports the versions of Python. They are checked first, because code
         # cannot be sent between different versions.
         python = required.identity["Python"]
@@ -297,7 +298,7 @@ class DaskCluster:
                     f"but this program runs on Python {python}"
                 )
 
-        answers = self._client.run(_make_probe(), files, on_error="return")
+        answers = self._client.run(_make_probe(), required.laws, on_error="return")
         for worker, answer in answers.items():
             if isinstance(answer, BaseException):
                 raise UsageError(f"the worker {worker} does not report its version: {answer}")

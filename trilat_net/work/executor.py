@@ -507,7 +507,7 @@ def open_worker_pool(
     on: Workers = None,
     *,
     most: int | None = None,
-    laws: Sequence[Any] = (),
+    laws: Sequence[tuple[str, str]] = (),
     hint: str = "",
 ) -> Iterator[WorkerPool]:
     """Starts the worker processes of a study, or connects to the workers of a cluster.
@@ -520,7 +520,8 @@ def open_worker_pool(
             items run in this process.
         on: Workers to use instead of processes on this machine.
         most: Number of items. No more processes than this are started.
-        laws: Imported control laws that the items need. Each worker must have their files.
+        laws: Name of each imported class that the items need, with the SHA-256 of its file.
+            Each worker must have the files.
         hint: Advice for the user that follows the message about a dead worker.
 
     Raises:

@@ -54,9 +54,8 @@ from trilat_net.net import (
     Info,
     LinkStats,
     RouterSilent,
+    SessionMembers,
     SystemClock,
-    find_members,
-    list_past_events,
     read_messages,
     read_records,
     topics,
@@ -715,7 +714,8 @@ class _Bridge:
         ends = self._ends
         # The changes before the bridge was started determine the site's present shares.
         shares = self._sites[site].shares
-        for event in list_past_events(ends.bus, ends.clock, ends.session, site):
+        members = SessionMembers(ends.bus, ends.clock, ends.session)
+        for event in members.list_past_events(site):
             shares.add_change(event.command)
 
         topic = ends.topic(site, "set_dominance")
@@ -1252,8 +1252,8 @@ def _await_site(ends: BridgeEnds, stopped: Callable[[], bool], *, running: bool)
     Returns:
         The identity of the site. `None` if `stopped` returned True.
     """
-    replies = find_members(ends.bus, ends.clock, ends.session, stopped=stopped, timeout_s=None)
-    for info in replies:
+    members = SessionMembers(ends.bus, ends.clock, ends.session)
+    for info in members.find(stopped=stopped, timeout_s=None):
         # Members without a scenario, such as the recorder, are not sites.
         is_site = bool(info.scenario)
         if is_site and (info.running or not running):

@@ -48,7 +48,7 @@ from trilat_net.execution import FusedRun
 from trilat_net.log import open_log, read_link_delays
 from trilat_net.presentation import MARKS, Block, MarkedText, TextTable, describe_moving_states
 from trilat_net.results import Result, finite_or_none
-from trilat_net.scenario import BUILT_IN, Scenario, load_scenario, read_arm
+from trilat_net.scenario import BUILT_IN, Scenario, load_scenario
 from trilat_net.work import Progress, ignore_progress
 
 TUNED_LAWS = tuple(
@@ -380,7 +380,7 @@ def _draw_poses(scenario: Scenario, count: int, seed: int) -> Array:
     """
     ranges = []
     first_site = scenario.sites[scenario.names[0]]
-    model = read_arm(first_site.arm, scenario.urdf)
+    model = first_site.arm.read_chain(scenario.urdf)
     for joint in model.joints:
         half_range = _HALF_SLIDE_M if joint.kind == "prismatic" else _HALF_TURN
         at_least_lower = max(joint.lower, 0.0)

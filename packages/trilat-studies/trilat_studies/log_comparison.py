@@ -15,7 +15,6 @@ from typing import Any, NamedTuple
 from trilat_net.analysis import LogMetrics, Metric, Quantity, certify_run
 from trilat_net.errors import UsageError, count_nouns, join_words
 from trilat_net.log import Log, open_log
-from trilat_net.own_code import may_run_user_laws
 from trilat_net.presentation import (
     Block,
     MarkedText,
@@ -380,7 +379,7 @@ def compare(*logs: str | Path | Log) -> LogComparison:
 
     remarks = {}
     for name, log in zip(names, opened, strict=True):
-        judgement = certify_run(log, own_laws=may_run_user_laws(log.scenario))
+        judgement = certify_run(log, own_laws=log.may_run_user_laws)
         verdict = describe_judgement(judgement)
         remarks[name] = [verdict, *check_final_posture(log)]
 

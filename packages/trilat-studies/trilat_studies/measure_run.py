@@ -49,9 +49,7 @@ from trilat_net.scenario import (
     ALL_SITES_QUANTITIES,
     END_WINDOW_S,
     Expect,
-    ExpectWindow,
     Scenario,
-    field_names,
 )
 
 BATCH_RECORDS = 1000
@@ -444,15 +442,16 @@ class WindowStats:
     updated batch by batch, so the records need not be kept.
 
     Args:
-        window: Period of the run, with the limits that apply to it.
+        from_s: Start of the part of the run, in s.
+        to_s: End of the part of the run, in s.
         scenario: Scenario of the run.
         site: Name of the site whose records are evaluated.
     """
 
-    def __init__(self, window: ExpectWindow, scenario: Scenario, site: str) -> None:
+    def __init__(self, from_s: float, to_s: float, scenario: Scenario, site: str) -> None:
         spec = scenario.sites[site]
-        self._from_ns = round(window.from_s * NS_PER_S)
-        self._to_ns = round(window.to_s * NS_PER_S)
+        self._from_ns = round(from_s * NS_PER_S)
+        self._to_ns = round(to_s * NS_PER_S)
         self._period_ns = NS_PER_S // spec.rate_hz + 1
         self._arm = build_arm_rows(scenario, site)
         self._walls = VirtualWall.list_of_site(spec)
@@ -619,7 +618,9 @@ class SiteStats:
         self.windows: list[WindowStats | None] = []
         for window in expect.windows:
             applies = window.site in ("", site)
-            stats = WindowStats(window, scenario, site) if applies else None
+            stats: WindowStats | None = None
+            if applies:
+                stats = WindowStats(window.from_s, window.to_s, scenario, site)
             self.windows.append(stats)
 
         self.records = 0
@@ -1315,7 +1316,7 @@ def _evaluate_stability(expect: Expect, metrics: RunMetrics) -> Iterator[Expecta
         yield ExpectationResult("stable", held, measured, limit)
 
 
-_LIMITS = tuple(key for key in field_names(Expect) if re.search("_(max|min|by)(_|$)", key))
+_LIMITS = tuple(key for key in Expect.__struct_fields__ if re.search("_(max|min|by)(_|$)", key))
 """Keys of [expect] that are a smallest or largest value of a metric."""
 
 

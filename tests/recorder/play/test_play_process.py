@@ -24,8 +24,8 @@ from trilat_net.app.play.play_process import (
 from trilat_net.app.play.player import PlayProgress
 from trilat_net.app.play.session_reader import PlaySelection, preload_messages
 from trilat_net.errors import SessionError
-from trilat_net.execution.virtual import compute_boot
 from trilat_net.log.log_layout import ChannelFilter
+from trilat_net.log.message_identity import compute_virtual_boot
 from trilat_net.net import topics
 from trilat_net.net.bus import Bus, Inbox
 from trilat_net.net.discovery import refuse_running_session
@@ -148,7 +148,10 @@ def test_visitors_find_a_running_session(
         info.member: info
         for info in (decode(payload, Info) for _, payload in drained(rings[0]))
     }
-    boots = {name: compute_boot(hall.facts.scenario, name) for name in ("m1", "m2", "s")}
+    boots = {
+        name: compute_virtual_boot(hall.facts.scenario.sha256, name)
+        for name in ("m1", "m2", "s")
+    }
     assert {name: info.boot for name, info in infos.items()} == boots
     for name, info in infos.items():
         assert info.running

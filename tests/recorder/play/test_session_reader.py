@@ -10,8 +10,8 @@ from tests.log.builders import write_log
 from tests.recorder.play.logs import encode_event, preload_paths, read_payloads, write_event_log
 from trilat_net.app.play.session_reader import PlaySelection, preload_messages
 from trilat_net.errors import LogError, UsageError
-from trilat_net.execution.virtual import compute_boot
 from trilat_net.log.log_layout import ChannelFilter
+from trilat_net.log.message_identity import compute_virtual_boot
 
 from .logs import BOOT
 
@@ -33,7 +33,7 @@ def test_site_messages_are_read_byte_for_byte(log_file: Path) -> None:
     assert played == published
     assert facts.session == "paper"
     assert facts.boots == {
-        name: compute_boot(facts.scenario, name) for name in ("m1", "m2", "s")
+        name: compute_virtual_boot(facts.scenario.sha256, name) for name in ("m1", "m2", "s")
     }
     assert facts.torn == {}
 

@@ -28,7 +28,7 @@ import numpy as np
 
 from ...log import Coverage, Log, judge_integrity
 from ...net import HALTED_MODES
-from ..aligned import Bools, find_unlimited_rows
+from ..aligned import Bools
 from ..dominance_history import (
     PeerLoss,
     compute_lyapunov_weights,
@@ -378,7 +378,7 @@ def _check_following(run: FunctionalFacts) -> Premise:
     limited_ticks = {}
     for site in log.sites:
         limits = log.scenario.sites[site].limits
-        limited_rows = ~find_unlimited_rows(limits, log[site].qd_des)
+        limited_rows = ~limits.find_unlimited_rows(log[site].qd_des)
         if limited_rows.any():
             limited_ticks[site] = int(np.count_nonzero(limited_rows))
 

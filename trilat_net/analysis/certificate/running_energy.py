@@ -27,7 +27,6 @@ from ..aligned import (
     RESUMING_S,
     AlignedRecords,
     PeerTrajectory,
-    find_unlimited_rows,
 )
 from ..dominance_history import DominanceHistory, DominancePlan, find_closed_groups
 from .energy_balance import (
@@ -155,7 +154,7 @@ class RecordWindow:
         if self._limits.qd_des_limit_rad_s is None:
             return True
         qd_des = np.array(record.qd_des)
-        return bool(find_unlimited_rows(self._limits, qd_des))
+        return bool(self._limits.find_unlimited_rows(qd_des))
 
     def _shift_to(self, first: int) -> None:
         """Makes room for newer records: drops those before tick `first`, and moves the rest."""

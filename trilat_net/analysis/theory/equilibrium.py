@@ -13,6 +13,7 @@ Invariant:
 
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
+from typing import Any
 
 import msgspec
 import numpy as np
@@ -21,7 +22,7 @@ from ...core import BUCKETS_PER_S, Array, Law, SiteSetup
 from ...errors import ScenarioError, UsageError, count_nouns
 from ...execution import FusedRun
 from ...own_code import ImportedLaw
-from ...scenario import Chirp, Multisine, Scenario
+from ...scenario import Scenario
 from ..blas_threads import limit_blas_threads
 from ..run_end import EQUILIBRIUM_SPEED_RAD_S
 from . import linear_loop
@@ -74,7 +75,7 @@ def extend_scenario(scenario: Scenario, duration_s: float) -> Scenario:
     """
     end_s = scenario.duration_s
 
-    def extend_actors(actors: tuple[msgspec.Struct, ...]) -> tuple[msgspec.Struct, ...]:
+    def extend_actors(actors: tuple[Any, ...]) -> tuple[Any, ...]:
         """Adapts operators and walls to a longer run in which the arms are to come to rest.
 
         Operators that never rest are left out, and springs that act at the original end act
@@ -83,7 +84,7 @@ def extend_scenario(scenario: Scenario, duration_s: float) -> Scenario:
         extended = []
         for actor in actors:
             starts_later = getattr(actor, "start_s", 0.0) > end_s
-            if starts_later or isinstance(actor, Chirp | Multisine):
+            if starts_later or actor.oscillates:
                 continue
             is_present = getattr(actor, "end_s", 0.0) > end_s
             if is_present and hasattr(actor, "stiffness_nm_rad"):

@@ -42,7 +42,7 @@ from ..blas_threads import limit_blas_threads
 from ..decision_facts import LoopRoots
 from ..delay_period import find_final_link, is_ending_trace
 from ..run_end import SETTLED_SPEED_RAD_S, RunTrace
-from ..shared_slave import has_program_hand, list_program_sites
+from ..shared_slave import list_program_sites
 from ..timeline import Timeline
 from .characteristic_roots import Spectrum
 from .equilibrium import follow_equilibrium, pad_rows, settle_memories
@@ -246,7 +246,7 @@ def find_run_loop(scenario: Scenario, run: FusedRun) -> _EndLoop:
             theta_hat.append(record[columns["theta_hat"]])
         state = _choose_end_state(ended, trace, theta_hat)
     loop = _build_end_loop(final, state, trace, own_laws=True)
-    programs = [site for site in scenario.names if has_program_hand(scenario, site)]
+    programs = [site for site in scenario.names if scenario.sites[site].has_program_hand]
     return loop._replace(programs=tuple(programs))
 
 

@@ -179,7 +179,7 @@ def record_command(
     from sites import check_machine_load
 
     from ...files import refuse_existing
-    from ...log import ChannelFilter, LogStorage, collect_provenance, find_parts
+    from ...log import ChannelFilter, LogStorage, collect_provenance
     from ...net import RECORDER
     from ..recorded_session import make_scenario_reader
     from .options import parse_viz_rate
@@ -223,7 +223,7 @@ def record_command(
         A log in several files is treated as one.
         """
         if concluded:
-            _conclude(list(find_parts(path).values()), png=png)
+            _conclude(list(storage.find_parts().values()), png=png)
 
     try:
         code = record_session(

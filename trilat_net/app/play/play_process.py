@@ -21,7 +21,7 @@ from trilat_net import process
 from trilat_net.net import topics
 from trilat_net.records import NS_PER_S
 
-from ...net import Bus, Clock, Connection, open_playback_bus, refuse_running_session
+from ...net import Bus, Clock, Connection, open_playback_bus
 from .batch import MessageBatch
 from .message_source import MessageSource
 from .player import LatenessSummary, Pace, Player, PlayProgress
@@ -305,7 +305,6 @@ def play_log(
         if bus is None:
             return None
         stack.enter_context(closing(bus))
-        refuse_running_session(bus, clock, options.session, stopped)
 
         source = stack.enter_context(closing(MessageSource(header, batch)))
         if batch is None:

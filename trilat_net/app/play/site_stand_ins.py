@@ -21,9 +21,9 @@ from bisect import bisect_left
 from collections import deque
 from collections.abc import Collection
 from contextlib import suppress
+from functools import partial
 from typing import NamedTuple
 
-import msgspec
 import numpy as np
 
 from trilat_net.errors import WireError
@@ -33,18 +33,12 @@ from ...log import Ints
 from ...net import (
     BACKFILL_BYTES,
     BACKFILL_MESSAGES,
-    BackfillRequest,
     Bus,
     Clock,
     Event,
     MemberQuery,
-    Query,
-    answer_backfill,
-    answer_pings,
+    SiteStandIn,
     decode,
-    describe_member,
-    encode,
-    liveliness_token,
     read_messages,
 )
 from .batch import MessageBatch
@@ -182,11 +176,6 @@ class PlayedHistory:
 
 _MAX_RECORDER_EVENTS = 256
 """Largest number of waiting events of recorders."""
-REFRESH_NS = 500_000_000
-"""Time for which an encoded identity is used again, in ns.
-
-An identity contains a whole scenario, so encoding it takes long.
-"""
 
 
 class SiteStandIns:
@@ -231,26 +220,18 @@ class SiteStandIns:
         self._listening: set[str] = set()
         # Index and boot of the start of each site that is played, see `_find_start`.
         self._boots: dict[str, tuple[int, int]] = {}
-        # Time at which the identity of each site was encoded, and the encoded identity.
-        self._encoded: dict[str, tuple[int, bytes]] = {}
 
-        # The identities of the sites, and the tokens that make them appear as members of the
-        # session.
-        self._infos = {}
+        self._sites: dict[str, SiteStandIn] = {}
         for site, boot in header.boots.items():
-            self._infos[site] = describe_member(
-                site, boot, clock, header.fingerprint, header.scenario_text
+            self._sites[site] = SiteStandIn(
+                bus=bus,
+                clock=clock,
+                session=session,
+                site=site,
+                boot=boot,
+                fingerprint=header.fingerprint,
+                scenario_text=header.scenario_text,
             )
-
-        self._identity_queries = {}
-        self._backfill_queries = {}
-        for site, info in self._infos.items():
-            info_key = topics.key(session, site, topics.INFO)
-            past_key = topics.key(session, site, topics.PAST)
-            self._identity_queries[site] = bus.query_inbox(info_key)
-            self._backfill_queries[site] = bus.query_inbox(past_key)
-            answer_pings(bus, clock, session, info)
-            bus.announce(liveliness_token(session, site, info.boot))
 
     def start_session(self, epoch_mono_ns: int) -> None:
         """Announces the session as running, so that recorders and viewers join it.
@@ -263,15 +244,8 @@ class SiteStandIns:
         """
         unix_ns = self._clock.unix_ns()
         epoch_unix_ns = unix_ns + epoch_mono_ns - self._clock.monotonic_ns()
-        for site, info in self._infos.items():
-            self._infos[site] = msgspec.structs.replace(
-                info,
-                running=True,
-                epoch_mono_ns=epoch_mono_ns,
-                epoch_unix_ns=epoch_unix_ns,
-                boots=dict(self._header.boots),
-            )
-        self._encoded.clear()
+        for stand_in in self._sites.values():
+            stand_in.start_session(epoch_mono_ns, epoch_unix_ns, self._header.boots)
 
     def serve_queries(self) -> bool:
         """Replies to waiting requests of other programs in the name of the original sites.
@@ -283,14 +257,14 @@ class SiteStandIns:
         Returns:
             True if a request of a recorder was processed. More requests may be waiting then.
         """
-        for site, queries in self._identity_queries.items():
-            while (query := queries.poll()) is not None:
-                query.reply(self._encode_identity(site))
+        for site, stand_in in self._sites.items():
+            stand_in.answer_identity_queries(partial(self._count_ticks, site))
         self._receive_recorders()
-        for site, queries in self._backfill_queries.items():
-            query = queries.poll()
-            if query is not None:
-                self._reply_backfill(site, query)
+        for site, stand_in in self._sites.items():
+            find_messages = partial(self._find_messages, site)
+            sent = stand_in.answer_backfill_query(partial(self._find_boot, site), find_messages)
+            if sent is not None:
+                self.refilled += sent
                 return True
         return False
 
@@ -306,17 +280,10 @@ class SiteStandIns:
                 stored_sites = self._stored.setdefault(str(event.boot), set())
                 stored_sites.add(event.about)
 
-    def _encode_identity(self, site: str) -> bytes:
-        """Returns the encoded identity of a site, which may be up to `REFRESH_NS` old."""
-        encoded_ns, identity = self._encoded.get(site, (0, b""))
-        now_ns = self._clock.monotonic_ns()
-        if not identity or now_ns - encoded_ns >= REFRESH_NS:
-            channel = self._find_channel(site, topics.STATE)
-            ticks = self._history.next_numbers.get(channel, 0)
-            info = msgspec.structs.replace(self._infos[site], ticks=ticks)
-            identity = encode(info)
-            self._encoded[site] = (now_ns, identity)
-        return identity
+    def _count_ticks(self, site: str) -> int:
+        """Returns the number of the newest played record of a site plus 1."""
+        channel = self._find_channel(site, topics.STATE)
+        return self._history.next_numbers.get(channel, 0)
 
     def are_recorders_listening(self) -> bool:
         """Checks whether all recorders on the network are ready to receive replayed messages.
@@ -336,7 +303,7 @@ class SiteStandIns:
             recorders: The recorders. Each is identified by the random number of its start, as
                 text.
         """
-        all_sites = self._infos.keys()
+        all_sites = self._sites.keys()
         for recorder in recorders:
             stored_sites = self._stored.get(recorder, set())
             if not stored_sites >= all_sites:
@@ -376,7 +343,7 @@ class SiteStandIns:
         # It is -1 if no event of the site was played yet.
         newest_event = self._history.next_numbers.get(channel, 0) - 1
         start_index = max(newest_event, 0) // NUMBERS_OF_A_START
-        first_start = (0, self._infos[site].boot)
+        first_start = (0, self._sites[site].boot)
         if start_index == 0:
             return first_start
 
@@ -390,12 +357,18 @@ class SiteStandIns:
                     self._boots[site] = (start_index, decode(payload, Event).boot)
         return self._boots.get(site, first_start)
 
-    def _reply_backfill(self, site: str, query: Query) -> None:
+    def _find_boot(self, site: str) -> int:
         """Sends messages that a recorder has missed again, in the name of the original site.
 
-        The reply is called a backfill. It contains messages that were played before, and it
-        states the boot of the site's start that is being played, because the recorder accepts
-        only replies of that start.
+        Recorders accept only replies of that start.
+        """
+        _, boot = self._find_start(site)
+        return boot
+
+    def _find_messages(
+        self, site: str, channel_name: str, first: int, last: int
+    ) -> tuple[int, list[bytes], int]:
+        """Finds the replayed messages that a recorder requests again after missing them.
 
         The history and the recorder number events differently. A site numbers its events from 0
         in each start, and so does the recorder. The history numbers them over all starts: it
@@ -403,32 +376,24 @@ class SiteStandIns:
 
         Args:
             site: Name of the site.
-            query: The encoded request, with the means to reply to it.
+            channel_name: Name of the site's channel.
+            first: Number of the first requested message.
+            last: Number of the last requested message.
+
+        Returns:
+            The number of the first message in the reply, the encoded messages, and the number
+            of messages that the site has published on this channel so far. The numbers are
+            those of the recorder.
         """
-        start_index, boot = self._find_start(site)
-
-        def find_requested(request: BackfillRequest) -> tuple[int, list[bytes], int]:
-            """Finds the replayed messages that a recorder requests again after missing them.
-
-            Args:
-                request: The channel, and the numbers of the first and last requested message.
-
-            Returns:
-                The number of the first message in the reply, the encoded messages, and the
-                number of messages that the site has published on this channel so far. The
-                numbers are those of the recorder.
-            """
-            channel = self._find_channel(site, request.channel)
-            # Number in the history minus number of the recorder.
-            offset = 0
-            if request.channel == topics.EVENT:
-                offset = start_index * NUMBERS_OF_A_START
-            published = self._history.next_numbers.get(channel, 0) - offset
-            first_in_history, payloads = self._history.find_messages(
-                channel, request.first + offset, request.last + offset
-            )
-            # Messages of earlier starts would have negative numbers.
-            first = max(first_in_history - offset, 0)
-            return first, payloads, max(published, 0)
-
-        self.refilled += answer_backfill(query, site, boot, find_requested)
+        channel = self._find_channel(site, channel_name)
+        # Number in the history minus number of the recorder.
+        offset = 0
+        if channel_name == topics.EVENT:
+            start_index, _ = self._find_start(site)
+            offset = start_index * NUMBERS_OF_A_START
+        published = self._history.next_numbers.get(channel, 0) - offset
+        first_in_history, payloads = self._history.find_messages(
+            channel, first + offset, last + offset
+        )
+        # Messages of earlier starts would have negative numbers.
+        return max(first_in_history - offset, 0), payloads, max(published, 0)

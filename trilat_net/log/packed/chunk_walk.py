@@ -66,17 +66,17 @@ class MessageRun(NamedTuple):
     excess: Ints
     firsts: Ints
 
+    @classmethod
+    def allocate(cls, slots: int, messages: int = 1) -> "MessageRun":
+        """Returns empty arrays that receive the messages of one call of `walk_messages`.
 
-def allocate_run(slots: int, messages: int = 1) -> MessageRun:
-    """Returns empty arrays that receive the messages of one call of `walk_messages`.
-
-    Args:
-        slots: Number of slots, the small numbers that stand for channels.
-        messages: Largest number of messages.
-    """
-    places = [np.zeros(messages, np.int64) for _ in range(4)]
-    sums = [np.zeros(slots, np.int64) for _ in range(4)]
-    return MessageRun(np.zeros(messages, np.int32), *places, *sums)
+        Args:
+            slots: Number of slots, the small numbers that stand for channels.
+            messages: Largest number of messages.
+        """
+        places = [np.zeros(messages, np.int64) for _ in range(4)]
+        sums = [np.zeros(slots, np.int64) for _ in range(4)]
+        return cls(np.zeros(messages, np.int32), *places, *sums)
 
 
 @leaf

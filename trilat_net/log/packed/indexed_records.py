@@ -20,14 +20,7 @@ from ...net import MODE_WORDS
 from ...records import Layout
 from . import record_scan
 from .packed_messages import Ints, PackedMessages
-from .record_layout import (
-    BEFORE_BUSY,
-    BEFORE_SENT,
-    FIRST_VECTOR,
-    NUMBER_BYTES,
-    RecordLayout,
-    make_record_layout,
-)
+from .record_layout import BEFORE_BUSY, BEFORE_SENT, FIRST_VECTOR, NUMBER_BYTES, RecordLayout
 
 _INTS = {
     "t_ns": (record_scan.TIME, ()),
@@ -44,7 +37,8 @@ _TICK, _BOOT, _MODE = range(3)
 class IndexedRecords:
     """Fields of K records of an arm, which compiled code reads directly from the encoded bytes.
 
-    All records have the layout that this program writes. `index_records` creates this object.
+    All records have the layout that this program writes. `IndexedRecords.of_payloads` creates
+    this object.
 
     Args:
         messages: The encoded records.
@@ -69,7 +63,7 @@ class IndexedRecords:
         marks: NDArray[np.int32],
         counts: NDArray[np.int32],
     ) -> None:
-        """Stores encoded records, with the positions of their values from `index_records`."""
+        """Stores encoded records, with the positions of their values from `of_payloads`."""
         self.messages = messages
         self._peers = peers
         self._layout = layout
@@ -317,39 +311,39 @@ class IndexedRecords:
             first += count
         return lists
 
+    @classmethod
+    def of_payloads(
+        cls, payloads: PackedMessages, site: str, peers: Sequence[str], layout: Layout
+    ) -> "IndexedRecords | None":
+        """Prepares records for reading their fields without decoding them one by one.
 
-def index_records(
-    payloads: PackedMessages, site: str, peers: Sequence[str], layout: Layout
-) -> IndexedRecords | None:
-    """Prepares records for reading their fields without decoding them one by one.
+        This is possible only if all of them have the exact layout that this program writes.
 
-    This is possible only if all of them have the exact layout that this program writes.
+        Args:
+            payloads: The encoded records.
+            site: Name of the site that sent them.
+            peers: Names of its peers, in the order of the scenario.
+            layout: Lengths of the vectors of a record.
 
-    Args:
-        payloads: The encoded records.
-        site: Name of the site that sent them.
-        peers: Names of its peers, in the order of the scenario.
-        layout: Lengths of the vectors of a record.
-
-    Returns:
-        The records. None if a record has another layout, or is not valid.
-    """
-    exact = make_record_layout(site, peers, layout)
-    count = len(payloads)
-    heads = np.zeros((count, 3), np.int64)
-    marks = np.zeros((count, record_scan.MARKS), np.int32)
-    counts = np.zeros((count, record_scan.COUNTS), np.int32)
-    accepted = record_scan.scan_records(
-        payloads.data, payloads.starts, payloads.ends, exact, heads, marks, counts
-    )
-    if accepted < count:
-        return None
-    return IndexedRecords(
-        messages=payloads,
-        peers=peers,
-        layout=layout,
-        exact=exact,
-        heads=heads,
-        marks=marks,
-        counts=counts,
-    )
+        Returns:
+            The records. None if a record has another layout, or is not valid.
+        """
+        exact = RecordLayout.of_site(site, peers, layout)
+        count = len(payloads)
+        heads = np.zeros((count, 3), np.int64)
+        marks = np.zeros((count, record_scan.MARKS), np.int32)
+        counts = np.zeros((count, record_scan.COUNTS), np.int32)
+        accepted = record_scan.scan_records(
+            payloads.data, payloads.starts, payloads.ends, exact, heads, marks, counts
+        )
+        if accepted < count:
+            return None
+        return cls(
+            messages=payloads,
+            peers=peers,
+            layout=layout,
+            exact=exact,
+            heads=heads,
+            marks=marks,
+            counts=counts,
+        )

@@ -60,6 +60,58 @@ class RecordLayout(NamedTuple):
     modes: Ints
     mode_codes: Ints
 
+    @classmethod
+    def of_site(cls, site: str, peers: Sequence[str], layout: Layout) -> "RecordLayout":
+        """Describes byte by byte how this program encodes the records of one arm.
+
+        Records with this layout can be read without a general decoder, which is faster.
+
+        Args:
+            site: Name of the site.
+            peers: Names of its peers, in the order of the scenario.
+            layout: Lengths of the vectors of a record.
+        """
+        lengths = layout.lengths()
+        optional = {name: lengths[name] for name in _OPTIONAL_VECTORS if name in lengths}
+        vectors = {name: count for name, count in lengths.items() if name not in optional}
+        fields = _FIRST_FIELDS + len(optional)
+        literals = [
+            _map_head(fields) + b"".join(map(_encode, ("v", VERSION, "site", site, "boot"))),
+            *map(_encode, ("tick", "t_ns", "mode")),
+            _encode("used") + _map_head(len(peers)),
+            *map(
+                _encode, ("rx", "rx_crc", "cmd", "mem", "late_us", "busy_us", "sent_ns", "echo")
+            ),
+        ]
+        assert len(literals) == FIRST_VECTOR
+        for name, count in [*vectors.items(), *optional.items()]:
+            literals.append(_encode(name) + _array_head(count))
+        literals += map(_encode, peers)
+
+        bits = []
+        masks = []
+        first_words = [0]
+        for literal in literals:
+            padded = -len(literal) % _WORD_BYTES
+            bits.append(literal + bytes(padded))
+            masks.append(b"\xff" * len(literal) + bytes(padded))
+            first_words.append(first_words[-1] + len(bits[-1]) // _WORD_BYTES)
+        modes = []
+        for word in MODE_WORDS.values():
+            padded = _WORD_BYTES - len(word)
+            modes.append(word.encode() + bytes(padded) + b"\xff" * len(word) + bytes(padded))
+        return cls(
+            bits=np.frombuffer(b"".join(bits), "<i8").astype(np.int64),
+            masks=np.frombuffer(b"".join(masks), "<i8").astype(np.int64),
+            first_words=np.array(first_words, np.int64),
+            lengths=np.array(list(map(len, literals)), np.int64),
+            vectors=np.array(list(vectors.values()), np.int64),
+            optional_vectors=np.array(list(optional.values()), np.int64),
+            peers=len(peers),
+            modes=np.frombuffer(b"".join(modes), "<i8").astype(np.int64).reshape(-1, 2),
+            mode_codes=np.array(list(map(int, MODE_WORDS)), np.int64),
+        )
+
 
 def _array_head(length: int) -> bytes:
     """Returns the bytes with which an encoded list (MessagePack) of a given length begins."""
@@ -71,53 +123,3 @@ def _map_head(length: int) -> bytes:
     pair_bytes = len(_encode("00")) + len(_encode(None))
     encoded = _encode({f"{n:02}": None for n in range(length)})
     return encoded[: len(encoded) - length * pair_bytes]
-
-
-def make_record_layout(site: str, peers: Sequence[str], layout: Layout) -> RecordLayout:
-    """Describes byte by byte how this program encodes the records of one arm.
-
-    Records with this layout can be read without a general decoder, which is faster.
-
-    Args:
-        site: Name of the site.
-        peers: Names of its peers, in the order of the scenario.
-        layout: Lengths of the vectors of a record.
-    """
-    lengths = layout.lengths()
-    optional = {name: lengths[name] for name in _OPTIONAL_VECTORS if name in lengths}
-    vectors = {name: count for name, count in lengths.items() if name not in optional}
-    fields = _FIRST_FIELDS + len(optional)
-    literals = [
-        _map_head(fields) + b"".join(map(_encode, ("v", VERSION, "site", site, "boot"))),
-        *map(_encode, ("tick", "t_ns", "mode")),
-        _encode("used") + _map_head(len(peers)),
-        *map(_encode, ("rx", "rx_crc", "cmd", "mem", "late_us", "busy_us", "sent_ns", "echo")),
-    ]
-    assert len(literals) == FIRST_VECTOR
-    for name, count in [*vectors.items(), *optional.items()]:
-        literals.append(_encode(name) + _array_head(count))
-    literals += map(_encode, peers)
-
-    bits = []
-    masks = []
-    first_words = [0]
-    for literal in literals:
-        padded = -len(literal) % _WORD_BYTES
-        bits.append(literal + bytes(padded))
-        masks.append(b"\xff" * len(literal) + bytes(padded))
-        first_words.append(first_words[-1] + len(bits[-1]) // _WORD_BYTES)
-    modes = []
-    for word in MODE_WORDS.values():
-        padded = _WORD_BYTES - len(word)
-        modes.append(word.encode() + bytes(padded) + b"\xff" * len(word) + bytes(padded))
-    return RecordLayout(
-        bits=np.frombuffer(b"".join(bits), "<i8").astype(np.int64),
-        masks=np.frombuffer(b"".join(masks), "<i8").astype(np.int64),
-        first_words=np.array(first_words, np.int64),
-        lengths=np.array(list(map(len, literals)), np.int64),
-        vectors=np.array(list(vectors.values()), np.int64),
-        optional_vectors=np.array(list(optional.values()), np.int64),
-        peers=len(peers),
-        modes=np.frombuffer(b"".join(modes), "<i8").astype(np.int64).reshape(-1, 2),
-        mode_codes=np.array(list(map(int, MODE_WORDS)), np.int64),
-    )

@@ -18,7 +18,7 @@ from typing import NamedTuple
 from xml.etree import ElementTree
 from xml.etree.ElementTree import Element, SubElement
 
-from ...scenario import Scenario, read_arm
+from ...scenario import Scenario
 from .cdr import DEFINITIONS, TransformPacker
 
 WORLD = "world"
@@ -224,7 +224,7 @@ class RobotModel:
         site_number = scenario.names.index(site)
         joint_names = name_ros_joints(scenario, site)
         if settings.urdf:
-            arm_model = read_arm(settings, scenario.urdf)
+            arm_model = settings.read_chain(scenario.urdf)
             base = arm_model.base
             urdf = scenario.urdf[settings.urdf]
         else:

@@ -25,7 +25,6 @@ from matplotlib.figure import Figure
 from ...analysis import Certificate, EnergyBalance, ObservedEnergy, certify_log
 from ...core import Array
 from ...log import Log
-from ...own_code import may_run_user_laws
 from .. import style
 from ..appearance import REPORT_SIZE, FigureSize
 from ..premise_text import explain_no_functional
@@ -127,7 +126,7 @@ def _draw_certificate(log: Log, form: FigureSize) -> Figure:
     V must never rise without supplied energy. This function is called through the registry of
     figures.
     """
-    own_laws = may_run_user_laws(log.scenario)
+    own_laws = log.may_run_user_laws
     return draw_functional(log, certify_log(log, own_laws=own_laws), form)
 
 
@@ -174,7 +173,7 @@ def draw_observed_energy(
 
 def _has_declared_energies(log: Log) -> bool:
     """Returns True if at least one control law of the run declares energies."""
-    observed = ObservedEnergy.of_log(log, own_laws=may_run_user_laws(log.scenario))
+    observed = ObservedEnergy.of_log(log, own_laws=log.may_run_user_laws)
     return observed is not None and bool(observed.curves)
 
 
@@ -186,7 +185,7 @@ def _has_declared_energies(log: Log) -> bool:
 )
 def _draw_observed(log: Log, form: FigureSize) -> Figure:
     """Draws the declared energies of a log's control laws, for the registry of figures."""
-    observed = ObservedEnergy.of_log(log, own_laws=may_run_user_laws(log.scenario))
+    observed = ObservedEnergy.of_log(log, own_laws=log.may_run_user_laws)
     assert observed is not None
     return draw_observed_energy(log, observed, form)
 

@@ -28,7 +28,6 @@ from ...analysis import (
 from ...core import Array
 from ...errors import UsageError
 from ...log import Log
-from ...own_code import may_run_user_laws
 from .. import plot_signals, style
 from ..appearance import REPORT_SIZE, SITE_COLOURS, FigureSize
 from .compared_runs import label_runs
@@ -132,7 +131,7 @@ def _compose_title(log: Log, form: FigureSize) -> str:
     settled_s = settling_time_of_all_s(settling_times_s)
     settling = "no settling time" if settled_s is None else f"settling time {settled_s:.1f} s"
     name = log.scenario.title or log.scenario.name
-    certificate = certify_run(log, own_laws=may_run_user_laws(log.scenario))
+    certificate = certify_run(log, own_laws=log.may_run_user_laws)
     title = f"{name}: {certificate.stability}, {settling}"
     letters = round(_LETTERS_PER_IN * form.width_in)
     return "\n".join(textwrap.wrap(title, letters))

@@ -36,7 +36,6 @@ from ...analysis import (
 from ...core import BUCKETS_PER_S, Array
 from ...execution import SMALLEST, TwinPath, Twins, explain_not_repeatable
 from ...log import Log
-from ...own_code import may_run_user_laws
 from .. import style
 from ..appearance import REPORT_SIZE, FigureSize
 from .figure_entry import draws
@@ -130,13 +129,13 @@ def draw_twins(pushed: PushedTwins, form: FigureSize = REPORT_SIZE) -> Figure:
 
 def _explain_absent_twins(log: Log) -> str:
     """Returns the reason why a log has no twins. Empty if it has twins."""
-    return explain_not_repeatable(log, own_laws=may_run_user_laws(log.scenario))
+    return explain_not_repeatable(log, own_laws=log.may_run_user_laws)
 
 
 @draws("twins", "growth or decay of small pushes", _explain_absent_twins, in_report=True)
 def _draw_log_twins(log: Log, form: FigureSize) -> Figure:
     """Draws the differences of twins that are pushed at the start of a log's run."""
-    own_laws = may_run_user_laws(log.scenario)
+    own_laws = log.may_run_user_laws
     growth = TwinGrowth.of_log(log, RunEnd.of_log(log), own_laws=own_laws)
     return draw_twins(PushedTwins(log, 0.0, growth), form)
 

@@ -130,6 +130,11 @@ class LinkBase(Frozen, frozen=True, tag_field="model", omit_defaults=True):
         """
         return {}
 
+    @property
+    def constant_delay_ms(self) -> float | None:
+        """Delay of every message, in ms, if all messages have the same. Otherwise None."""
+        return None
+
     def _delay(self) -> LinkModel:
         """Returns the delay of the link in the format that the compiled simulation reads.
 

@@ -275,6 +275,11 @@ class NoDelay(LinkBase, frozen=True, kw_only=True, tag="none"):
     act in the period in which it was sent.
     """
 
+    @property
+    def constant_delay_ms(self) -> float:
+        """Delay of every message, in ms: none."""
+        return 0.0
+
     def _delay(self) -> LinkModel:
         """Returns the settings of a link without delay, for the compiled simulation."""
         return LinkModel()
@@ -297,6 +302,11 @@ class ConstantDelay(LinkBase, frozen=True, kw_only=True, tag="constant"):
     """
 
     delay_ms: Milliseconds
+
+    @property
+    def constant_delay_ms(self) -> float:
+        """Delay of every message, in ms."""
+        return self.delay_ms
 
     def _delay(self) -> LinkModel:
         """Returns the delay in whole microseconds, for the compiled simulation."""

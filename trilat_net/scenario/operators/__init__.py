@@ -64,7 +64,9 @@ class ActorBase(fields.Frozen, frozen=True, tag_field="kind"):
     """
 
     group: ClassVar[str] = "hands"
-    """List of a site's table that contains the actor: "hands" or "environment"."""
+    """List of a site to which the actor belongs: "hands" or "environment"."""
+    oscillates: ClassVar[bool] = False
+    """True if the torque is an oscillation in time, with which an arm never rests."""
     value_texts: ClassVar[Mapping[str, str]] = {}
     """Permitted values of each key that `VALUE_TEXTS` does not describe, for error messages."""
 

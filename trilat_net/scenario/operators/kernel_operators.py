@@ -248,6 +248,8 @@ class Chirp(TimedActor, frozen=True, tag="chirp"):
         sweep_s: Duration of a sweep, in s.
     """
 
+    oscillates: ClassVar[bool] = True
+
     peak_nm: fields.Joints
     from_hz: Frequency
     to_hz: Frequency
@@ -280,6 +282,8 @@ class Multisine(TimedActor, frozen=True, tag="multisine"):
             low-peak-factor signals and binary sequences with low autocorrelation", IEEE Trans.
             Information Theory 16 (1970)).
     """
+
+    oscillates: ClassVar[bool] = True
 
     amplitude_nm: fields.Joints
     frequencies_hz: Annotated[tuple[Frequency, ...], Meta(min_length=1, max_length=64)]

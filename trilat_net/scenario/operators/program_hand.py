@@ -37,7 +37,6 @@ from ...own_code import (
     CodeKey,
     Watch,
     call_directly,
-    import_class,
     make_own_instance,
     read_code,
 )
@@ -241,6 +240,25 @@ class HandSite(NamedTuple):
                 )
         return None
 
+    def make_program(self) -> HandProgram:
+        """Creates an object of the user's class that moves the arm of one site.
+
+        A site is the process that runs one arm. The class is imported here, if a person has
+        permitted it to run.
+
+        Raises:
+            CodeWithheld: The class may not run.
+            ScenarioError: The class cannot be imported, or no instance of it can be created.
+        """
+        path = f"sites.{self.name}.hands"
+        spec = self.spec
+        assert isinstance(spec, ProgramHand)
+        kind = CodeKey.of(spec).import_class(f"{path}.class", spec.method)
+        program: HandProgram = make_own_instance(
+            kind, spec.code, self.describe(), spec.settings, path
+        )
+        return program
+
 
 class HandPlayer:
     """Calls a program that operates an arm, and passes its actions to the site of the arm.
@@ -364,29 +382,6 @@ class HandPlayer:
         return f"{self._site}: {self._code} {change} at t = {t_s:.3f} s"
 
 
-def make_hand_program(hand_site: HandSite) -> HandProgram:
-    """Creates an object of the user's class that moves the arm of one site.
-
-    A site is the process that runs one arm. The class is imported here, if a person has
-    permitted it to run.
-
-    Args:
-        hand_site: The site and the settings of the program.
-
-    Raises:
-        CodeWithheld: The class may not run.
-        ScenarioError: The class cannot be imported, or no instance of it can be created.
-    """
-    path = f"sites.{hand_site.name}.hands"
-    spec = hand_site.spec
-    assert isinstance(spec, ProgramHand)
-    kind = import_class(CodeKey.of(spec), f"{path}.class", spec.method)
-    program: HandProgram = make_own_instance(
-        kind, spec.code, hand_site.describe(), spec.settings, path
-    )
-    return program
-
-
 def make_hand_players(scenario: "Scenario") -> dict[str, HandPlayer]:
     """Creates the programs that operate arms, for all sites that have a program.
 
@@ -408,5 +403,5 @@ def make_hand_players(scenario: "Scenario") -> dict[str, HandPlayer]:
     for name in scenario.names:
         hand_site = HandSite.find(scenario, name)
         if hand_site is not None:
-            players[name] = HandPlayer(hand_site, make_hand_program(hand_site))
+            players[name] = HandPlayer(hand_site, hand_site.make_program())
     return players

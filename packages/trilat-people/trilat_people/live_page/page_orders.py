@@ -37,9 +37,8 @@ from trilat_net.net import (
     ChangeReply,
     ChangeRequest,
     Clock,
-    HandMessage,
+    HandSender,
     Inbox,
-    SiteSender,
     decode,
     encode,
     topics,
@@ -485,7 +484,7 @@ class PageHands:
         self._clock = clock
         self._session = session
         self._source = source
-        self._senders: dict[str, SiteSender] = {}
+        self._senders: dict[str, HandSender] = {}
         self._held_sites: set[str] = set()
 
     def move(self, order: MoveHand, *, pushes: bool) -> None:
@@ -502,7 +501,7 @@ class PageHands:
         if site not in self._senders:
             if not order.grip:
                 return  # the page has never held this arm
-            new_sender = SiteSender.for_hand(self._bus, self._clock, self._session, site)
+            new_sender = HandSender(self._bus, self._clock, self._session, site)
             new_sender.number = 0  # the messages of a page are numbered from 1
             self._senders[site] = new_sender
 
@@ -514,12 +513,7 @@ class PageHands:
 
         numbers = order.to if order.grip else []
         field = "force" if pushes else "target"
-        content = {
-            "source": self._source,
-            "grip": order.grip,
-            field: numbers,
-        }
-        sender.send(HandMessage, **content)
+        sender.move(self._source, grip=order.grip, **{field: numbers})
 
     def release(self) -> None:
         """Releases all arms that the user of a web page moves.

@@ -20,12 +20,12 @@ Invariant:
 """
 
 from collections import Counter, deque
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Generic, TypeVar
 
 import msgspec
 
-from recorder import AWAY_NS, GapRepair, InboundMessage, InboundQueue, SiteReception
+from recorder import AWAY_NS, GapRepair, InboundQueue, SiteReception
 from trilat_net.analysis import KEPT_S, RecordWindow, RunningEnergy
 from trilat_net.core import TAKEN, LifeAlarm
 from trilat_net.errors import ScenarioError, WireError
@@ -38,7 +38,6 @@ from trilat_net.net import (
     MemberQuery,
     State,
     decode,
-    split_states,
     topics,
 )
 from trilat_net.records import NS_PER_S
@@ -378,7 +377,7 @@ class SessionView:
 
         for message in self._queue.drain(now_ns):
             try:
-                self._receive(message)
+                self._receive(message.key, message.payload, message.mono_ns)
             except WireError as error:
                 self.dropped[error.reason] += 1
 
@@ -497,29 +496,27 @@ class SessionView:
                 window=self.energy.windows[name],
             )
 
-    def _receive(self, inbound: InboundMessage) -> None:
+    def _receive(self, key: str, block: bytes, mono_ns: int) -> None:
         """Decodes a message of a site, and stores each record, statistic or event in it.
 
         Messages of other members are ignored. The first record or statistics of a site show
         whether this observer has joined late. If so, earlier ones are not requested.
 
         Args:
-            inbound: The message, with its key in the network and the time of its arrival.
+            key: Key of the message in the network.
+            block: Bytes of the message, on the channel of records those of several records.
+            mono_ns: Time of the arrival on the monotonic clock, in ns.
 
         Raises:
             WireError: The message cannot be decoded.
         """
-        parts = topics.parse_key(inbound.key)
+        parts = topics.parse_key(key)
         site = self.sites.get(parts.member) if parts is not None else None
         if parts is None or site is None:
             return
 
         channel = parts.channel
-        payloads: Iterable[bytes] = (inbound.payload,)
-        # A message on the channel of records contains a block of records.
-        if channel == topics.STATE:
-            payloads = split_states(inbound.payload)
-        for payload in payloads:
+        for payload in site.reception.split(channel, block):
             try:
                 message = site.reception.read(channel, payload)
             except WireError:
@@ -537,7 +534,7 @@ class SessionView:
                 self._skip_records_before(site, message.content)
 
             # A message that has arrived before, for example on request, is not stored again.
-            is_new = site.reception.accept(channel, message, inbound.mono_ns)
+            is_new = site.reception.accept(channel, message, mono_ns)
             if is_new:
                 self._store(parts.member, site, channel, message.content)
 

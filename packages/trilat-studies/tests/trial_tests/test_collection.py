@@ -25,7 +25,7 @@ from tests.log.builders import drop_records, edit_log_bytes, make_log_bytes, ope
 from trilat_net.core.arms.two_link_arm import end_effector_jacobian
 from trilat_net.log.log_reader import Log
 from trilat_net.scenario import Scenario, load_scenario
-from trilat_net.scenario.expect import ExpectWindow, window_quantities
+from trilat_net.scenario.expect import ExpectWindow
 
 RANDOM = {"link": {"model": "uniform", "delay_ms": 20.0, "half_width_ms": 10.0}}
 SHORT = {"duration_s": 2.5, "rate_hz": 500, "link.delay_ms": 20.0}
@@ -268,7 +268,7 @@ def test_a_bucket_without_records_is_marked() -> None:
 
 
 WALL = {"kind": "wall", "point_m": [1.25, 0.0], "normal": [-2.0, 0.0], "stiffness_n_m": 2000.0}
-QUANTITIES = window_quantities(2)
+QUANTITIES = ExpectWindow.list_quantities(2)
 WIDE_LIMITS = {key: [-1e9, 1e9] for key in QUANTITIES}
 PUSHED = {
     "duration_s": 2.0,
@@ -305,7 +305,7 @@ def collect_window_ranges(
 ) -> dict[str, Any]:
     """Returns the ranges in a window over records that come in batches cut at some rows."""
     scenario = load_scenario("contact", {**PUSHED, "sites.s.rate_hz": 100})
-    window_stats = WindowStats(ExpectWindow(from_s=0.5, to_s=to_s), scenario, "s")
+    window_stats = WindowStats(0.5, to_s, scenario, "s")
     for batch in iterate_batches(records, cuts):
         if len(batch.t_ns):
             window_stats.add(batch)

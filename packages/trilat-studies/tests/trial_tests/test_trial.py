@@ -17,7 +17,8 @@ from trilat_studies.trials import Trial, TrialResult
 import trilat_net
 from tests.log.builders import drop_records, edit_log_bytes, make_log_bytes
 from trilat_net.errors import ScenarioError
-from trilat_net.scenario import apply_overrides, load_scenario
+from trilat_net.scenario import load_scenario
+from trilat_net.scenario.override import apply_overrides
 
 CONSTANT = {"link": {"model": "constant", "delay_ms": 60.0}}
 

@@ -38,9 +38,7 @@ from trilat_net.errors import ScenarioError, UsageError
 from trilat_net.laws import COMMON_MOTION_SHARE, PD, Adaptive, find_least_reversible
 from trilat_net.scenario import (
     ArmModel,
-    ConstantDelay,
     LinkBase,
-    NoDelay,
     Scenario,
     SiteSpec,
     is_number,
@@ -871,7 +869,7 @@ def _list_delays_s(scenario: Scenario) -> list[float] | None:
             if dominance_factors.get(peer, 0.0) == 0.0:
                 continue
             link: LinkBase = scenario.links[f"{peer}->{site}"]
-            if not isinstance(link, ConstantDelay | NoDelay):
+            if link.constant_delay_ms is None:
                 return None
             if link.random or link.loss or link.outages_s:
                 return None

@@ -28,7 +28,7 @@ from trilat_net.analysis import LogMetrics
 from trilat_net.errors import ScenarioError, UsageError, count_nouns, suggest_nearest
 from trilat_net.fields import split_unit
 from trilat_net.own_code import allow_own_code, name_law_classes
-from trilat_net.scenario import LAWS, ExperimentText, Scenario, apply_overrides, is_number
+from trilat_net.scenario import LAWS, ExperimentText, Scenario, is_number
 
 from ..run_commands import format_command, format_toml_value, set_options
 from . import sweep_cell
@@ -769,8 +769,7 @@ def _force_law(written: ExperimentText, overrides: Sequence[str], law: str) -> t
         overrides: Overrides that apply to all cells, which may contain a table of a site.
         law: Name of the law.
     """
-    tables = tomllib.loads(written.text)
-    apply_overrides(tables, overrides)
+    tables = written.read_tables(overrides)
     law_overrides = [f"control.law={law}"]
     for name, site in tables.get("sites", {}).items():
         # The table of a site takes precedence over the common one.

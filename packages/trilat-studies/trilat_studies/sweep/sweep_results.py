@@ -29,7 +29,7 @@ from trilat_net.analysis import LogMetrics
 from trilat_net.errors import ScenarioError, UsageError, count_nouns
 from trilat_net.files import write_whole
 from trilat_net.results import Result
-from trilat_net.scenario import read_source
+from trilat_net.scenario import ExperimentText
 from trilat_net.work import MeanInterval, wilson_interval
 
 from ..run_commands import format_command, set_options
@@ -180,9 +180,7 @@ class SweepResults(Result):
         overrides = plan.cell(row["cell"]).overrides
 
         try:
-            text, source_folder = read_source(source)
-            written = plan.written._replace(text=text, folder=source_folder)
-            current_plan = plan._replace(written=written)
+            current_plan = plan._replace(written=ExperimentText.read(source))
             seed = f"seed={row['seed']}"
             current_scenario = current_plan.scenario(*overrides, seed)
             digest = current_scenario.sha256

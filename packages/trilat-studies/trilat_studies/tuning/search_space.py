@@ -26,7 +26,7 @@ from trilat_net.analysis import build_arm_rows
 from trilat_net.errors import ScenarioError, UsageError, suggest_nearest
 from trilat_net.fields import MAX_QUANTITY
 from trilat_net.laws import DAMPING, ERROR_DAMPING, ControlLaw, GainRange, TuningSite
-from trilat_net.own_code import CodeConsent, CodeKey, allowed_code, import_class, read_code
+from trilat_net.own_code import import_named_class
 from trilat_net.scenario import BUILT_IN, Scenario, is_number
 
 MIN_BOX = 0.1
@@ -270,10 +270,7 @@ class SearchSpace(NamedTuple):
             ScenarioError: The class does not exist.
             UsageError: The class has no ranges, or a range is not valid.
         """
-        sha256 = read_code(code, "--law").sha256
-        key = CodeKey(code, sha256, "{}")
-        allowed_code[key] = CodeConsent(None, sha256)
-        kind = import_class(key, "--law")
+        kind = import_named_class(code, "--law")
 
         ranges = getattr(kind, "tune", None)
         if not isinstance(ranges, Mapping) or not ranges:
