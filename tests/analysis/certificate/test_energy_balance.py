@@ -7,10 +7,14 @@ balance of sites that follow with their end effectors closes, and needs every te
 
 import dataclasses
 from dataclasses import replace
-from itertools import pairwise
+from itertools import accumulate, pairwise
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 import trilat_net
 from tests.analysis.builders import (
@@ -27,10 +31,16 @@ from tests.theory.delay_equations import DelayEquations, inertia, make_equations
 from tests.theory.energy import compute_balance as balance_by_hand
 from tests.theory.energy import left_null_vector
 from trilat_net.analysis.certificate.certificate_result import Certificate
-from trilat_net.analysis.certificate.energy_balance import EnergyBalance, SiteEnergy
+from trilat_net.analysis.certificate.energy_balance import (
+    EnergyBalance,
+    SiteEnergy,
+    find_dominance_matrices,
+)
 from trilat_net.analysis.certificate.stability_certificate import certify_log
 from trilat_net.analysis.certificate.verdict_facts import StabilityFinding
+from trilat_net.analysis.dominance_history import DominancePlan
 from trilat_net.analysis.metrics.log_metrics import LogMetrics
+from trilat_net.core import DominanceRamp
 from trilat_net.presentation.premise_text import explain_no_functional
 from trilat_net.scenario import load_scenario, parse_scenario
 
@@ -500,3 +510,33 @@ def test_false_records_break_the_balance() -> None:
     )
     assert np.abs(wrong.records.tau - wrong.law_torque(np.arange(len(motion.r)))).max() > 1e-3
     assert EnergyBalance.of_energies(energies).V.max() > 1.0
+
+
+waits = st.lists(st.integers(1, 12), max_size=4)
+"""Ticks between successive steps of the shares of a site."""
+
+
+@given(waits, waits)
+def test_every_step_of_shares_adds_a_matrix(of_a: list[int], of_b: list[int]) -> None:
+    """The matrices of a run are the first one, and one for every step of the shares of a site."""
+    rate_hz = 100
+    t_s = np.arange(60) / rate_hz
+    energies: dict[str, Any] = {}
+    shares = {}
+    for site, listed in (("a", of_a), ("b", of_b)):
+        ramps = []
+        for n, tick in enumerate(accumulate(listed)):
+            start_ns = tick * 10**9 // rate_hz
+            share = (n + 1) / 10
+            ramps.append(DominanceRamp(start_ns, start_ns, (share, 1.0 - share)))
+        plan = DominancePlan(np.array([0.0, 1.0]), ramps, 1 / rate_hz)
+        history = plan.evaluate(t_s)
+        records = SimpleNamespace(t_s=t_s, rate_hz=rate_hz, known=np.ones(60, dtype=bool))
+        peers = dict.fromkeys(("b", "c") if site == "a" else ("a", "c"))
+        motion = SimpleNamespace(records=records, dominance=history, peers=peers)
+        energies[site] = SimpleNamespace(motion=motion)
+        shares[site] = history.alpha[:, 0].tolist()
+    matrices = find_dominance_matrices(energies)
+    assert len(matrices) == 1 + len(of_a) + len(of_b)
+    in_force = set(zip(shares["a"], shares["b"], strict=True))
+    assert {(float(m[0, 1]), float(m[1, 0])) for m in matrices} == in_force

@@ -1,5 +1,7 @@
 """Jumps are exact: each booked jump is the difference of V before and after, found by computing V twice."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -11,6 +13,7 @@ from trilat_net.analysis.arm_rows import PlanarArmRows
 from trilat_net.analysis.certificate.energy_terms import SiteConstants, SiteMotion
 from trilat_net.analysis.dominance_history import DominanceHistory
 from trilat_net.analysis.torque_sources import TorqueSplit
+from trilat_net.core import Scheme
 
 ROWS = 40
 NOW = 30
@@ -182,3 +185,53 @@ def test_the_torque_limit_counts_when_active() -> None:
     assert cut.any()
     assert np.array_equal(booked.left != 0.0, cut[:-1])
     assert np.array_equal(booked.right != 0.0, cut[1:])
+
+
+@settings(max_examples=30)
+@given(st.integers(0, 2**32 - 1), st.tuples(ticks, ticks), st.tuples(ticks, ticks))
+def test_sampling_work_ends_before_the_next_sample(
+    seed: int, before: tuple[int, int], after: tuple[int, int]
+) -> None:
+    """The sampling work of a period does not depend on the sample that comes into use at its
+    end.
+    """
+    booked = []
+    for next_ticks in (after, (before[0] + 1, before[1] + 1)):
+        site = Situation(seed, before, next_ticks)
+        site.track.qd_des[:] = sum(
+            a * v.delayed.qd for a, v in zip(site.alpha, site.views, strict=True)
+        )
+        law = site.motion.law_torque(np.arange(2))
+        site.track.tau[1] = np.clip(law[1], -EQ.tau_limit, EQ.tau_limit)
+        digital = dataclasses.replace(site.motion, scheme=Scheme.DIGITAL)
+        booked.append(float(digital.compute_sampling_work().total[0]))
+    assert booked[0] == pytest.approx(booked[1], rel=1e-9, abs=1e-9)
+
+
+@settings(max_examples=30)
+@given(st.integers(0, 2**32 - 1), st.sampled_from([0, 1, 2, NOW]))
+def test_a_torque_at_its_rate_limit_is_limited(seed: int, first: int) -> None:
+    """A torque counts as limited where its change was cut to the rate, and the torque before a
+    run is zero.
+    """
+    random = np.random.default_rng(seed)
+    rate_nm_s = 60.0
+    largest_nm = rate_nm_s / RATE_HZ
+    demand = random.normal(scale=0.7, size=(ROWS, 2))
+    track = draw_records(random, "s", {}, ROWS, first)
+    previous = np.zeros(2)
+    for row, demanded in enumerate(demand):
+        track.tau[row] = np.clip(demanded, previous - largest_nm, previous + largest_nm)
+        previous = track.tau[row]
+    is_cut = track.tau != demand
+    if first:
+        is_cut[0] = False
+    none = np.zeros_like(track.q)
+    motion = SiteMotion(
+        track,
+        EQ._replace(tau_rate=np.array(rate_nm_s)),
+        DominanceHistory(np.zeros((ROWS, 0)), np.zeros((ROWS, 0)), np.zeros((ROWS - 1, 0))),
+        {},
+        TorqueSplit(EQ.arm.place_end_effector(track.q, track.qd), none, none, none, none),
+    )
+    assert np.array_equal(motion.limited, is_cut)

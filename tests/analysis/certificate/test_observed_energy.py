@@ -125,6 +125,14 @@ def test_code_from_outside_runs_only_on_request() -> None:
     )
 
 
+def test_own_laws_run_by_request_alone() -> None:
+    """A certificate runs the code of a user's law only if its caller requests this."""
+    log = simulate_scenario(load_scenario(PAIR, {"duration_s": 0.01}))
+    assert ObservedEnergy.of_log(log) is None
+    assert certify_log(log).observed is None
+    assert certify_log(log, own_laws=True).observed is not None
+
+
 def test_the_certificate_reports_it_in_text_and_json() -> None:
     certificate = certify_log(simulate_clamped_pair(), own_laws=True)
     lines = {line.text: line.mark for line in describe_certificate(certificate)}

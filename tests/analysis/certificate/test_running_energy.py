@@ -2,10 +2,15 @@
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
+import trilat_net
 from tests.analysis.builders import make_run
+from tests.log.builders import replace_fields
 from trilat_net.analysis.certificate.running_energy import (
     EnergyCourse,
+    RecordWindow,
     RunningEnergy,
 )
 from trilat_net.log.log_reader import Log
@@ -92,3 +97,30 @@ def test_a_law_without_v_is_reported() -> None:
     obstacle = describe_energy_obstacle(running)
     assert "p_d" in obstacle or "law" in obstacle
     assert running.compute_next(dict.fromkeys(log.sites, 100)) is None
+
+
+@pytest.fixture(scope="module")
+def brief_log() -> Log:
+    return trilat_net.simulate("paper", {"duration_s": 0.1, "rate_hz": 100})
+
+
+@given(st.sets(st.integers(0, 9), min_size=1))
+def test_a_gap_keeps_its_last_samples(brief_log: Log, received: set[int]) -> None:
+    """A row has the samples in use of its record, or else of the last record before; rows
+    before all records have those of the first.
+    """
+    window = RecordWindow(brief_log.scenario, "m1")
+    states = brief_log["m1"].states
+    for tick in received:
+        used = {"m2": 7 * tick, "s": 3 * tick + 1}
+        mode = "run" if tick % 2 else "hold"
+        window.receive(replace_fields(states[tick], used=used, mode=mode))
+    window.receive(replace_fields(states[0], tick=10, used={"m2": 70, "s": 31}, mode="hold"))
+    rows = window.rows(0, 10)
+    for row in range(11):
+        earlier = [tick for tick in (*received, 10) if tick <= row]
+        source = max(earlier, default=min(received))
+        assert rows.used["m2"][row] == 7 * source
+        assert rows.used["s"][row] == 3 * source + 1
+        assert rows.follows[row] == bool(source % 2)
+        assert rows.known[row] == (row in received or row == 10)

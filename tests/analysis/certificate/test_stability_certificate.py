@@ -1,10 +1,14 @@
 """Certificates of logs of every kind: other laws, gaps, old versions, torn and empty files."""
 
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import msgspec
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 import trilat_net
 from tests.analysis.builders import (
@@ -14,8 +18,12 @@ from tests.analysis.builders import (
     make_short_log,
 )
 from tests.log.builders import replace_fields, rewrite_log
-from trilat_net.analysis.certificate.stability_certificate import certify_log
-from trilat_net.analysis.certificate.verdict_facts import RecordGap, StabilityFinding
+from trilat_net.analysis.certificate.stability_certificate import JUDGEMENTS, certify_log
+from trilat_net.analysis.certificate.verdict_facts import (
+    RecordGap,
+    StabilityFinding,
+    StabilityVerdict,
+)
 from trilat_net.analysis.run_end import EndBehaviour, Stability
 from trilat_net.errors import LogError
 from trilat_net.log.log_reader import Log
@@ -209,3 +217,50 @@ def test_an_unreadable_change_is_a_log_error() -> None:
     change = lambda s: replace_fields(s, cmd=["{}"] if s.tick == 5 else [])  # noqa: E731
     with pytest.raises(LogError, match="a command that cannot be read"):
         certify_log(rewrite_log(make_short_log("paper"), change=change))
+
+
+def judge_unexplained(
+    error_share: float, uncertain_share: float, scale_j: float
+) -> StabilityVerdict | None:
+    """Returns the verdict on the balance of one site with the given unexplained energy."""
+    course = scale_j * error_share * np.array([0.0, -0.5, -1.0, 1.0])
+    energy = SimpleNamespace(
+        unexplained=course,
+        uncertainty=scale_j * uncertain_share,
+        followed={},
+        motion=SimpleNamespace(records=SimpleNamespace(t_s=np.arange(4.0))),
+    )
+    run: Any = SimpleNamespace(
+        energies={"s": energy},
+        balance=SimpleNamespace(scale=scale_j),
+        log=SimpleNamespace(scenario=SimpleNamespace(external=())),
+    )
+    return JUDGEMENTS[0](run, ())
+
+
+@given(
+    st.sampled_from([0.0, 1e-4, 4e-4, 1.5e-3, 2e-2]),
+    st.sampled_from([0.0, 1e-5, 3e-4, 2e-3]),
+    st.sampled_from([1e-4, 1e-2, 1e2, 1e4]),
+)
+def test_broken_balances_have_no_unit_of_energy(
+    error_share: float, uncertain_share: float, scale_j: float
+) -> None:
+    """A verdict on unexplained energy depends on its share of V, and not on V itself."""
+    of_unit = judge_unexplained(error_share, uncertain_share, 1.0)
+    scaled = judge_unexplained(error_share, uncertain_share, scale_j)
+    assert (of_unit is None) == (scaled is None)
+    if of_unit is not None and scaled is not None:
+        assert scaled.finding is of_unit.finding is StabilityFinding.BROKEN
+        expected = of_unit.facts._replace(
+            error_j=pytest.approx(scale_j * error_share), scale_j=scale_j
+        )
+        assert scaled.facts == expected
+
+
+def test_unexplained_energy_is_certain_if_known_well() -> None:
+    """Unexplained energy is certain only if large, and if the energies are known well."""
+    shares = {(1e-4, 0.0): None, (4e-4, 0.0): False, (2e-2, 1e-5): True, (2e-2, 2e-3): False}
+    for (error_share, uncertain_share), is_certain in shares.items():
+        verdict = judge_unexplained(error_share, uncertain_share, 100.0)
+        assert (verdict.facts.is_certain if verdict else None) is is_certain
