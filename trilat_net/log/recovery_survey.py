@@ -77,8 +77,6 @@ class RecoverySurvey:
 
     def __init__(self, scanner: mcap_records.RecordScanner) -> None:
         """Reads a damaged file once, and selects those parts of it that belong to one log."""
-        self.is_finished = scanner.finished
-        self.trailing_bytes = scanner.trailing
         self.profile = ""
         self.library = ""
         self.metadata: dict[str, dict[str, str]] = {}
@@ -97,6 +95,9 @@ class RecoverySurvey:
         self._uncovered_offsets: dict[Definition, int] = {}
 
         has_messages = self._read_records()
+        # The scanner knows the end of the file once it has read all records.
+        self.is_finished = scanner.finished
+        self.trailing_bytes = scanner.trailing
         self.is_session_log = (
             any(_TOPIC_ROOT in content for _, content in self.definitions)
             or _PROGRAM in self.library

@@ -88,7 +88,7 @@ def check_arguments(kind: Any, code: str, settings: Mapping[str, Any], path: str
     for name, parameter in named.items():
         if parameter.default is parameter.empty and name not in settings:
             raise ScenarioError(
-                f"{subject} needs a value of its argument {name}, which has no default; its "
+                f"{subject} needs a value for its argument {name}, which has no default; its "
                 f"__init__ takes {accepted}",
                 path=path,
             )

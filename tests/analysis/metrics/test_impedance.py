@@ -65,7 +65,7 @@ def test_weak_drives_and_missing_records_are_named() -> None:
     )
     gaps = EVERYTHING.copy()
     gaps[::700] = False
-    assert "no stretch of 4 s" in estimate_strongest(x, x, x, gaps, RATE_HZ, 1e-3).why
+    assert "no interval of 4 s" in estimate_strongest(x, x, x, gaps, RATE_HZ, 1e-3).why
 
 
 def test_closed_loop_impedance_depends_on_the_driver() -> None:

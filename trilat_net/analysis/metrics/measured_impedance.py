@@ -116,13 +116,13 @@ class FrequencyResponse(NamedTuple):
         length = round(SEGMENT_S * rate_hz)
         starts = _find_segments(usable, length)
         if not starts:
-            reason = f"the log has no stretch of {SEGMENT_S:g} s in which nobody else drives"
+            reason = f"the log has no interval of {SEGMENT_S:g} s without another drive"
             return [FrequencyResponse(why=reason)]
 
         D = _compute_spectra(drive, starts, length)
         drive_power = (np.abs(D) ** 2).mean(axis=0)
         if not np.isfinite(drive_power).all():
-            return [FrequencyResponse(why="the numbers of the drive are too large")]
+            return [FrequencyResponse(why="the values of the drive are too large")]
 
         strongest = int(drive_power.argmax())
         if math.sqrt(2.0 * drive_power[strongest]) < least:

@@ -362,7 +362,7 @@ class SharingRatio(NamedTuple):
             if pushed_weight.value is None or holds_weight.value is None:
                 expected = Metric(None, pushed_weight.why)
             elif holds_weight.value == 0.0:
-                expected = Metric(None, f"no site follows {holds} in the end")
+                expected = Metric(None, f"no site depends on {holds} in the end")
             else:
                 expected = metric(torque * pushed_weight.value / holds_weight.value)
 
