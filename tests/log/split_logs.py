@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 
 import msgpack
 from mcap.reader import make_reader
-from mcap.writer import Writer
+from mcap.writer import CompressionType, Writer
 
 from tests.log.builders import make_log_bytes, open_bytes
 from trilat_net.log.accounting import Account
@@ -61,6 +61,7 @@ def make_bytes_of_messages(
     scenario: str | None = None,
     part: int = 0,
     accounts: dict[str, str] | None = None,
+    compression: CompressionType = CompressionType.ZSTD,
 ) -> bytes:
     """A log with the head of another one and these messages.
 
@@ -72,10 +73,11 @@ def make_bytes_of_messages(
         scenario: its scenario, where that is another one.
         part: its number among the parts of a log; 0: it says nothing of parts.
         accounts: its accounts.
+        compression: the compression of its chunks.
     """
     reader = make_reader(io.BytesIO(data))
     stream = io.BytesIO()
-    writer = Writer(stream)
+    writer = Writer(stream, compression=compression)
     writer.start()
     (head,) = (
         entry.metadata for entry in reader.iter_metadata() if entry.name == "trilat.session"

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from trilat_net.log import accounting
-from trilat_net.log.accounting import Account, RangeSet, StartGap
+from trilat_net.log.accounting import Account, RangeSet, StartGap, describe_unknown_ends
 
 streams = st.lists(st.integers(0, 60), max_size=80)
 
@@ -194,6 +194,37 @@ def test_heard_records_of_killed_starts_are_missing(
     gap.begin_next_start(10, 0)  # said twice, it counts once
     assert (account.gaps, account.missing, account.unpublished) == ([[5, 6]], 2, 3)
     assert account.expected == account.received + account.missing == 10
+
+
+@given(
+    received=st.integers(0, 5),
+    under_way=st.integers(0, 4),
+    reports=st.lists(st.integers(0, 14), max_size=4),
+    position=st.integers(0, 4),
+)
+def test_reported_losses_beyond_transit_are_missing(
+    received: int, under_way: int, reports: list[int], position: int
+) -> None:
+    """The order of the reports and the next start, and a start without any message, change nothing."""
+    account = Account()
+    for number in range(received):
+        account.receive(number)
+    gap = StartGap(account, under_way)
+    for report in reports[:position]:
+        gap.note_published(report)
+    gap.begin_next_start(10, 0)
+    for report in reports[position:]:
+        gap.note_published(report)
+    lost = min(max([received, *reports]), 10) - received
+    missing = lost if lost > under_way else 0
+    assert (account.missing, account.unpublished) == (missing, 10 - received - missing)
+
+
+@pytest.mark.parametrize(
+    ("sites", "names"), [(["m"], "m"), (["m", "s"], "m and s"), (["a", "b", "c"], "a, b and c")]
+)
+def test_unknown_ends_name_each_site_once(sites: Sequence[str], names: str) -> None:
+    assert describe_unknown_ends(sites).startswith(f"the end of {names} is unknown")
 
 
 @given(first=st.integers(-5, 5), length=st.integers(1, 10), data=st.data())

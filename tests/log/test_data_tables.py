@@ -20,6 +20,7 @@ from trilat_net.files import format_extra_install
 from trilat_net.log.data_tables import (
     UNIT_SUFFIXES,
     Column,
+    Table,
     build_arrivals_table,
     read_field_docs,
 )
@@ -275,3 +276,24 @@ def test_every_field_has_meaning_and_unit(kind: type[msgspec.Struct]) -> None:
         assert json_type in ("integer", "string", "array", "object")
         if ending := ENDINGS.get(field.rpartition("_")[2]):
             assert unit == ending, field
+
+
+@pytest.mark.parametrize("columns", [0, 1, 2])
+def test_a_tables_length_is_its_columns(columns: int) -> None:
+    column = Column("x_us", np.arange(5))
+    assert len(Table("m", "", "", (column,) * columns)) == (5 if columns else 0)
+
+
+@pytest.mark.parametrize(
+    ("number", "expected"),
+    [(0.0, 0), (2.0**53 - 1, 2**53 - 1), (1e300, 2**53), (-7.0, -1)],
+)
+def test_numbers_of_operators_stay_exact_integers(number: float, expected: int) -> None:
+    """A number beyond the exact integers of floating-point numbers is stored as the last of these."""
+
+    def change(record: dict[str, Any]) -> dict[str, Any]:
+        return {**record, "hand": [1.0, number, number, *record["hand"][3:]]}
+
+    log = open_bytes(edit_log_bytes(make_log_bytes("play"), record=change))
+    for name in ("hand_number", "hand_source"):
+        assert set(log.table("m1")[name].values.tolist()) == {expected}

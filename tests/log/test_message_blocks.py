@@ -75,10 +75,12 @@ def test_blocks_of_a_changed_file_are_its_messages(change: Any, seed: int) -> No
     assert read_in_blocks(changed) == read_singly(changed)
 
 
-def make_message_bytes(messages: list[tuple[str, int, bytes]], topics: list[str]) -> bytes:
+def make_message_bytes(
+    messages: list[tuple[str, int, bytes]], topics: list[str], chunk_bytes: int = 1 << 20
+) -> bytes:
     """A file in which every topic of a list has a channel, and may have several."""
     stream = io.BytesIO()
-    writer = Writer(stream)
+    writer = Writer(stream, chunk_size=chunk_bytes)
     writer.start()
     channels = [writer.register_channel(topic, "msgpack", 0) for topic in topics]
     late_topic = ""
@@ -128,3 +130,20 @@ def test_messages_can_follow_those_that_were_read() -> None:
     assert channel.payloads == [b"first", b"", b"third"]
     assert channel.payloads[1:] == [b"", b"third"]
     assert [channel.payload(n) for n in range(len(channel))] == [b"first", b"", b"third"]
+
+
+@pytest.mark.parametrize("kept_chunks", range(1, 6))
+def test_a_channels_memory_adds_up_over_chunks(
+    kept_chunks: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A channel that fits in each chunk alone is still cut where all chunks together do not fit."""
+    topics = ["/trilat/s/m1/state"]
+    data = make_message_bytes([("", n, bytes(50)) for n in range(1000)], topics, 8192)
+    messages_in_chunk = 8192 // (50 + 31)
+    kept_bytes = 3000 * messages_in_chunk * kept_chunks
+    monkeypatch.setattr(mcap_reader, "KEPT_BYTES", int(kept_bytes / mcap_reader._CHANNEL_SHARE))
+    monkeypatch.setattr(mcap_reader, "KEPT_RATIO", 1)
+    content = read_in_blocks(data)
+    ((_, messages),) = content[0]
+    assert kept_bytes // 3000 - 1 <= len(messages) <= kept_bytes // 3000
+    assert content == read_singly(data)

@@ -5,7 +5,7 @@ import json
 import os
 import struct
 import tracemalloc
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import cache
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -26,7 +26,13 @@ from tests.log.builders import (
     write_log,
 )
 from tests.log.hostility import make_chunk as packed_chunk
-from tests.log.split_logs import Message, make_foreign_bytes, read_messages
+from tests.log.split_logs import (
+    Message,
+    make_bytes_of_messages,
+    make_foreign_bytes,
+    read_messages,
+)
+from tests.log.surgery import take_apart
 from trilat_net.errors import LogError, NothingSaved, UsageError
 from trilat_net.execution.verification import verify_log
 from trilat_net.log.log_layout import active_path
@@ -34,6 +40,7 @@ from trilat_net.log.log_reader import open_log
 from trilat_net.log.log_writer import LogWriter
 from trilat_net.log.provenance import collect_provenance
 from trilat_net.log.recovery import Recovery, recover, recovered_path
+from trilat_net.log.running_digest import DigestState
 
 anywhere = settings(
     suppress_health_check=[HealthCheck.function_scoped_fixture], max_examples=12
@@ -451,3 +458,53 @@ def test_an_unfinished_log_is_named_where_it_is(command: list[str], tmp_path: Pa
     write_log(tmp_path, make_chunked_bytes()[:-60], "run.mcap.active")
     done = trilat(*command, "run.mcap", cwd=tmp_path)
     done.refuses("run.mcap cannot be read", "trilat log recover run.mcap.active")
+
+
+def make_later_messages_bytes(part: int) -> bytes:
+    """A log, or a part of a log, whose messages begin 60 ms after the start of the session."""
+    data = make_log_bytes("paper")
+    later = [m for m in read_messages(data) if m.log_ns >= 60_000_000]
+    return make_bytes_of_messages(data, later, part=part, compression=CompressionType.NONE)
+
+
+@pytest.mark.parametrize(("part", "lacks_beginning"), [(0, True), (1, True), (2, False)])
+def test_only_later_parts_may_lack_a_beginning(
+    part: int, lacks_beginning: bool, tmp_path: Path
+) -> None:
+    """What an undivided log or a first part lacks is missing, and its records do not follow it."""
+    data = make_later_messages_bytes(part)
+    whole, saved = recover_bytes(data, tmp_path, "run.mcap")
+    assert read_messages(saved) == read_messages(data)
+    assert any(": 0-59" in text for text in whole.missing) == lacks_beginning, whole.missing
+    (chunk,) = list_chunks(data)
+    cut = data[: (chunk.begin + chunk.end) // 2]
+    result, _ = recover_bytes(cut, tmp_path)
+    assert result.messages == result.salvaged
+    assert (result.salvaged > 20) != lacks_beginning
+
+
+@pytest.mark.parametrize(
+    ("changes", "state"),
+    [
+        ((), DigestState.INTACT),
+        (("definition",), DigestState.OPEN),
+        (("message",), DigestState.CHANGED),
+        (("metadata",), DigestState.CHANGED),
+        (("message", "definition"), DigestState.CHANGED),
+    ],
+    ids=str,
+)
+def test_recoveries_state_changes_beyond_damaged_definitions(
+    changes: Sequence[str], state: DigestState, tmp_path: Path
+) -> None:
+    """A definition that only its copy in the index has is damage; every other difference is a change."""
+    pieces = take_apart(make_log_bytes("paper"))
+    if "metadata" in changes:
+        pieces.metadata("trilat.session")["note"] = "added later"
+    if "message" in changes:
+        pieces.messages[-1] = pieces.messages[-1]._replace(log_ns=10**9)
+    data = pieces.bytes()
+    if "definition" in changes:
+        data = data.replace(b"/m1/state", b"/m9/state", 1)
+    result, _ = recover_bytes(data, tmp_path, "run.mcap")
+    assert result.chain is state

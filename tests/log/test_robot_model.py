@@ -5,8 +5,11 @@ from xml.etree import ElementTree
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 from mcap.records import Schema
 from mcap_ros2.decoder import DecoderFactory
+from scipy.spatial.transform import Rotation
 
 from tests.core.chain_references import ARMS, chain_references
 from tests.scenario.builders import two_arm_text
@@ -14,6 +17,7 @@ from trilat_net.log.ros2 import cdr
 from trilat_net.log.ros2.robot_model import (
     SPACING_M,
     RobotModel,
+    _read_joint_frame,
     multiply_quaternions,
     rotate_vector,
 )
@@ -130,3 +134,22 @@ def test_joint_states_name_the_joints_of_urdfs(name):
 
 def test_planar_arms_alone_have_no_model():
     assert Ros2SiteChannels(load_scenario("two_sites"), "m").robot is None
+
+
+@given(
+    rpy=st.tuples(*[st.floats(-3.0, 3.0)] * 3),
+    axis=st.tuples(*[st.sampled_from([-1.0, 0.5, 2.0])] * 3),
+    position_m=st.floats(-0.5, 0.5),
+)
+def test_sliding_joints_move_links_along_their_axis(rpy, axis, position_m):
+    """The axis is that of the turned frame of the joint, and the orientation of the link stays."""
+    joint = ElementTree.fromstring(
+        '<joint name="slide" type="prismatic">'
+        f'<origin xyz="0.1 -0.2 0.3" rpy="{rpy[0]} {rpy[1]} {rpy[2]}"/>'
+        f'<axis xyz="{axis[0]} {axis[1]} {axis[2]}"/></joint>'
+    )
+    frame = _read_joint_frame(joint, ["slide"])
+    origin, rotation = frame.compute_transform(position_m)
+    assert rotation == frame.compute_transform(0.0)[1]
+    slide = Rotation.from_euler("xyz", rpy).apply(np.array(axis) / np.linalg.norm(axis))
+    assert origin == pytest.approx([0.1, -0.2, 0.3] + position_m * slide, abs=1e-12)

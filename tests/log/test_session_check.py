@@ -6,6 +6,7 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from unittest import mock
 
@@ -16,7 +17,13 @@ from mcap.opcode import Opcode
 
 from tests.log.builders import drop_records, edit_log_bytes, make_log_bytes, write_log
 from tests.log.hostility import make_chunk
-from tests.log.split_logs import make_foreign_bytes, write_late_parts
+from tests.log.split_logs import (
+    make_bytes_of_messages,
+    make_foreign_bytes,
+    read_messages,
+    write_late_parts,
+)
+from tests.log.surgery import take_apart
 from trilat_net.errors import LogError
 from trilat_net.execution.verification import verify_log
 from trilat_net.log.log_reader import open_log
@@ -28,7 +35,8 @@ from trilat_net.log.mcap_records import (
     unpack_chunk,
 )
 from trilat_net.log.recovery import recover
-from trilat_net.log.session_check import LogCheckResult, check_file
+from trilat_net.log.running_digest import DigestState
+from trilat_net.log.session_check import LogCheckResult, check_file, judge_integrity
 
 WHOLE = make_log_bytes("paper")
 DATA = edit_log_bytes(WHOLE, chunk_bytes=8192)
@@ -150,6 +158,16 @@ def _check_bytes(data: bytes) -> LogCheckResult:
         return check_bytes(Path(folder), data)
 
 
+def add_view(payload: bytes) -> bytes:
+    """The log with a message on a topic of views at its end."""
+    pieces = take_apart(WHOLE).without_chain()
+    channel = next(entry for entry in pieces.about if hasattr(entry, "topic"))
+    view = replace(channel, id=1 + max(pieces.topics()), topic="/viz/odd")
+    pieces.about.append(view)
+    pieces.messages.append(pieces.messages[-1]._replace(channel=view.id, payload=payload))
+    return pieces.bytes()
+
+
 SAID: dict[str, tuple[Callable[[], bytes], set[str], str]] = {
     "records are missing": (
         lambda: edit_log_bytes(DATA, record=drop_records("m1", {7, 8, 9, 40})),
@@ -189,6 +207,11 @@ SAID: dict[str, tuple[Callable[[], bytes], set[str], str]] = {
         {"times"},
         "was sent at 5 ns, but is stored with 3000000",
     ),
+    "a view that is not CDR": (
+        lambda: add_view(b"text"),
+        {"schema"},
+        "/viz/odd: a message is not encoded in CDR",
+    ),
     "another scenario": (
         lambda: edit_log_bytes(DATA, scenario=lambda text: text + "# and more\n"),
         {"scenario"},
@@ -212,6 +235,13 @@ def test_session_errors_fail_their_check(kind: str, tmp_path: Path) -> None:
     data, checks, text = SAID[kind]
     result = check_bytes(tmp_path, data())
     assert list_failed_checks(result) == checks, result.findings
+    chunks = {
+        frame.offset
+        for frame in RecordScanner(io.BytesIO(data())).frames()
+        if frame.opcode == Opcode.CHUNK
+    }
+    places = [place for finding in result.findings for place in finding.places]
+    assert {place.offset for place in places if place.offset is not None} <= chunks
     assert any(text in f"{f.text} {f.places}" for f in result.findings if not f.passed), (
         result.findings
     )
@@ -324,3 +354,25 @@ def test_existing_data_checksums_are_compared(tmp_path: Path) -> None:
     assert list_failed_checks(
         check_bytes(tmp_path, flip_byte(data, data.index(b"mcap") + 2))
     ) == {"checksums"}
+
+
+@pytest.mark.parametrize("epoch", ["", "soon", "-1"])
+def test_unreadable_epochs_count_as_virtual_time(epoch: str, tmp_path: Path) -> None:
+    result = check_bytes(tmp_path, edit_log_bytes(DATA, session={"epoch_unix_ns": epoch}))
+    assert result.passed, result.findings
+
+
+@settings(max_examples=10)
+@given(first=st.integers(0, 9), removed=st.sets(st.integers(10, 118), min_size=1, max_size=4))
+def test_removed_records_show_without_account_or_digests(first: int, removed: set[int]) -> None:
+    """The text has the number of records of a site that are missing after its first record."""
+    kept_ticks = set(range(first, 120)) - removed
+    kept = [
+        message
+        for message in read_messages(WHOLE)
+        if message.topic != "/trilat/paper/m1/state" or message.sequence in kept_ticks
+    ]
+    integrity = judge_integrity(open_log(io.BytesIO(make_bytes_of_messages(WHOLE, kept))))
+    assert integrity.state is DigestState.CHANGED
+    verb = "record of m1 is" if len(removed) == 1 else "records of m1 are"
+    assert integrity.text.startswith(f"{len(removed)} {verb} missing in between")

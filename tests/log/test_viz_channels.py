@@ -17,7 +17,7 @@ from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 
 from tests.execution.builders import execute_ticks
-from tests.log.builders import simulate_bytes
+from tests.log.builders import make_log, simulate_bytes
 from tests.log.split_logs import read_messages
 from trilat_net.core.step.ticks import Mode, TickRecord
 from trilat_net.log.log_writer import LogWriter
@@ -29,6 +29,7 @@ from trilat_net.log.ros2.viz_channels import (
     offer_views,
 )
 from trilat_net.log.view_rates import FULL_RATE_HZ
+from trilat_net.net import topics
 from trilat_net.net.messages import Event, LinkStats, State
 from trilat_net.net.wire import decode, encode_state
 from trilat_net.scenario import Scenario, load_scenario
@@ -389,3 +390,21 @@ def test_odd_rates_are_shown_as_asked() -> None:
     desk.take(make_record(k, [0.0] * 17) for k in range(333))
     desk.finish()
     assert 100 <= len(desk.arrays("/viz/m/joint_states")) <= 112
+
+
+@pytest.mark.parametrize(
+    "overrides", [{}, {"control.law": "tests.log.wide_law:Wide"}], ids=["shipped", "wide"]
+)
+def test_views_never_end_beyond_their_bound(overrides: dict[str, Any]) -> None:
+    """The room that a log reserves covers the views of laws that send many quantities."""
+    log = make_log("paper", {"duration_s": 0.22, **overrides})
+    sizes: list[int] = []
+    views = VizChannels(
+        log.scenario, "lab", 0, 100.0, lambda _topic, data, *_times: sizes.append(len(data))
+    )
+    for site in log.sites:
+        for n, state in enumerate(log[site].states):
+            views.receivers[topics.key("lab", site, topics.STATE)](state, n)
+    sizes.clear()
+    views.finish(0)
+    assert 0 < sum(sizes) <= views.most_bytes
