@@ -235,3 +235,26 @@ def test_a_torque_at_its_rate_limit_is_limited(seed: int, first: int) -> None:
         TorqueSplit(EQ.arm.place_end_effector(track.q, track.qd), none, none, none, none),
     )
     assert np.array_equal(motion.limited, is_cut)
+
+
+@settings(max_examples=30)
+@given(st.integers(0, 2**32 - 1), st.booleans(), st.booleans())
+def test_wrong_fixed_estimates_do_work(seed: int, keeps: bool, rests: bool) -> None:
+    """The work is that of r'Y(theta_hat - theta), over the parameters that are not adapted."""
+    site = Situation(seed, (5, 9), (6, 10))
+    theta = site.motion.constants.theta
+    estimates = site.track.theta_hat
+    estimates[:, 1] = theta[1]
+    if keeps:
+        estimates[1] = estimates[0]
+    site.track = site.track._replace(rests=np.array([rests, rests]))
+    adapts = np.array([1.0, 1.0, 0.0, 1.0, 0.0])
+    motion = dataclasses.replace(site.motion, constants=EQ._replace(Gamma=adapts))
+    booked = motion.compute_work()["estimates"]
+    power = motion.Yr * (estimates - theta)
+    is_fixed = np.tile(adapts == 0.0, (2, 1))
+    is_fixed[1] |= keeps and rests
+    expected = 0.5 / RATE_HZ * np.where(is_fixed, power, 0.0).sum(axis=1)
+    assert float(booked.left[0]) == pytest.approx(expected[0], abs=1e-12)
+    assert float(booked.right[0]) == pytest.approx(expected[1], abs=1e-12)
+    assert float(booked.jump[0]) == 0.0

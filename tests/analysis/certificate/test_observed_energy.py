@@ -13,7 +13,7 @@ import pytest
 from trilat_studies.tuning.tuning_report import list_energy_notes
 
 from tests.energy_runs import CONSTANT, FOLLOWER, JITTER, LAWS, make_energy_pair
-from tests.log.builders import edit_log_bytes, make_log_bytes, open_bytes
+from tests.log.builders import drop_records, edit_log_bytes, make_log_bytes, open_bytes
 from tests.scenario.builders import make_scenario
 from tests.unit_arm import make_spring_hand, make_unit_scenario
 from trilat_net.analysis.certificate.observed_energy import ObservedEnergy, ObservedFinding
@@ -286,3 +286,37 @@ def test_three_texts_explain_negative_energy_alike() -> None:
     assert note.endswith(NEGATIVE_ENERGY_MEANING)
     tuned.found.pop()
     assert list_energy_notes(tuned) == []
+
+
+def test_a_complete_brief_run_satisfies_all_premises() -> None:
+    """No torque of the run is at its limit, so that no work is missing from the books."""
+    log = simulate_scenario(load_scenario(PAIR, {"duration_s": 0.05}))
+    energies = ObservedEnergy.of_log(log, own_laws=True)
+    assert {premise.name: premise.holds for premise in energies.premises} == {
+        "books": True,
+        "torque": True,
+        "sampling": True,
+    }
+
+
+BRIEF_TANKS = {"control.law": "tanks", "duration_s": 0.1, "scheme": "digital"}
+
+
+@pytest.mark.parametrize("ticks", [{40}, {0}, {0, 40}])
+def test_lost_records_leave_the_energies_unjudged(ticks: set[int]) -> None:
+    """Sums since the start of a run need every record from the first one on."""
+    data = make_log_bytes("two_sites", BRIEF_TANKS)
+    energies = ObservedEnergy.of_log(
+        open_bytes(edit_log_bytes(data, record=drop_records("s", ticks)))
+    )
+    assert energies.finding is ObservedFinding.NOT_JUDGED
+    assert energies.incomplete_sites == ("s",)
+
+
+def test_uncounted_energy_begins_at_zero() -> None:
+    """The potential energy of raised arms at the start is no energy that they gave."""
+    raised = {f"sites.{site}.q0_rad": [0.8, 0.5] for site in ("m", "s")}
+    log = open_bytes(make_log_bytes("two_sites", {**BRIEF_TANKS, **raised}))
+    assert all(log.scenario.setup(site).theta_known for site in log.sites)
+    energies = ObservedEnergy.of_log(log)
+    assert 0.0 <= energies.sampling_j < 1e-3 * energies.largest_j + 1e-6

@@ -15,7 +15,7 @@ import pytest
 
 import trilat_net
 from tests.analysis.builders import EXPERT, make_run
-from tests.scenario.builders import make_overrides
+from tests.scenario.builders import make_overrides, rough_arm_text
 from trilat_net.analysis import decision_facts, run_end, run_remarks, stability_decision
 from trilat_net.analysis.certificate import (
     certificate_result,
@@ -42,7 +42,7 @@ from trilat_net.core.step.vectors import Array
 from trilat_net.log.log_reader import Log
 from trilat_net.presentation import decision_text, end_text, premise_text, verdict_text
 from trilat_net.presentation.verdict_text import REQUIREMENTS
-from trilat_net.scenario import load_scenario
+from trilat_net.scenario import load_scenario, parse_scenario
 
 SHORT = {"duration_s": 1.5, "rate_hz": 200, "link.delay_ms": 100.0}
 CUT = {"links.m2->s.outages_s": [[0.45, 1.0]], "links.m2->s.delay_ms": 100.0}
@@ -401,3 +401,44 @@ def test_two_overlapping_absences_are_both_found() -> None:
     )
     spans = find_absent_spans(log)  # type: ignore[arg-type]
     assert spans == [AbsentSpan("a", 1.0, 2.0), AbsentSpan("b", 3.0, 5.0)]
+
+
+def test_sites_may_end_a_tenth_apart() -> None:
+    """A site that left exactly 0.1 s before the end was not absent."""
+    spans = {}
+    for ticks in (48, 49, 50):
+        log = LogOfSites(
+            sites=("a", "b"),
+            parts={
+                "a": PartOfSite(rate_hz=10, last_tick=49, t_s=np.arange(50) / 10.0),
+                "b": PartOfSite(rate_hz=10, last_tick=ticks - 1, t_s=np.arange(ticks) / 10.0),
+            },
+            absences={},
+            events=[SimpleNamespace(about="b", kind="left")],
+            scenario=SimpleNamespace(duration_s=5.0),
+        )
+        spans[ticks] = find_absent_spans(log)  # type: ignore[arg-type]
+    assert spans == {48: [AbsentSpan("b", 4.8, 5.0)], 49: [], 50: []}
+
+
+def test_a_stretch_has_only_its_own_delays() -> None:
+    """A delay that changes after an absence varies in the later stretch alone."""
+    change = {"at_s": 1.0, "link": "m1->s", "to": {"delay_ms": 60.0}}
+    log = make_run("free", {**SHORT, "timeline": [change]}).log
+    absent = AbsentSpan("m2", 0.5, 0.6)
+    facts = gather_facts(log)
+    assert facts.functional is not None
+    with_absence = facts.functional._replace(absent=[absent])
+    checked = check_premises(facts._replace(functional=with_absence))
+    presence = next(premise for premise in checked if premise.name == "presence")
+    assert presence.holds is False
+    earlier, later = presence.quantities.stretches  # type: ignore[union-attr]
+    assert (earlier.to_s, earlier.varying) == (0.5, ())
+    assert (later.from_s, later.varying) == (0.6, (("m1", "s"),))
+
+
+def test_stops_out_of_reach_satisfy_their_premise() -> None:
+    """The elbow is far from its stop during the first tenth of a second."""
+    log = trilat_net.simulate(parse_scenario(rough_arm_text(), overrides={"duration_s": 0.1}))
+    checked = {premise.name: premise for premise in check_premises(gather_facts(log))}
+    assert checked["stops"].holds is True

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 import trilat_net
@@ -15,6 +15,7 @@ from trilat_net.analysis.certificate.running_energy import (
 )
 from trilat_net.log.log_reader import Log
 from trilat_net.presentation.premise_text import describe_energy_obstacle
+from trilat_net.scenario import load_scenario
 
 BLOCK = 60
 
@@ -124,3 +125,35 @@ def test_a_gap_keeps_its_last_samples(brief_log: Log, received: set[int]) -> Non
         assert rows.used["s"][row] == 3 * source + 1
         assert rows.follows[row] == bool(source % 2)
         assert rows.known[row] == (row in received or row == 10)
+
+
+@settings(max_examples=20)
+@given(st.sets(st.integers(0, 99), min_size=1), st.sampled_from(["glide", "brake"]))
+def test_only_a_gliding_site_rests(brief_log: Log, resting: set[int], action: str) -> None:
+    """A site that glides rests from a resting mode until 0.2 s later."""
+    overrides = {"rate_hz": 100, "on_stale.action": action, "on_stale.age_ms": 450.0}
+    window = RecordWindow(load_scenario("paper", overrides), "m1")
+    states = brief_log["m1"].states
+    for tick in range(100):
+        mode = "hold" if tick in resting else "run"
+        window.receive(replace_fields(states[tick % 10], tick=tick, mode=mode))
+    expected = [
+        action == "glide" and any(tick - 20 <= rest <= tick for rest in resting)
+        for tick in range(100)
+    ]
+    assert window.rows(0, 99).rests.tolist() == expected
+
+
+@given(st.sets(st.integers(0, 99), min_size=2))
+@example(set(range(0, 99, 2)))
+def test_a_full_window_knows_only_received_records(brief_log: Log, received: set[int]) -> None:
+    """A record that never came stays missing after the window has moved on."""
+    window = RecordWindow(brief_log.scenario, "m1", kept_s=0.1)
+    states = brief_log["m1"].states
+    for tick in sorted(received):
+        assert window.receive(replace_fields(states[tick % 10], tick=tick))
+    assert window.newest == max(received)
+    stored = [tick for tick in range(110) if window.has_record(tick)]
+    assert stored == sorted(tick for tick in received if tick >= window.first)
+    kept = [tick for tick in received if tick > window.newest - 10]
+    assert set(kept) <= set(stored)
