@@ -353,7 +353,7 @@ def test_own_and_foreign_packages_join_the_core(
         )
         assert refused.returncode == 2
         assert refused.stderr.splitlines() == [
-            f"error: trilat {command} is in a package of its own: pip install {package}"
+            f"error: trilat {command} is in a separate package: pip install {package}"
         ]
     install_wheel(clean, built[EXAMPLE][1], set())
     assert "lag " in run_outside(trilat, "--help", cwd=tmp_path)

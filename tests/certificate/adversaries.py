@@ -418,9 +418,13 @@ ROWS = (
         "decaying",
     ),
     Row(
-        "C7", "for 150 s", _free_swinging(0.5831, duration_s=150.0), ("open",), "nobody pushed"
+        "C7",
+        "for 150 s",
+        _free_swinging(0.5831, duration_s=150.0),
+        ("open",),
+        "no operator pushed",
     ),
-    Row("C7", "at 0.55 s", _free_swinging(0.55), NEVER_STABLE, "nobody pushed"),
+    Row("C7", "at 0.55 s", _free_swinging(0.55), NEVER_STABLE, "no operator pushed"),
     Row("C7=", "at 1.3 s", _free_swinging(1.3), AT_REST),
     Row("C7=", "by 20 ms", _free_swinging(0.5831, 20.0), AT_REST),
     Row(

@@ -291,7 +291,7 @@ def test_open_loop_reruns_are_judged_beside_logs(tmp_path: Path) -> None:
     write_log(tmp_path, make_log_bytes("free") + b"x")
     alone = LogCheckReport.of_log(open_log(log_path), virtual=True)
     assert not alone.passed
-    assert "not beside it" in "".join(line.text for line in alone.findings)
+    assert "not in the same folder" in "".join(line.text for line in alone.findings)
 
 
 def test_lost_samples_excuse_virtual_time_afterwards() -> None:
