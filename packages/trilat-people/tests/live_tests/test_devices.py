@@ -71,7 +71,7 @@ def held(stage: Stage) -> Iterator[DeviceSession]:
         )
         process = stage.start("device", *arguments, *connection_options(session.endpoints))
         session.processes["device"] = process
-        process.prints("button 'a' takes hold")
+        process.prints("button 'a' holds the arm")
         yield DeviceSession(session, service, process)
 
 
@@ -126,7 +126,7 @@ def test_silent_haply_lets_go_until_its_button(held: DeviceSession) -> None:
     held.service.silent.set()
     held.process.prints("is silent; the arm is released")
     held.service.silent.clear()
-    until(lambda: sum("takes hold" in line for line in held.lines) == 2, 30.0)
+    until(lambda: sum("holds the arm" in line for line in held.lines) == 2, 30.0)
     log = held.reproduce()
     message_s, release_s = find_release_s(log)
     assert release_s - message_s <= LET_GO_S
