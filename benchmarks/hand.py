@@ -160,14 +160,16 @@ def _flood(session: Session) -> tuple[int, int, int]:
 
 def _describe_flood(log: Log, flooded: tuple[int, int, int]) -> list[str]:
     begun_ns, ended_ns, sent = flooded
-    epoch_ns, part = _epoch_ns(log, "s"), log["s"]
+    epoch_ns = _epoch_ns(log, "s")
+    part = log["s"]
     during = (part.t_ns > begun_ns - epoch_ns) & (part.t_ns < ended_ns - epoch_ns)
     before = (part.t_ns < begun_ns - epoch_ns - 2_000_000_000) & (part.t_s > 2.0)
     p99 = [float(np.percentile(part.late_us[rows], 99)) for rows in (during, before)]
     refused = {k: v for k, v in log.link_stats("s")[-1].dropped.items() if k.startswith("hand")}
-    found, missing = verify_log(log), sum(map(log.missing, log.sites))
+    verification = verify_log(log)
+    missing = sum(map(log.missing, log.sites))
     return [
         f"flood of {sent / (ended_ns - begun_ns) * 1e9:.0f} messages/s for {FLOOD_S:g} s at s: p99 lateness "
         f"{p99[0]:.0f} us, before {p99[1]:.0f} us; refused {refused}",
-        f"  {missing} records missing, {found.identical} of {found.records} identical",
+        f"  {missing} records missing, {verification.identical} of {verification.records} identical",
     ]

@@ -33,9 +33,11 @@ def _session(scenario: Scenario, folder: Path) -> str:
     if outcome.problems or not outcome.log.exists():
         return "; ".join(outcome.problems)
     log = open_log(outcome.log)
-    again, twins = verify_log(log), compare_with_virtual(log)
-    want = sum(map(scenario.ticks, scenario.names))
+    verification = verify_log(log)
+    comparison = compare_with_virtual(log)
+    expected = sum(map(scenario.ticks, scenario.names))
     return (
-        f"verify {again.identical}/{want}, fed {twins.fed.identical}/{want}, "
-        f"plain {twins.plain.identical}/{want}, {len(twins.late)} late samples"
+        f"verify {verification.identical}/{expected}, "
+        f"fed {comparison.fed.identical}/{expected}, "
+        f"plain {comparison.plain.identical}/{expected}, {len(comparison.late)} late samples"
     )

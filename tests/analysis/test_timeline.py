@@ -17,14 +17,14 @@ from trilat_net.net.messages import MODES
 def test_spans_are_ticks_of_not_following(modes):
     part = make_site_log(modes)
     spans = [(mode, k) for k, mode in enumerate(modes) if not MODES[mode].follows]
-    found = Timeline({"m1": part}).find_mode_intervals("m1")
+    mode_intervals = Timeline({"m1": part}).find_mode_intervals("m1")
     intervals = [
         (span.mode, k)
-        for span in found
+        for span in mode_intervals
         for k in range(round(span.from_s * part.rate_hz), round(span.to_s * part.rate_hz))
     ]
     assert intervals == spans
-    for before, after in pairwise(found):
+    for before, after in pairwise(mode_intervals):
         # one span, not two in a row
         assert (before.mode, before.to_s) != (
             after.mode,

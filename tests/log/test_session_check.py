@@ -240,8 +240,9 @@ def test_session_errors_fail_their_check(kind: str, tmp_path: Path) -> None:
         for frame in RecordScanner(io.BytesIO(data())).frames()
         if frame.opcode == Opcode.CHUNK
     }
-    places = [place for finding in result.findings for place in finding.places]
-    assert {place.offset for place in places if place.offset is not None} <= chunks
+    locations = [location for finding in result.findings for location in finding.places]
+    offsets = {location.offset for location in locations}
+    assert offsets - {None} <= chunks
     assert any(text in f"{f.text} {f.places}" for f in result.findings if not f.passed), (
         result.findings
     )

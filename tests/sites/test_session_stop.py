@@ -32,19 +32,19 @@ def test_stop_ends_all_sites_at_one_time(tmp_path: Path) -> None:
     session = Session.whole(
         load_scenario("paper", {"duration_s": 30.0, **LIVE}), tmp_path, ends={}
     )
-    said: list[str] = []
-    shown: list[list[StatusRow]] = []
+    printed_lines: list[str] = []
+    displayed_rows: list[list[StatusRow]] = []
     titles: list[str] = []
 
     def stop(bus: Bus, clock: RelayClock) -> None:
         sleep_for_ns(clock, 2_500_000_000)
-        said.extend(reach_session(bus, clock).end())
+        printed_lines.extend(reach_session(bus, clock).end())
 
     def look(bus: Bus, clock: RelayClock) -> None:
         watch = SessionWatch(bus, clock, SESSION)
         while not watch.view.ended:
             watch.update()
-            shown.append(watch.rows())
+            displayed_rows.append(watch.rows())
             titles.append(watch.title)
             sleep_for_ns(clock, 20_000_000)
 
@@ -54,14 +54,14 @@ def test_stop_ends_all_sites_at_one_time(tmp_path: Path) -> None:
     assert session.ends == {"m1": 0, "m2": 0, "s": 0}
     (ticks,) = {log.expected_ticks(name) for name in log.sites}
     assert 1500 < ticks < 4000
-    assert said == [f"{name} ends at t = {ticks / 1000:.3f} s" for name in log.sites]
+    assert printed_lines == [f"{name} ends at t = {ticks / 1000:.3f} s" for name in log.sites]
     assert log.complete
     assert verify_log(log).identical == 3 * ticks
-    last = shown[-1]
+    last = displayed_rows[-1]
     assert [row["site"] for row in last] == ["m1", "m2", "s"]
     assert last[0]["angles"] == " ".join(f"{q:+.3f}" for q in log["m1"].q[-1]) + " rad"
     assert [row["held"] for row in last] == ["free", "", ""]
-    assert shown[-1][0].describe().startswith(f"m1 {(ticks - 1) / 1000:.1f} s ")
+    assert displayed_rows[-1][0].describe().startswith(f"m1 {(ticks - 1) / 1000:.1f} s ")
     assert titles[0].endswith("waits for its members")
     assert " V = " in titles[-1]
 
@@ -227,11 +227,11 @@ def test_watching_sees_returns_and_stops_everything(tmp_path: Path) -> None:
     session.clocks["m1"].dies_ns = 4_000_000_000
     session.site("m1", at_ns=5_000_000_000)
     session.clocks["s"].dies_ns = 9_000_000_000
-    said: list[str] = []
+    printed_lines: list[str] = []
     seen: dict[str, int] = {}
 
     def stop(bus: Bus, clock: RelayClock) -> None:
-        said.extend(reach_session(bus, clock).end())
+        printed_lines.extend(reach_session(bus, clock).end())
 
     def look(bus: Bus, clock: RelayClock) -> None:
         watch = SessionWatch(bus, clock, SESSION)
@@ -245,7 +245,7 @@ def test_watching_sees_returns_and_stops_everything(tmp_path: Path) -> None:
     session.stranger(look)
     session.stranger(stop, at_ns=10_000_000_000)
     log = session.run()
-    assert [line.split()[0] for line in said] == ["m1", "m2"]
+    assert [line.split()[0] for line in printed_lines] == ["m1", "m2"]
     ticks = log.expected_ticks("m2")
     assert ticks < 2200
     assert max(seen.values()) - seen["m1"] < 10

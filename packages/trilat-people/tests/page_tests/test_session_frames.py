@@ -106,14 +106,14 @@ def test_a_user_is_shown_how_its_law_pulls(tmp_path: Path) -> None:
     arm = build_arm_rows(log.scenario, "m1")
     largest_pull_n = 0.0
     for frame in frames:
-        own = frame["sites"]["m1"]
-        record = log["m1"].states[own["tick"]]
+        shown_master = frame["sites"]["m1"]
+        record = log["m1"].states[shown_master["tick"]]
         q = np.array([record.q])
         J = arm.place_end_effector(q, np.zeros_like(q)).J[0]
         torque = np.array(record.tau) - arm.gravity_torque(q)[0]
         if np.linalg.svd(J, compute_uv=False)[-1] > 0.1 * np.linalg.norm(J):
-            assert J.T @ np.array(own["pull"]) == pytest.approx(torque, abs=5e-3)
-            largest_pull_n = max(largest_pull_n, np.linalg.norm(own["pull"]))
+            assert J.T @ np.array(shown_master["pull"]) == pytest.approx(torque, abs=5e-3)
+            largest_pull_n = max(largest_pull_n, np.linalg.norm(shown_master["pull"]))
     assert largest_pull_n > 1.0
 
 
@@ -129,12 +129,14 @@ def test_peers_stay_until_their_record_has_come(tmp_path: Path) -> None:
     lags_ticks = []
     for frame in frames:
         shown_peer = frame["sites"]["s"]
-        own = frame["sites"]["m"]
-        used_tick = log["m"].states[own["tick"]].used["s"]
+        shown_master = frame["sites"]["m"]
+        used_tick = log["m"].states[shown_master["tick"]].used["s"]
         lags_ticks.append(used_tick - shown_peer["tick"])
         assert shown_peer["points"] == compute_points(log, "s", shown_peer["tick"])
         if shown_peer["age_ms"] is not None:
-            assert shown_peer["age_ms"] == pytest.approx(own["tick"] - shown_peer["tick"])
+            assert shown_peer["age_ms"] == pytest.approx(
+                shown_master["tick"] - shown_peer["tick"]
+            )
     assert min(lags_ticks) == 0
     assert max(lags_ticks) > 50
     assert lags_ticks[-1] == 0
