@@ -17,7 +17,7 @@ TOPS = {
 """The packages of the program, each with the folder in which it lies."""
 BELOW_ALL = {
     *("errors", "process", "signals", "workers", "files", "results", "fields", "records"),
-    *("recorded_change", "hooks", "entry_points", "package_names"),
+    *("recorded_change", "hooks", "entry_points", "package_names", "toml_text"),
 }
 
 

@@ -29,7 +29,7 @@ PARTS = {
     "lerobot": r"lerobot",
     "people": r"^packages/trilat-people/|studies/experiment",
     "studies": r"^trilat_net/studies/|^packages/trilat-studies/",
-    "kernel": r"^trilat_net/(core|laws)/|^trilat_net/(fields|errors|files|process|signals|workers|results|hooks|records|recorded_change)\.py",
+    "kernel": r"^trilat_net/(core|laws)/|^trilat_net/(fields|errors|files|process|signals|workers|results|hooks|records|recorded_change|toml_text)\.py",
     "analysis": r"^trilat_net/analysis/",
     "app": r"^trilat_net/(app|presentation|work)/|^trilat_net/(__init__|__main__|entry_points|extension|package_names)\.py",
     "session": r"^trilat_net/(scenario|own_code|net|log|execution)/|^sites/|^recorder/",

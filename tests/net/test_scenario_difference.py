@@ -1,5 +1,7 @@
 """The settings in which two scenarios differ, named in a line that any text may go into."""
 
+import tracemalloc
+
 import pytest
 import tomli_w
 from hypothesis import given
@@ -57,3 +59,25 @@ def test_any_names_and_values_give_a_line(settings: dict[str, str]) -> None:
     phrase = describe(tomli_w.dumps(settings), "")
     assert phrase.isprintable()
     assert len(phrase) <= 120 * (LISTED_SETTINGS + 1)
+
+
+def test_long_table_names_need_little_memory() -> None:
+    """The name of a table, which all its settings repeat, may have the size of the scenario."""
+    name = 200_000 * "t"
+    first = f"[{name}]\n" + "".join(f"k{n} = 1\n" for n in range(2000))
+    tracemalloc.start()
+    phrase = describe(first, first.replace("k7 = 1", "k7 = 2"))
+    _, peak_bytes = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert phrase.endswith(" is 1 at s and 2 at m1")
+    assert peak_bytes < 50 * len(first)
+
+
+def test_long_names_differ_beyond_their_printed_part() -> None:
+    first = f"{300 * 'a'}b = 1"
+    assert describe(first, first.replace("b", "c")).count("absent at") == 2
+
+
+def test_keys_of_very_many_parts_name_nothing() -> None:
+    """A parser would need minutes for such a key."""
+    assert describe("a" + 50_000 * ".a" + " = 1", PAPER) == ""

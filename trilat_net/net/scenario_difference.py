@@ -8,12 +8,13 @@ Invariant:
       the result is one short line without control characters.
 """
 
+import hashlib
 import json
-import tomllib
 from collections.abc import Iterator
 from typing import Any
 
-from ..errors import count_nouns
+from ..errors import ScenarioError, count_nouns
+from ..toml_text import parse_toml
 
 LISTED_SETTINGS = 3
 """Number of settings whose values are stated. The others are counted."""
@@ -73,19 +74,31 @@ def _read_settings(text: str) -> dict[str, str] | None:
         The settings. None if the text is not TOML, or is nested too deeply.
     """
     try:
-        return dict(_list_settings(tomllib.loads(text)))
-    except (tomllib.TOMLDecodeError, RecursionError):
+        return dict(_list_settings(parse_toml(text)))
+    except (ScenarioError, RecursionError):
         return None
 
 
 def _list_settings(table: dict[str, Any], prefix: str = "") -> Iterator[tuple[str, str]]:
     """Yields the dotted name and the value of each setting of a table and of its subtables."""
     for key, value in table.items():
-        name = prefix + key
+        name = prefix + _bound_key(key)
         if isinstance(value, dict):
             yield from _list_settings(value, f"{name}.")
         else:
             yield name, json.dumps(value, default=str)
+
+
+def _bound_key(key: str) -> str:
+    """Returns a key, or a short text that stands for a long key and for no other key.
+
+    The name of a table is part of the names of all its settings. With a long name, these would
+    need far more memory than the scenario.
+    """
+    if len(key) <= _NAME_LENGTH:
+        return key
+    digest = hashlib.sha256(key.encode()).hexdigest()
+    return f"{key[: _NAME_LENGTH // 4]}...{digest}"
 
 
 def _shorten(text: str, length: int = _VALUE_LENGTH) -> str:

@@ -23,6 +23,7 @@ import tomli_w
 from ..errors import ScenarioError, suggest_nearest
 from ..files import open_regular
 from ..own_code import allow_own_code, name_law_classes
+from ..toml_text import parse_toml
 from .named_files import SHIPPED_FOLDER
 from .override import (
     Override,
@@ -37,8 +38,6 @@ from .resolve import resolve_scenario
 from .scenario_types import Scenario
 from .validate import build_scenario
 
-MAX_KEY_PARTS = 32
-"""Largest number of parts of a dotted key. Scenarios need four, as in sites.m1.arm.l1_m."""
 _MAX_NAME_LENGTH = 80
 
 
@@ -72,7 +71,7 @@ def read_shipped(name: str) -> str:
     shipped_names = list_shipped()
     if name not in shipped_names and not (len(name) < _MAX_NAME_LENGTH and file.is_file()):
         hint = suggest_nearest(name, shipped_names)
-        # A hint is a complete sentence, which ends in a question mark.
+        # A hint ends the sentence with a question mark.
         separator = " The" if hint else "; the"
         raise ScenarioError(
             f"there is no scenario of that name{hint}{separator} shipped scenarios are "
@@ -194,9 +193,9 @@ class ExperimentText(NamedTuple):
             overrides: Texts KEY=VALUE, each of which replaces one value of the description.
 
         Raises:
-            ScenarioError: An override is not valid.
+            ScenarioError: The text is not TOML, or an override is not valid.
         """
-        tables = tomllib.loads(self.text)
+        tables: dict[str, Any] = pickle.loads(_parse_toml(self.text))
         apply_overrides(tables, overrides)
         return tables
 
@@ -312,7 +311,6 @@ def parse_scenario(
     written: dict[str, Any] = {}
     with _PARSE_LOCK:
         try:
-            _refuse_long_keys(text)
             tables = pickle.loads(_parse_toml(text))
             written = tables
             pairs, entry_pairs = split_entries(tables, parse_overrides(overrides))
@@ -342,45 +340,7 @@ def _parse_toml(text: str) -> bytes:
     Raises:
         ScenarioError: The text is not TOML, or has a key of very many parts.
     """
-    _refuse_long_keys(text)
-    try:
-        return pickle.dumps(tomllib.loads(text))
-    # TOMLDecodeError is a ValueError. A number of 5000 digits raises a plain ValueError.
-    except ValueError as error:
-        raise ScenarioError(f"is not TOML: {error}") from None
-
-
-_KEY_PART = re.compile(
-    r"""(?P<word>[\w-]+|"[^"]*"|'[^']*')|(?P<dot>\s{0,9}\.\s{0,9})|(?P<other>.)"""
-)
-"""Matches the next piece of a line: a part of a key, a dot, or another character."""
-
-
-def _refuse_long_keys(text: str) -> None:
-    """Refuses a text with a dotted key that has very many parts.
-
-    The time that a TOML parser needs grows faster than the square of the number of parts, so a
-    short text from an untrusted source could block the program.
-
-    Raises:
-        ScenarioError: There is such a key. The error contains the number of its line.
-    """
-    for number, line in enumerate(text.split("\n"), 1):
-        if line.count(".") < MAX_KEY_PARTS:
-            continue
-        dots = 0
-        previous_kind = ""
-        for part in _KEY_PART.finditer(line):
-            kind = part.lastgroup or ""
-            # In a key, words and dots alternate. Any other pair of pieces ends the key.
-            is_inside_key = {kind, previous_kind} == {"word", "dot"}
-            if not is_inside_key:
-                dots = 0
-            elif kind == "dot":
-                dots += 1
-            previous_kind = kind
-            if dots >= MAX_KEY_PARTS:
-                raise ScenarioError(f"line {number}: a key has more than {MAX_KEY_PARTS} parts")
+    return pickle.dumps(parse_toml(text))
 
 
 def parse_embedded(text: str, source: str = "") -> Scenario:

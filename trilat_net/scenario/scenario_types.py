@@ -44,7 +44,7 @@ from ..errors import ScenarioError, suggest_nearest
 from ..fields import Frozen
 from ..laws import SentVectorSpecs
 from ..own_code import build_channel
-from ..recorded_change import SiteOrder as SiteOrder
+from ..recorded_change import SiteOrder
 from ..records import NS_PER_S, Layout
 from .arms import START_MARGIN_RAD, Arm, ArmModel, build_arm, start_margin
 from .change import Change
@@ -340,7 +340,7 @@ class Scenario(Frozen, frozen=True, dict=True):
         """
         if name not in self.sites:
             hint = suggest_nearest(name, self.names)
-            # A hint is a complete sentence, which ends in a question mark.
+            # A hint ends the sentence with a question mark.
             listing = " The sites are " if hint else "; the sites are "
             raise ScenarioError(
                 f"there is no site {name!r}{hint}" + listing + ", ".join(self.names),
