@@ -31,6 +31,7 @@ def lap(what):
     now = time.process_time()
     print(f"{what}={now - last:.3f}")
     last = now
+from trilat_net.analysis import LogMetrics
 from trilat_net.presentation.page import write_report
 from trilat_net.analysis.certificate.stability_certificate import certify_log
 from trilat_net import open_log, verify

@@ -1,4 +1,4 @@
-"""Requests messages that were lost on the network again from their sender.
+"""Requests messages again from their sender if they were lost on the network.
 
 The process of each arm (the site) publishes numbered messages, and the recorder writes them to
 a log. A gap in the numbers shows that a message was lost. If the last messages are lost, there

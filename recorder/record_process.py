@@ -242,8 +242,10 @@ class Recorder:
         return recording
 
     def _find_scenario(self, epoch: Epoch) -> tuple[SessionScenario, MakeViews | None]:
-        """Returns the scenario to record, which a member has sent with its identity.
+        """Returns the scenario to record, and the function that makes channels for viewers.
 
+        A member has sent the scenario with its identity. The function is None if no such
+        channels are recorded.
         A recorder needs no scenario file. Members that were started again after the common
         start was agreed are ignored. They have another boot, the random number of a start.
 

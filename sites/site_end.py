@@ -192,7 +192,7 @@ class SiteEnd:
         ]
         if unreached_peers:
             cause += f"; {', '.join(unreached_peers)} did not confirm its last samples"
-        text = f"{parts.name} executed {count_nouns(self._outcome.ticks, 'tick')}{cause}"
+        text = f"{parts.name} made {count_nouns(self._outcome.ticks, 'tick')}{cause}"
         self._publish_end_event("end", text, about=about)
 
     @property
@@ -212,7 +212,7 @@ class SiteEnd:
         Returns:
             member: Name of the member that ended the run. Empty if the run was completed, or
                 was ended by a request to all sites.
-            cause: Text that names the cause, to be appended to the sentence "m1 executed 500
+            cause: Text that names the cause, to be appended to the sentence "m1 made 500
                 ticks". Empty if the run was completed.
         """
         parts = self._parts

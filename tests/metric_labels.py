@@ -8,7 +8,7 @@ import io
 from pathlib import Path
 
 from trilat_net.analysis.metrics import log_metrics  # noqa: F401 (its import registers the metrics)
-from trilat_net.analysis.metrics.log_metrics import LogMetrics
+from trilat_net.analysis.metrics.measures import Quantity
 
 TABLE = Path(__file__).parents[1] / "docs" / "data" / "metric-labels.csv"
 
@@ -20,7 +20,7 @@ def build_table() -> str:
     writer.writerow(["label", "key", "unit", "of"])
     rows = [
         (quantity.name, quantity.key, quantity.unit, quantity.of)
-        for quantity in LogMetrics.list_quantities()
+        for quantity in Quantity.list_all()
     ]
     writer.writerows(sorted(rows))
     return stream.getvalue()

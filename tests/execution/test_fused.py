@@ -13,6 +13,7 @@ from tests.execution.builders import execute_ticks, run_fused
 from tests.execution.varying_links import VARYING_LINKS
 from tests.programs import run_python
 from trilat_net.analysis.metrics.log_metrics import LogMetrics
+from trilat_net.analysis.metrics.measures import Quantity
 from trilat_net.core.step.ticks import BUCKETS_PER_S, Mode, TickRecord
 from trilat_net.errors import LawFailed, ScenarioError
 from trilat_net.execution import virtual
@@ -160,7 +161,7 @@ def test_totals_are_those_of_the_log(name: str, changes: dict[str, Any]) -> None
     log = virtual.simulate_scenario(scenario)
     whole = {
         quantity.key: LogMetrics.of_log(log).run_value(quantity).value
-        for quantity in LogMetrics.list_quantities()
+        for quantity in Quantity.list_all()
         if quantity.key in TOTALS
     }
     totals = fused.totals._asdict()

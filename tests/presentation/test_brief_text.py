@@ -4,7 +4,7 @@ from dataclasses import replace
 
 from tests.analysis.builders import make_run, make_short_log
 from trilat_net.analysis.metrics.log_metrics import LogMetrics
-from trilat_net.analysis.metrics.measures import Metric
+from trilat_net.analysis.metrics.measures import Metric, Quantity
 from trilat_net.presentation import brief_text
 from trilat_net.presentation.certificate_text import CertificateLine, describe_certificate
 from trilat_net.presentation.result_text import TextTable, compose
@@ -40,7 +40,7 @@ def test_missing_key_metric_has_its_reason() -> None:
 
 
 def test_every_key_metric_exists() -> None:
-    known = {quantity.key for quantity in LogMetrics.list_quantities()}
+    known = {quantity.key for quantity in Quantity.list_all()}
     assert set(brief_text._KEY_METRICS) <= known
 
 

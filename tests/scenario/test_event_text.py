@@ -5,8 +5,8 @@ from typing import Any, get_args
 
 import pytest
 
+from trilat_net.recorded_change import SiteOrder
 from trilat_net.scenario.change import Change, describe_event, find_requester
-from trilat_net.scenario.scenario_types import SiteOrder
 
 CHANGES = {
     "m2 was stopped by the experimenter at 58.2 s": {

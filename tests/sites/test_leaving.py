@@ -222,8 +222,8 @@ def test_one_way_cuts_are_in_last_messages(tmp_path: Path) -> None:
     log = session.run()
     ends = {event.member: event.text for event in log.events if event.kind == "end"}
     assert ends == {
-        "m": "m executed 600 ticks; s did not confirm its last samples",
-        "s": "s executed 600 ticks",
+        "m": "m made 600 ticks; s did not confirm its last samples",
+        "s": "s made 600 ticks",
     }
 
 

@@ -283,9 +283,10 @@ class AlignedRecords(NamedTuple):
             t_s: Times since the start of the session, shape (K,), in s.
 
         Returns:
-            For each time, the row of that tick, shape (K,). If the time is outside
-            the records, it is the nearest row. For each time, True if that tick was recorded,
-            and False if its row is interpolated or outside the records, shape (K,).
+            For each time, the row of that tick, shape (K,). If the time is outside the records,
+            it is the nearest row.
+            For each time, True if that tick was recorded, and False if its row is interpolated
+            or outside the records, shape (K,).
         """
         position = t_s * self.rate_hz
         tick = np.floor(position + 1e-6).astype(np.int64)

@@ -58,13 +58,16 @@ Obstacle = Literal[
     "few bursts",
     "unclear end",
 ]
-"""Reasons that prevent a better decision. The first six are findings against stability: an arm
-exceeded its limits, there are doubts about the end of the run, sites have no records, delays
-repeat only after the judged part, other analyses contradict stability, or the roots show
-growth. The others say why the evidence does not suffice: the record is too short, its end does
-not agree with a proof, a numerical root decays too slowly to be distinguished from lasting
-motion, no run with pushes was made or judged, the pushes show no clear trend, the judged part
-has few bursts of lost samples, or the end of the run shows no clear trend.
+"""Reasons that prevent a better decision.
+
+The first six are findings against stability: an arm exceeded its limits, there are doubts about
+the end of the run, sites have no records, delays repeat only after the judged part, other
+analyses contradict stability, or the roots show growth.
+
+The others say why the evidence does not suffice: the record is too short, its end does not
+agree with a proof, a numerical root decays too slowly to be distinguished from lasting motion,
+no run with pushes was made or judged, the pushes show no clear trend, the judged part has few
+bursts of lost samples, or the end of the run shows no clear trend.
 """
 Doubt = StabilityVerdict | UnsuppliedGrowth | ObservedEnergy | EvidenceDoubt
 """A finding of another analysis that contradicts a stable run."""

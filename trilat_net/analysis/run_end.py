@@ -1058,7 +1058,8 @@ def _find_last_change(scenario: Scenario, span_s: float) -> float:
 def _find_frequency_hz(site_logs: list[SiteLog]) -> float | None:
     """Estimates the frequency at which the arms oscillate, from the fastest joint.
 
-    Args: site_logs: Logs of all sites. The second half of each is used.
+    Args:
+        site_logs: Logs of all sites. The second half of each is used.
 
     Returns:
         The frequency in Hz, from the sign changes of the joint's velocity. `None` if they are

@@ -203,9 +203,8 @@ class Timeline:
         }
 
         for site in log.sites:
-            log.commands(
-                site
-            )  # raises if a record names a change that is not valid for the site
+            # This call raises if a record names a change that is not valid for the site.
+            log.commands(site)
             for tick, texts in log.changes(site).items():
                 for text in texts:
                     change = msgspec.json.decode(text, type=Change)

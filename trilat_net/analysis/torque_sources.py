@@ -198,8 +198,8 @@ class SourceRows:
         J = end_effector.J
 
         if kind is TorqueKind.WALL:
-            normal_force = VirtualWall(self.source).find_force(t_s, end_effector)
-            force = normal_force[:, np.newaxis] * np.array(self.source.b)
+            wall = VirtualWall(self.source)
+            force = wall.find_force(t_s, end_effector)[:, np.newaxis] * wall.normal
             torque = _map_to_joints(J, force)
         elif kind is TorqueKind.VISCOUS:
             torque = -np.array(self.source.B) * qd
@@ -543,7 +543,7 @@ class WallEnergy(NamedTuple):
     arm_damping_n_s_m: float
 
     @staticmethod
-    def count_walls(scenario: Scenario) -> int:
+    def count_sampled_walls(scenario: Scenario) -> int:
         """Returns the number of walls in a scenario that may generate energy.
 
         Args:

@@ -36,7 +36,7 @@ class AdaptiveRobust(AdaptiveBox):
         Lambda, Kp, Kd, Gamma, theta_hat0, theta_low, theta_high: As in `AdaptiveBox`.
         rho_nm: Bound on the disturbance per joint, N m (N for a sliding joint).
         width_rad_s: Value of r at which the robust term is 0.71 rho, per joint, rad/s (m/s).
-        friction: Fraction of the joints' friction that the law compensates, 0 to 1.
+        friction: Fraction of the joints' friction that the law compensates.
     """
 
     rho_nm: NotNegativeJoints = (1.0,)

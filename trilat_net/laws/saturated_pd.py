@@ -103,9 +103,9 @@ class SaturatedPd(ControlLaw):
         """Evaluates the stability of this law, and whether its torques stay within limits.
 
         The condition of a linear spring of stiffness K with a damper applies at any pose at
-        rest, even if sites are held apart. It does not suffice that the spring is nowhere
-        stiffer than K. The reason is that the slopes of a hyperbolic tangent form a positive
-        semidefinite matrix; the Schur product theorem then gives the bound
+        rest, even if sites are held apart. This does not follow from the spring being nowhere
+        stiffer than K. It follows from the slopes of a hyperbolic tangent, which form a
+        positive semidefinite matrix: the Schur product theorem then gives the bound
         (docs/theory/damping-conditions.md, 13).
 
         If the gravity torque of the arm is known, the torque limit of each joint must be above

@@ -708,9 +708,9 @@ class Tdpa(EnergyLaw):
         K: Stiffness of the spring by which the site follows, per joint, N m/rad. 0 if the site
             follows no other site.
         B: Damping with which the site follows, per joint, N m s/rad.
-        acceleration_rad_s2: Change of a joint's acceleration per tick (period of the control
-            loop) for which the leaders' controllers plan, caused by other torques than those of
-            the law. Half of the reserve covers larger changes.
+        acceleration_rad_s2: Largest change of a joint's acceleration per tick (period of the
+            control loop) for which the leaders' controllers plan, caused by other torques than
+            those of the law. Half of the reserve covers larger changes.
         drift_rad_s: Largest velocity with which positions that have drifted apart are brought
             together again. With 0, positions drift.
         reserve_J: Initial energy of an end per joint and peer, J.

@@ -440,8 +440,8 @@ def _find_longest_ordered(spans_ns: Sequence[tuple[int, int]]) -> set[int]:
     Returns:
         The indices of the spans that belong to the sequence.
     """
-    # Entry n is the last index of the increasing sequence of length n + 1 with the earliest
-    # last span.
+    # Entry n of both lists: the last span, and its index, of the increasing sequence of length
+    # n + 1 that ends earliest.
     last_spans: list[tuple[int, int]] = []
     last_indices: list[int] = []
     # For each index, the index before it in its sequence. It is -1 for the first one.

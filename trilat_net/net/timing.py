@@ -780,10 +780,13 @@ def _describe_acknowledgement(monitor: LinkTimingMonitor, k: int) -> ClockNotice
     if monitor.is_unacknowledged:
         timeout_ms = _UNHEARD_NS // 1_000_000
         kind = "unheard"
-        text = f"samples of {name} arrive, but {name} has acknowledged none for {timeout_ms} ms"
+        text = (
+            f"samples of {name} arrive, but {name} has acknowledged none of this site's "
+            f"samples for {timeout_ms} ms"
+        )
     else:
         kind = "heard"
-        text = f"{name} acknowledges samples again"
+        text = f"{name} acknowledges this site's samples again"
     return {"kind": kind, "text": text, "about": name, "ticks": k}
 
 

@@ -64,7 +64,7 @@ def check_arguments(kind: Any, code: str, settings: Mapping[str, Any], path: str
         signature = inspect.signature(kind)
     except (TypeError, ValueError):
         return  # a class written in C has no signature, and rejects wrong arguments itself
-    parameters = list(signature.parameters.values())[1:]  # without `context`
+    parameters = list(signature.parameters.values())[1:]  # without the facts about the site
     named = {
         parameter.name: parameter
         for parameter in parameters

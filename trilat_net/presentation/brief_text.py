@@ -105,7 +105,7 @@ def compose_key_metrics(metrics: LogMetrics) -> Iterator[Block]:
     Args:
         metrics: All metrics of the run.
     """
-    by_key = {quantity.key: quantity for quantity in LogMetrics.list_quantities()}
+    by_key = {quantity.key: quantity for quantity in Quantity.list_all()}
     rows = []
     for key in _KEY_METRICS:
         row = _make_row(metrics, by_key[key])

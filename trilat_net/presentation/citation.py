@@ -172,7 +172,10 @@ def _state_settings(scenario: Scenario) -> Iterator[str]:
 
 
 def _group_equal(texts: Mapping[str, str]) -> str:
-    """Joins the texts about several objects, each with the names of its objects."""
+    """Joins the texts about several objects, each with the names of its objects.
+
+    If all texts are equal, the text is returned once, without names.
+    """
     names: dict[str, list[str]] = {}
     for name, text in texts.items():
         names.setdefault(text, []).append(name)

@@ -760,9 +760,7 @@ def compose_metrics(metrics: LogMetrics) -> Iterator[Block]:
         metrics: The metrics of the run.
     """
     reasons: dict[str, list[str]] = {}
-    tables = groupby(
-        LogMetrics.list_quantities(), key=lambda quantity: (quantity.group, quantity.of)
-    )
+    tables = groupby(Quantity.list_all(), key=lambda quantity: (quantity.group, quantity.of))
     for (group, _), group_quantities in tables:
         yield from _compose_group(group, list(group_quantities), metrics, reasons)
     yield from _compose_sharing(metrics)

@@ -1,11 +1,11 @@
-"""Writes configuration files with which Foxglove, Lichtblick and RViz show the arms of a log.
+"""Writes the layout with which Foxglove and Lichtblick show the arms of a log.
 
-The files are written next to the log. Some of them are for a bag, a file of standard messages
-of ROS 2 (Robot Operating System), into which a log can be exported. A bag has the topics that
-the live bridge to ROS 2 publishes during a session.
+The file is written next to the log. It also serves a bag, a file of standard messages of ROS 2
+(Robot Operating System), into which a log can be exported. A bag has the topics that the live
+bridge to ROS 2 publishes during a session.
 
 Invariant:
-    - A file names only topics of the log, and topics of the bag and of the live bridge.
+    - The layout names only topics of the log, and topics of the bag and of the live bridge.
     - An existing file is replaced only with `force`.
 """
 

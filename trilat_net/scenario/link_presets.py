@@ -21,8 +21,8 @@ GRID_LOSSES_PERCENT = (0, 10, 25, 50)
 
 The ranges are those of Rodriguez-Seda, Lee and Spong, "Experimental Comparison Study of Control
 Architectures for Bilateral Teleoperators", IEEE Trans. Robotics 25 (2009): round trips of 8 to
-1088 ms and losses of 0 to 50 %. The grid points are our choice, because the study does not
-state its own.
+1088 ms and losses of 0 to 50 %. The grid points are our choice, because we do not know those of
+the study.
 """
 
 _GRID: dict[str, dict[str, Any]] = {

@@ -259,7 +259,7 @@ def _sample_chain(model: ArmModel, q0: Array, speed: Array) -> _ArmSamples:
     gravity_torques = []
     coriolis_torques = []
     for q in _draw_poses(model, q0):
-        inertias.append(model.inertia(q))
+        inertias.append(dynamics.find_inertia(q))
         poses = np.tile(q, (len(velocities), 1))
         torques = dynamics.compute_torque(poses, qd=velocities, v=velocities, a=still)
         G = torques[0]

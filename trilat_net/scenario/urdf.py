@@ -731,11 +731,12 @@ def _read_body(
             to the tip.
     """
     mass, centre, tensor, _ = inertial
+    centre_pose = pose @ centre
     moments = _principal_moments(tensor)
     slack = max(LEAST_MOMENT_KG_M2, CONSISTENCY * moments[2])
     problem = _find_moments_problem(moments, -slack, slack)
     if not problem:
-        return _LinkBody(name, (pose @ centre).place_body(mass, tensor))
+        return _LinkBody(name, centre_pose.place_body(mass, tensor))
 
     if inertias.balance:
         tensor = balance_tensor(tensor)
@@ -743,7 +744,7 @@ def _read_body(
         notes.append(
             f"{_link(name)}: {problem}; balanced to {least:.4g}, {middle:.4g} and {most:.4g}"
         )
-        return _LinkBody(name, (pose @ centre).place_body(mass, tensor))
+        return _LinkBody(name, centre_pose.place_body(mass, tensor))
     supplied = inertias.links.get(name)
     if supplied is not None and supplied.inertia_kg_m2 is not None:
         raise ScenarioError(problem, path=f"{_key(name)}.inertia_kg_m2")
@@ -751,8 +752,8 @@ def _read_body(
         _refuse(_link(name), f"{problem}; {_advise_balance(name, path)}")
 
     # `_lump_bodies` decides whether the link counts as stated or as a point.
-    stated = (pose @ centre).place_body(mass, tensor)
-    point = (pose @ centre).place_body(mass, _POINT_TENSOR)
+    stated = centre_pose.place_body(mass, tensor)
+    point = centre_pose.place_body(mass, _POINT_TENSOR)
     return _LinkBody(name, stated, point, problem)
 
 

@@ -868,10 +868,11 @@ def _describe_target(
         frame: Name of the coordinate frame of the positions and forces in the messages.
 
     Returns:
-        topic: Name of the topic. type: Name of the ROS type of its messages. read: Function
-        that converts an encoded message to a target: joint angles, a force or a position. It
-        raises ValueError if the message is not valid. send: Function that sends the target to
-        the site.
+        topic: Name of the topic.
+        type: Name of the ROS type of its messages.
+        read: Function that converts an encoded message to a target: joint angles, a force or a
+            position. It raises ValueError if the message is not valid.
+        send: Function that sends the target to the site.
     """
     operator = scenario.sites[site].find_live_hand(is_open=True)
     assert operator is not None

@@ -115,7 +115,7 @@ def compare_metrics(logs: Sequence[Log], names: Sequence[str] = ()) -> _MetricCo
     """
     measured = [LogMetrics.of_log(log) for log in logs]
     rows = []
-    for quantity in LogMetrics.list_quantities():
+    for quantity in Quantity.list_all():
         entries = tuple(metrics.run_value(quantity) for metrics in measured)
         if any(entry.applies for entry in entries):
             rows.append(_ComparisonRow(quantity, entries))

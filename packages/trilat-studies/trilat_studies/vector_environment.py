@@ -249,8 +249,8 @@ class TeleoperationVectorEnv(SyncVectorEnv[Any, Any]):
 
         Returns:
             The observations, in which the observations of new episodes replace those of ended
-            episodes; and the information, with "final_obs" and "final_info" of the ended
             episodes.
+            The information, with "final_obs" and "final_info" of the ended episodes.
         """
         observations = {}
         for index in np.flatnonzero(self._autoreset_envs).tolist():
@@ -605,8 +605,8 @@ class _LaneEnvs:
     def _describe(self, state: "_State", succeeded: Flags) -> dict[str, Any]:
         """Returns the information of a step for all lanes, as in `TeleoperationEnv`.
 
-        A teacher is a user other than the policy. If the site of the task follows a teacher
-        more than the policy, the teacher intervenes.
+        A teacher is a user other than the policy. The teacher with the largest dominance factor
+        intervenes while the site of the task follows this teacher more than the policy.
 
         Args:
             state: State after the step.

@@ -23,6 +23,7 @@ from tests.analysis.builders import (
 )
 from tests.log.builders import add_clock_readings, replace_fields, replace_scenario, rewrite_log
 from trilat_net.analysis.metrics.log_metrics import LogMetrics
+from trilat_net.analysis.metrics.measures import Quantity
 from trilat_net.log.log_reader import Log
 
 GOLDEN = sorted((Path(__file__).parents[2] / "golden").glob("v*.mcap"))
@@ -35,7 +36,7 @@ def check_facts(log: Log) -> dict[str, Any]:
     assert set(facts["sites"]) == set(log.sites)
     assert len(facts["links"]) == len(log.sites) * (len(log.sites) - 1)
     unknown = facts["unknown"]
-    for quantity in LogMetrics.list_quantities():
+    for quantity in Quantity.list_all():
         kind = "run" if quantity.of == "run" else f"{quantity.of}s"
         places = {"run": facts["run"]} if kind == "run" else facts[kind]
         for name, values in places.items():
@@ -138,7 +139,7 @@ def test_the_docs_have_a_line_for_every_quantity() -> None:
     table = Path(__file__).parents[3] / "docs" / "data" / "metrics.csv"
     with table.open(encoding="utf-8", newline="") as file:
         keys = [key for row in csv.DictReader(file) for key in row["keys"].split(", ")]
-    assert sorted(keys) == sorted(quantity.key for quantity in LogMetrics.list_quantities())
+    assert sorted(keys) == sorted(quantity.key for quantity in Quantity.list_all())
 
 
 def test_a_row_is_the_largest_or_the_sum() -> None:

@@ -33,7 +33,7 @@ _REFUTING_FINDINGS = (ObservedFinding.NEGATIVE, ObservedFinding.BROKEN)
 
 @dataclass(frozen=True, repr=False)
 class Certificate(Result):
-    """Judgement whether a recorded run was stable, with every reason. `certify` creates it.
+    """Judgement whether a recorded run was stable, with every reason. `certify_log` creates it.
 
     A certificate combines several kinds of evidence: the energy function V of the stability
     proof, the end of the motion, the roots of the linearised loop, and repeated runs with a

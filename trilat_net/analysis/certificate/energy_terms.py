@@ -557,14 +557,12 @@ class SiteMotion:
         - damping: the work of the damping and of the robust torque, which both act against the
           filtered error r.
         - disagreement: half the squared difference between the velocity of the site and the
-        delayed
-          velocity of each peer, weighted with the dominance factor of the peer and the gain Kd.
+          delayed velocity of each peer, weighted with the dominance factor of the peer and the
+          gain Kd.
         - friction, if the joints have any: the work r'(friction(qd) - friction(qd - r)), with
-        the
-          joint velocities qd.
+          the joint velocities qd.
         - open axes: the energy that the site gives to others along the axes of space that not
-        all
-          sites follow. It is missing if all sites follow along all axes.
+          all sites follow. It is missing if all sites follow along all axes.
 
         Returns:
             The energies, by kind.
@@ -793,8 +791,7 @@ class SiteMotion:
         With the filtered error r, the work has two parts:
 
         - Torque: the integral of r'(u - tau). The torque u is constant within a period, while
-        the
-          torque tau of the continuous law changes linearly until the end of the period.
+          the torque tau of the continuous law changes linearly until the end of the period.
         - Parameter estimates: their recorded step, compared with the trapezoid rule for the
           adaptive law.
 
@@ -898,8 +895,8 @@ class Increment(NamedTuple):
         """Change of the energy in each tick period, in J, as the sum of the three parts.
 
         The parts are the contribution of the power at the start of the period, the contribution
-        at its end, and the jump at the end. K ticks bound K - 1 periods, so the shape is (K -
-        1,).
+        at its end, and the jump at the end. The shape is (K - 1,), because K ticks bound K - 1
+        periods.
         """
         return self.left + self.right + self.jump
 

@@ -456,52 +456,6 @@ def _read_peer_records(
     return PeerRecords(tick, received, sent_to_peer)
 
 
-def _find_curves(log: Log, accounts: Mapping[str, _SiteBooks]) -> Iterator[_EnergyCurve]:
-    """Yields the energies over time that a passive control law never lets fall below zero.
-
-    These energies are the energy in transit between two arms (line), the part of it that the
-    receiver knows, the stored energy, and the energy that a law dissipated.
-
-    Args:
-        log: The log of the run.
-        accounts: Energies of every site's law.
-    """
-    for site, account in accounts.items():
-        declared = account.declared
-        energies: list[tuple[_EnergyKind, str, Array]] = []
-        if declared.store is not None:
-            energies.append(("store", "", declared.store))
-        for j, peer in enumerate(log[site].peers):
-            peer_account = accounts[peer]
-            index_at_peer = log[peer].peers.index(site)
-            sent_j = peer_account.declared.gave[index_at_peer]
-            # the peer's last tick at each tick of this site
-            next_row = np.searchsorted(peer_account.t_s, account.t_s + 1e-9, side="right")
-            line_j = sent_j[next_row - 1] - declared.took[j]
-            energies.append(("line", peer, line_j))
-            if declared.observed:
-                energies.append(("known", peer, declared.observed[j]))
-
-        for kind, peer, energy in energies:
-            parts = energy.reshape(len(energy), -1)
-            yield _EnergyCurve(
-                kind=kind,
-                site=site,
-                peer=peer,
-                t_s=account.t_s,
-                energy_j=_add_parts(energy),
-                least_j=parts.min(axis=1),
-            )
-        yield _EnergyCurve(
-            kind="taken",
-            site=site,
-            peer="",
-            t_s=account.t_s,
-            energy_j=account.taken,
-            least_j=account.taken - np.maximum.accumulate(account.taken),
-        )
-
-
 def _judge_books(log: Log, accounts: Mapping[str, _SiteBooks]) -> ObservedEnergy:
     """Judges whether the energies that laws declare are contradictory, negative or passive.
 
@@ -558,6 +512,52 @@ def _judge_books(log: Log, accounts: Mapping[str, _SiteBooks]) -> ObservedEnergy
         sampling_j=max(float(account.leak.max()) for account in accounts.values()),
         curves=curves,
     )
+
+
+def _find_curves(log: Log, accounts: Mapping[str, _SiteBooks]) -> Iterator[_EnergyCurve]:
+    """Yields the energies over time that a passive control law never lets fall below zero.
+
+    These energies are the energy in transit between two arms (line), the part of it that the
+    receiver knows, the stored energy, and the energy that a law dissipated.
+
+    Args:
+        log: The log of the run.
+        accounts: Energies of every site's law.
+    """
+    for site, account in accounts.items():
+        declared = account.declared
+        energies: list[tuple[_EnergyKind, str, Array]] = []
+        if declared.store is not None:
+            energies.append(("store", "", declared.store))
+        for j, peer in enumerate(log[site].peers):
+            peer_account = accounts[peer]
+            index_at_peer = log[peer].peers.index(site)
+            sent_j = peer_account.declared.gave[index_at_peer]
+            # the peer's last tick at each tick of this site
+            next_row = np.searchsorted(peer_account.t_s, account.t_s + 1e-9, side="right")
+            line_j = sent_j[next_row - 1] - declared.took[j]
+            energies.append(("line", peer, line_j))
+            if declared.observed:
+                energies.append(("known", peer, declared.observed[j]))
+
+        for kind, peer, energy in energies:
+            parts = energy.reshape(len(energy), -1)
+            yield _EnergyCurve(
+                kind=kind,
+                site=site,
+                peer=peer,
+                t_s=account.t_s,
+                energy_j=_add_parts(energy),
+                least_j=parts.min(axis=1),
+            )
+        yield _EnergyCurve(
+            kind="taken",
+            site=site,
+            peer="",
+            t_s=account.t_s,
+            energy_j=account.taken,
+            least_j=account.taken - np.maximum.accumulate(account.taken),
+        )
 
 
 def _largest_residual_j(account: _SiteBooks) -> float:

@@ -143,14 +143,6 @@ class LogMetrics(Result):
             joint_names=_find_common_joint_names(scenario),
         )
 
-    @staticmethod
-    def list_quantities() -> list[Quantity]:
-        """Returns name, unit and meaning of all metrics of a run, such as the largest error.
-
-        Tables and docs/reference/metrics.md list them in this order.
-        """
-        return [quantity for measure in Measure.list_all() for quantity in measure.quantities]
-
     @classmethod
     def find_quantity(cls, key: str) -> Quantity:
         """Returns name, unit and meaning of the metric with a key such as "rms_error_rad".
@@ -161,7 +153,7 @@ class LogMetrics(Result):
         Raises:
             KeyError: No metric has this key. The message names the most similar key.
         """
-        known = {quantity.key: quantity for quantity in cls.list_quantities()}
+        known = {quantity.key: quantity for quantity in Quantity.list_all()}
         if key not in known:
             nearest = suggest_nearest(key, list(known))
             raise KeyError(
@@ -318,7 +310,7 @@ class LogMetrics(Result):
 
     def _list_values(self) -> Iterator[tuple[dict[str, str], Metric]]:
         """Yields each metric with a description of its quantity and its subject."""
-        for quantity in self.list_quantities():
+        for quantity in Quantity.list_all():
             values_by_subject = self.values_of(quantity)
             for subject, metric in values_by_subject.items():
                 description = {

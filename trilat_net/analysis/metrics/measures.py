@@ -81,8 +81,7 @@ def unavailable(
     """
     return {
         quantity.key: Metric(None, why, applies)
-        for measure in Measure.list_all()
-        for quantity in measure.quantities
+        for quantity in Quantity.list_all()
         if quantity.group == group and of in ("", quantity.of)
     }
 
@@ -185,6 +184,14 @@ class Quantity(NamedTuple):
     reduction: str = "max"
     of: str = ""
     group: str = ""
+
+    @staticmethod
+    def list_all() -> list["Quantity"]:
+        """Returns name, unit and meaning of all metrics of a run, such as the largest error.
+
+        Tables and docs/reference/metrics.md list them in this order.
+        """
+        return [quantity for measure in Measure.list_all() for quantity in measure.quantities]
 
     @classmethod
     def list_shared(cls, names: Mapping[str, str]) -> list["Quantity"]:

@@ -583,8 +583,8 @@ def _find_holding_stiffness(scenario: Scenario, site: str) -> tuple[Array, str]:
         site: Name of the site, the process that controls the arm.
 
     Returns:
-        The stiffness, shape (n,), in N m/rad. NaN along axes that the site does not follow. The
-        reason why the stiffness is unknown, empty if the stiffness is known.
+        The stiffness, shape (n,), in N m/rad. NaN along axes that the site does not follow.
+        The reason why the stiffness is unknown, empty if the stiffness is known.
     """
     spec = scenario.sites[site]
     arm = build_arm_rows(scenario, site)

@@ -235,8 +235,8 @@ class Pencil(NamedTuple):
             wanted: Number of roots. A conjugate pair counts once.
 
         Returns:
-            The `wanted` rightmost roots, or fewer if the loop does not have so many. The number
-            of guesses from which no root was reached.
+            The `wanted` rightmost roots, or fewer if the loop does not have so many.
+            The number of guesses from which no root was reached.
         """
         roots: list[CharacteristicRoot] = []
         dropped = 0
@@ -535,7 +535,8 @@ def _count_zero_roots(pencil: Pencil) -> tuple[int, int]:
         pencil: Matrices of the loop.
 
     Returns:
-        The number of roots at zero. The number of those roots that drift.
+        The number of roots at zero.
+        The number of those roots that drift.
     """
     counts = [0]
     for length in range(1, _LONGEST_CHAIN + 1):

@@ -8,8 +8,8 @@ unit and w an angular frequency, if
     det(I - exp(-j w T) G(j w)) = 0.
 
 G(j w) consists of those rows of (j w I - A)^-1 A_d that belong to the delayed components. Such
-a root exists if and only if G(j w) has an eigenvalue of modulus 1 whose phase is w T modulo 2
-pi. If T increases, a pair of roots moves into the unstable half plane if the modulus of this
+a root exists if and only if G(j w) has an eigenvalue of modulus 1 whose phase is w T modulo
+2 pi. If T increases, a pair of roots moves into the unstable half plane if the modulus of this
 eigenvalue falls with w, and out of it if the modulus rises. The crossings are counted upwards
 from a small delay, which gives the number of unstable roots for every delay.
 

@@ -681,9 +681,9 @@ class _SpanMap:
             sizes: List to which the norm of each column after each part is appended.
 
         Returns:
-            The motions at the end of the span, shape (size, columns). For each site i, its n_i
-            states at the start of the span and at every tick after it, shape (ticks + 1, n_i,
-            columns).
+            The motions at the end of the span, shape (size, columns).
+            For each site i, its n_i states at the start of the span and at every tick after it,
+            shape (ticks + 1, n_i, columns).
         """
         tracks = self._build_tracks(V)
         for n, part in enumerate(self._parts):

@@ -518,8 +518,8 @@ def _find_mean_equilibrium(scenario: Scenario) -> tuple[Equilibrium, str]:
         scenario: The experiment.
 
     Returns:
-        The equilibrium. A remark on the assumption. Empty if the pose of rest depends on the
-        arms alone.
+        The equilibrium.
+        A remark on the assumption. Empty if the pose of rest depends on the arms alone.
     """
     mean = find_equilibrium(scenario, find_mean_pose(scenario))
     rest = follow_equilibrium(scenario, mean)

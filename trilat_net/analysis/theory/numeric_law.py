@@ -202,8 +202,9 @@ class NumericLaw:
 
         Returns:
             The torque of the n joints, shape (n, ...), in N m. For a complex x, the imaginary
-            part of each column is the small change of the torque. The rate of change of the
-            law's memory, shape (memory, ...), in 1/s, in the same form.
+            part of each column is the small change of the torque.
+            The rate of change of the law's memory, shape (memory, ...), in 1/s, in the same
+            form.
         """
         if not np.iscomplexobj(x):
             return self._evaluate_rates(x)

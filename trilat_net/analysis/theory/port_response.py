@@ -601,8 +601,8 @@ class Transparency(NamedTuple):
         """Computes what an operator feels of another arm that is free, and that is clamped.
 
         With ideal transparency the operator would feel nothing while the other arm is free, and
-        a rigid arm while it is clamped. The impedance along each joint i is Z(j w) = 1 / Y_ii(j
-        w) with the admittance Y of the loop. All other ports are free.
+        a rigid arm while it is clamped. The impedance along each joint i is
+        Z(j w) = 1 / Y_ii(j w) with the admittance Y of the loop. All other ports are free.
 
         Args:
             loop: The loop.

@@ -2,10 +2,10 @@
 
 The linear analysis needs the derivatives of the rates of change with respect to the state: the
 joint angles, the joint velocities, and the parameter estimates of the control law. The
-derivatives are computed with a complex step: the derivative of a function f at x is Im f(x + i
-h) / h, where i is the imaginary unit and h = 1e-30. The formula contains no subtraction.
-Therefore the result is exact to rounding (Squire and Trapp, "Using complex variables to
-estimate derivatives of real functions", SIAM Review 40, 1998).
+derivatives are computed with a complex step: the derivative of a function f at x is
+Im f(x + i h) / h, where i is the imaginary unit and h = 1e-30. The formula contains no
+subtraction. Therefore the result is exact to rounding (Squire and Trapp, "Using complex
+variables to estimate derivatives of real functions", SIAM Review 40, 1998).
 
 Invariant:
     - All arithmetic is plain NumPy on `textbook_arm`, without the compiled simulation kernel,

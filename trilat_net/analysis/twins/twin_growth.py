@@ -29,7 +29,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ...core import BUCKETS_PER_S, Array, DelayKind, TorqueKind
+from ...core import BUCKETS_PER_S, Array, DelayKind
 from ...errors import NotRepeatable, UsageError
 from ...execution import (
     LEAST_PUSH,
@@ -46,6 +46,7 @@ from ...results import Result, finite_or_none
 from ...scenario import Scenario
 from ..delay_period import find_burst_interval_s, find_final_delay_period, find_final_link
 from ..run_end import RunEnd, find_coupled_sites
+from ..torque_sources import VirtualWall
 from .envelope_trend import EnvelopeFit, EnvelopeTrend, fit_envelopes
 
 LEAST_LEFT_S = 5.0
@@ -425,9 +426,8 @@ class TwinGrowth(NamedTuple):
         t_s = twins.paths[0].t_s
         has_motion = twins.speed.any(axis=1) | np.isfinite(twins.paths[0].largest).any(axis=1)
         rows = np.flatnonzero(has_motion)
-        end = (
-            int(rows[-1]) if len(rows) else 0
-        )  # without the last interval, which may be one tick
+        # The last interval is left out, because it may be a single tick.
+        end = int(rows[-1]) if len(rows) else 0
         period_s = _find_varying_period_s(scenario)
         counts_from_s = _fit_to_period(counts_from_s, float(t_s[end]), period_s)
         first = min(int(np.searchsorted(t_s, counts_from_s)), end)
@@ -907,10 +907,10 @@ def twin(
     Args:
         log: The log, or its path.
         at_s: Time of the pushes, in s.
-        push: Sizes by target, with one twin per push. A target is a joint's angle, `{"m1.q1":
-            1e-6}`, a joint's speed, `m1.qd1`, an estimate, `m1.theta1`, or several quantities
-            in a random direction, `m1.q` or `q`. By default the pushes are those of `certify`.
-            If they are made at 0 s, their growth is judged as in `certify`.
+        push: Sizes by target, as in `{"m1.q1": 1e-6}`, with one twin per push. A target is a
+            joint's angle, `m1.q1`, a joint's speed, `m1.qd1`, an estimate, `m1.theta1`, or
+            several quantities in a random direction, `m1.q` or `q`. By default the pushes are
+            those of `certify`. If they are made at 0 s, their growth is judged as in `certify`.
         delta: Sizes of a single push, as in "1e-9:1e-3", with one twin per decade.
 
     Raises:
@@ -1043,8 +1043,4 @@ def _find_linear_sizes(
 
 def _has_wall(scenario: Scenario) -> bool:
     """Returns True if some site has a wall, because contact makes the run nonlinear."""
-    for site in scenario.sites.values():
-        for environment in site.environment:
-            if environment.actor.kind == TorqueKind.WALL:
-                return True
-    return False
+    return any(map(VirtualWall.list_of_site, scenario.sites.values()))

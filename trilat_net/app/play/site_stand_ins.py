@@ -358,7 +358,7 @@ class SiteStandIns:
         return self._boots.get(site, first_start)
 
     def _find_boot(self, site: str) -> int:
-        """Sends messages that a recorder has missed again, in the name of the original site.
+        """Returns the boot, the random number of a start, of the start that is being played.
 
         Recorders accept only replies of that start.
         """

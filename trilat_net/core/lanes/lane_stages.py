@@ -66,7 +66,7 @@ def _no_torque(
     _table: TorqueTable,
     _sampled: int,
 ) -> SourceTorque:
-    """Returns no torque. This is the version of `torque_on_arm` for an arm without contacts."""
+    """Returns no torque: `torque_on_arm` of an arm without operators and environments."""
     return NO_TORQUE
 
 

@@ -133,7 +133,7 @@ class HandRules(NamedTuple):
     reach: "HandReach" = HandReach()
 
     def start(self) -> "HandStep":
-        """Returns the state in which nobody has moved the arm yet."""
+        """Returns the state and the action while nobody has moved the arm yet."""
         return HandStep(HandMemory(), empty_hand_vector(self.size))
 
     def advance(

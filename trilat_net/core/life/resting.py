@@ -22,9 +22,10 @@ terms are added:
 
 - B is the damping in N m s/rad, and k = 1 / (4 `RestGains.time_s`). Lambda is the convergence
   rate, in 1/s: the rate of the adaptive law in joint space, otherwise `REST_RATE_1_S`.
-- w carries a constant load, for example unknown gravity. It starts as the part of the last
-  torque that does not come from the law, times 1 - max B |qd| / tau_limit. While the arm
-  brakes, w loses B |qd| in each period in which it acts in the direction of motion.
+- w carries a constant load, for example unknown gravity. It starts as the difference between
+  the last torque and the torque of the law for the rest reference, times
+  1 - max B |qd| / tau_limit. While the arm brakes, w loses B |qd| in each period in which it
+  acts in the direction of motion.
 
 An arm is fast while B |qd| of some joint exceeds its torque limit `tau_limit`. The limit on the
 rate of the torque does not delay braking: against the motion, the torque may change by B |qd|
@@ -347,9 +348,10 @@ def add_rest_torque(k: int, t_ns: int, site: SiteRow) -> None:
 
     The integral term w, in N m, carries a constant load, for example unknown gravity:
 
-    - At the start of the rest, it is the part of the previous torque that does not come from
-      the control law. The faster the arm moves, the more this part is reduced. It is zero in
-      the first tick of a run, which has no previous torque.
+    - At the start of the rest, it is the difference between the previous torque and the torque
+      that the law computes for the rest reference. The faster the arm moves, the more this
+      difference is reduced. It is zero in the first tick of a run, which has no previous
+      torque.
     - While the arm brakes, w may act in the direction of motion and so delay the stop. Then its
       magnitude is reduced by B |qd| in each tick, at most to zero. qd is the joint velocity.
     - After this tick, `advance_rest` integrates it.
@@ -362,8 +364,8 @@ def add_rest_torque(k: int, t_ns: int, site: SiteRow) -> None:
     """
     starts_to_rest = t_ns == site.return_from_ns
     brakes = _brakes(t_ns, site)
-    # Factor for the part of the torque that does not come from the law: smaller for a faster
-    # arm.
+    # Factor for the difference between the previous torque and that of the law: smaller for a
+    # faster arm.
     unexplained_factor = 0.0
     if k > site.first:
         unexplained_factor = max(0.0, 1.0 - _find_brake_ratio(site))

@@ -300,7 +300,8 @@ def accept_sample(
         if model.kind != _MEASURED:  # on a measured link every sample is due before it arrives
             row.late += 1
         release = k
-    # The calendar has room for all stamps within this range, see `CalendarSizer`.
+    # The driver has enlarged the calendar as far as `CalendarSizer` permits. A sample for which
+    # there is still no room is rejected.
     if release - k >= calendar.shape[0]:
         row.refused += 1
         return

@@ -204,10 +204,10 @@ class CompiledRun:
             mask.
         """
         site_count = len(self.layouts)
-        fastest_hz = int(self._progress["rate_hz"].max())
+        fastest_hz = max(self.rates_hz)
         # Ticks of the fastest site until the latest sample arrives, with a margin for rounding.
         late_ticks = self._inputs.late_ns * fastest_hz // NS_PER_S + 2
-        slowest_hz = int(self._progress["rate_hz"].min())
+        slowest_hz = min(self.rates_hz)
         ticks_per_slow_tick = math.ceil(fastest_hz / slowest_hz)
         # The last tick of a slow site may be planned half of its period late, see `advance_to`.
         needed = max(2 * ticks_per_slow_tick + 1, keep, late_ticks)
@@ -299,10 +299,9 @@ class CompiledRun:
             LawFailed: A user's control law failed.
         """
         self._update_links()
-        rates_hz = [int(progress["rate_hz"]) for progress in self._progress]
         while self._changes and self.diverged_s is None:
             tick, i, change = self._changes[0]
-            t_ns = tick_ns(tick, rates_hz[i])
+            t_ns = tick_ns(tick, self.rates_hz[i])
             if t_ns > last_ns:
                 break
             self._step_until(t_ns - 1)
@@ -372,7 +371,7 @@ class CompiledRun:
         has_finished = self._progress[i]["t_ns"] == NEVER_NS
         if has_finished:
             return NEVER_NS
-        return tick_ns(next_tick + 1, int(self._progress[i]["rate_hz"]))
+        return tick_ns(next_tick + 1, self.rates_hz[i])
 
     def _request_actions(self, i: int) -> int:
         """Requests the next actions of an operator, if the previous actions were executed.
@@ -396,7 +395,7 @@ class CompiledRun:
             actions = self._hands[i].compute_actions(k, end, self.arrays(i))
             self._inputs.write_actions(i, k, actions)
             self._action_ends[i] = k + len(actions)
-        return tick_ns(self._action_ends[i], int(progress["rate_hz"]))
+        return tick_ns(self._action_ends[i], self.rates_hz[i])
 
     def _step_piece(self, last_ns: int) -> None:
         """Executes the planned ticks up to a time for which no user's program is needed.
@@ -493,8 +492,7 @@ class CompiledRun:
         """
         if until_s <= self.ran_s or self.diverged_s is not None:
             return
-        rates_hz = self._progress["rate_hz"].tolist()
-        self.plan([max(1, round(until_s * rate_hz)) for rate_hz in rates_hz])
+        self.plan([max(1, round(until_s * rate_hz)) for rate_hz in self.rates_hz])
         self.step_to(round(until_s * NS_PER_S))
         self.ran_s = until_s if self.diverged_s is None else self.diverged_s
 
@@ -802,7 +800,7 @@ class CompiledRun:
         Up to this time, no site (arm controller) produces more records than the run stores, see
         `keep` of the constructor. The result is at most the duration of the scenario.
         """
-        fastest_hz = int(self._progress["rate_hz"].max())
+        fastest_hz = max(self.rates_hz)
         return min(self.ran_s + (self._keep - 1) / fastest_hz, self.duration_s)
 
     def iterate_batches(self) -> Iterator[list[tuple[IntArray, Array]]]:

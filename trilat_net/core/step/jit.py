@@ -730,8 +730,9 @@ class _Leaf(CPUDispatcher):
         The code is loaded from the cache on disk if the cache contains it. Otherwise the
         function is compiled, and its code is stored.
         """
-        # A leaf for several runs side by side (lanes) is compiled into one larger function for
-        # each structure of runs. Its own code is not stored, because it would never be loaded.
+        # The code of a leaf for several runs side by side (lanes) is not stored. It contains
+        # the functions that `set_lane_form` chose for one structure of runs. The types of the
+        # arguments do not show this structure.
         is_stored = not any(map(_is_in_lanes, argument_types))
         if is_stored:
             loaded = self._cache.load_inner(argument_types, self.targetctx)

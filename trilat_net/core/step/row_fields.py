@@ -93,7 +93,7 @@ class SiteRow(Protocol):
         Field(
             "",
             "LifeReason",
-            "DROPPED or RESTORED after such a change in this tick",
+            "DROPPED or RESTORED after such a change in this tick, else 0",
             "3 reference",
         ),
     ]
@@ -330,7 +330,8 @@ class LinkRow(Protocol):
     memory: Annotated[float, Field("", "", "last number of the AR(1) delay", "2 release")]
     accepted: Annotated[int, Field("", "samples", "samples that arrived", "1 accept")]
     late: Annotated[
-        int, Field("", "samples", "samples that arrived after they were due", "1 accept")
+        int,
+        Field("", "samples", "samples that arrived after their tick of release", "1 accept"),
     ]
     duplicate: Annotated[
         int, Field("", "samples", "samples that had arrived before", "1 accept")

@@ -21,12 +21,10 @@ _TARGET_COLUMN = 3
 class RunInputs(NamedTuple):
     """All external inputs of a recorded run, with which the run can be repeated.
 
-    N is the number of sites (processes that run one arm), and P the largest number of peers
-    (other sites) from which a site receives samples (sent states).
-
     Attributes:
         feed: Ticks (control periods) in which samples of other sites arrived, and actions of
-            live operators (persons or programs that move an arm during the run).
+            live operators (persons or programs that move an arm during the run). A site is a
+            process that runs one arm, and a sample is a state that a site sends.
         changes: Changes of links or sites during the run, in order of time. Each entry contains
             the tick before which the site applies the change, the index of the site, and the
             change.

@@ -23,7 +23,6 @@ from typing import NamedTuple
 import numpy as np
 
 from ...errors import LawFailed
-from ..arms.exogenous import LIVE_KINDS
 from ..life.live_hand import HandInForce, empty_hand_vector
 from ..links.channel import LOST
 from ..links.delay import DelayKind
@@ -140,9 +139,9 @@ class Site:
         sent_first = self.layout.floats - self.layout.sent
         self._sent = self._buffers.record[sent_first:]
         self._plug_law(setup)
-        live = [n for n, actor in enumerate(setup.actors) if actor.kind in LIVE_KINDS]
-        self._hand_index = live[0] if live else -1
-        self._hand = self._find_hand(live[0]) if live else None
+        self._hand_index = setup.live_actor
+        has_hand = self._hand_index >= 0
+        self._hand = self._find_hand(self._hand_index) if has_hand else None
         received_counts = [link.channel.received_size for link in setup.links]
         reads_numbers = self._user_law is not None and any(received_counts)
         self._received_counts = received_counts if reads_numbers else None

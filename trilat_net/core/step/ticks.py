@@ -410,7 +410,7 @@ def describe_mode(
         output: Record of the first tick (period of the control loop) in the mode.
         glides: True if the site is under the rule `glide`, by which an arm comes to rest while
             a peer is silent. Its record then contains the reason for the mode. Without this
-            rule, the mode can only change because of a stale peer.
+            rule, the mode can only change because of a stale peer or because the arm diverged.
         law_failure: Error with which the user's control law failed last, or None. It is given
             as the reason if the mode is due to this failure. It is only used under the rule
             `glide`.

@@ -14,9 +14,10 @@ Invariant:
 """
 
 from collections.abc import Callable, Iterable, Sequence
+from typing import TYPE_CHECKING
 
 from ...core import POSE, POSITION
-from ...log import Log, QuaternionSigns
+from ...log import QuaternionSigns
 from ...net import LinkStats, State
 from ...scenario import Scenario
 from . import cdr
@@ -30,6 +31,9 @@ from .ros2_messages import (
     stack_signals,
 )
 from .topic_names import DIAGNOSTICS, FRAMES_TOPIC, NAMINGS, TopicTable, make_session_name
+
+if TYPE_CHECKING:
+    from ...log import Log
 
 Topics = dict[str, Ros2Channel]
 """Topics by name: by the name within trilat-net for one site, by the full name for a session.
@@ -57,7 +61,7 @@ COMMON_TOPICS = {
     FRAMES_TOPIC: Ros2Channel(cdr.TRANSFORMS, _FRAMES_METADATA),
     DIAGNOSTICS: Ros2Channel(cdr.DIAGNOSTICS, _DIAGNOSTICS_METADATA),
 }
-"""Topics that all sessions have in common, by their full names."""
+"""Topics that all sessions have in common, by their names without the leading "/"."""
 
 
 def list_topics(scenario: Scenario, session: str, table: TopicTable) -> Topics:
@@ -82,7 +86,7 @@ def list_topics(scenario: Scenario, session: str, table: TopicTable) -> Topics:
     return topics
 
 
-def list_log_topics(log: Log) -> Topics:
+def list_log_topics(log: "Log") -> Topics:
     """Lists the ROS 2 topics under which a bridge would publish the session of a log live.
 
     Files for viewers then work for the log and for the live session. The names follow the first

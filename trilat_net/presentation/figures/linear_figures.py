@@ -122,7 +122,7 @@ def _plot_impedance(ports: PortAnalysis, joint: int, magnitude: Axes, phase: Axe
 
     Args:
         ports: Analysis of the ports, the places at which operators hold the arms.
-        joint: Index of the joint or axis.
+        joint: Number of the joint or axis, from 1.
         magnitude: Panel of the magnitude.
         phase: Panel of the phase.
     """

@@ -522,9 +522,9 @@ class Experiment(Result):
             if entry is None:
                 continue
             if not path.exists():
-                yield f"{path}: is missing"
+                yield f"{path} is missing"
             elif digest_file(path) != entry.sha256:
-                yield f"{path}: is not the log that the trial wrote"
+                yield f"{path} is not the log that the trial wrote"
 
 
 _SHOWN_MEASURES = ("error_end_mm", "error_rms_mm", "path_m", "sparc")

@@ -45,7 +45,7 @@ FAREWELL_NS = NS_PER_S
 During this time, every page is told that the experiment has ended.
 """
 EARLY_FAILURE_NS = 60 * NS_PER_S
-"""A session that fails to begin within this time would fail again, in ns."""
+"""A session that fails within this time, before it begins, would fail again. In ns."""
 
 SessionRunner = Callable[[TrialWatch, Path, Callable[[], bool]], SessionResult]
 """Function that runs the session of a trial until the trial is over or people end it.

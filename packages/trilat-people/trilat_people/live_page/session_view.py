@@ -416,7 +416,7 @@ class SessionView:
 
     @property
     def complete_ticks(self) -> dict[str, int]:
-        """For every site, the last tick up to which no record is missing.
+        """For every site, the last tick up to which all records have arrived or are lost.
 
         A tick is a period of the control loop.
         """

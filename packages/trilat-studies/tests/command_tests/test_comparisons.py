@@ -10,8 +10,7 @@ from study_builders import TRIO
 import trilat_net as tn
 from tests.cli.running import trilat
 from tests.json_outline import is_documented
-from trilat_net.analysis.metrics.log_metrics import LogMetrics
-from trilat_net.analysis.metrics.measures import Metric
+from trilat_net.analysis.metrics.measures import Metric, Quantity
 
 
 @pytest.fixture(scope="module")
@@ -177,8 +176,8 @@ def test_metrics_of_every_unit_are_ranked() -> None:
     """The short text of any two values of any metric has a conclusion."""
     log = tn.simulate("two_sites", duration_s=0.2)
     comparison = tn.compare(log, log)
-    assert {"J", "rad", "N m"} < {quantity.unit for quantity in LogMetrics.list_quantities()}
-    for quantity in LogMetrics.list_quantities():
+    assert {"J", "rad", "N m"} < {quantity.unit for quantity in Quantity.list_all()}
+    for quantity in Quantity.list_all():
         row = comparison.metrics.rows[0]._replace(
             quantity=quantity, entries=(Metric(0.0), Metric(1e6))
         )

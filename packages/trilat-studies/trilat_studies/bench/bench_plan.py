@@ -1023,8 +1023,8 @@ def _analyse_link(link: str) -> tuple[bool, float]:
         link: A key of `LINKS`.
 
     Returns:
-        True if the delays or losses of the link are random; and the mean one-way delay of the
-        link, in ms.
+        True if the delays or losses of the link are random.
+        The mean one-way delay of the link, in ms.
     """
     settings = format_settings({"link": dict(LINKS[link])})
     scenario = TuningScenario.load(BASES["two"], settings).scenario

@@ -135,7 +135,7 @@ class BenchRunItem(NamedTuple):
     def run(self) -> BenchRun:
         """Simulates a run of the benchmark, judges its stability, and measures its performance.
 
-        The function depends only on its argument, so any worker process can call it.
+        The method depends only on this object, so any worker process can call it.
 
         Returns:
             The finished run, ready for the journal. It has the judgement of its stability and

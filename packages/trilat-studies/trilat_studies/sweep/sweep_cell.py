@@ -180,7 +180,7 @@ class CellResult(msgspec.Struct, frozen=True):
 
     @property
     def is_conclusive(self) -> bool:
-        """Returns True if a longer run would very probably end in the same way.
+        """True if a longer run would very probably end in the same way.
 
         This is the case if one of the following conditions is met:
 

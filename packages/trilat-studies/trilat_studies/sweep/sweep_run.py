@@ -35,7 +35,7 @@ from trilat_net.errors import (
     count_nouns,
     format_wall_time,
 )
-from trilat_net.execution import simulate_scenario
+from trilat_net.execution import FusedRun, simulate_scenario
 from trilat_net.files import make_results_folder, write_whole
 from trilat_net.net import SystemClock
 from trilat_net.own_code import list_imported_code
@@ -389,11 +389,10 @@ class CellItem(NamedTuple):
     def run(self) -> CellRun:
         """Executes one run of a sweep.
 
-        The function depends only on its argument, so any worker process can call it.
+        The method depends only on this object, so any worker process can call it.
 
         Returns:
             The finished run with its result, ready for the journal of the sweep.
-
         """
         try:
             scenario = _build_scenario(self)
@@ -543,7 +542,6 @@ def _prepare_lanes(plan: SweepPlan, runs: int) -> bool:
         return False
     # A sweep of single runs must not load the code of lanes.
     from trilat_net.core import prepare_lanes
-    from trilat_net.execution import FusedRun
 
     try:
         scenario = _build_scenario(CellItem(plan, plan.cell(0), plan.seeds[0]))

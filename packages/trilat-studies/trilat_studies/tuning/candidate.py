@@ -896,7 +896,7 @@ class CandidateItem(NamedTuple):
     def measure(self) -> "_MeasuredCandidate":
         """Runs a candidate, a law with chosen gains, with all of its seeds.
 
-        The function depends only on its argument, so any worker process can call it.
+        The method depends only on this object, so any worker process can call it.
         """
         scores = [CandidateScore.measure(text, twin_text) for text, twin_text in self.runs]
         return _MeasuredCandidate(CandidateScore.average(scores))

@@ -458,9 +458,8 @@ class TuningPlan(NamedTuple):
         scenario = self.base.scenario
         probe_s = min(scenario.duration_s, _PROBE_S)
         probe = msgspec.structs.replace(scenario, duration_s=probe_s).text
-        CandidateScore.measure(
-            probe, None
-        )  # loads the compiled kernel, so that it is not timed
+        # The first run loads the compiled kernel, so that the loading is not timed.
+        CandidateScore.measure(probe, None)
         clock = SystemClock()
         start_ns = clock.monotonic_ns()
         CandidateScore.measure(probe, None)
