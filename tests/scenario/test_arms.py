@@ -19,7 +19,6 @@ from trilat_net.execution.verification import verify_log
 from trilat_net.scenario import load_scenario, parse_embedded
 from trilat_net.scenario.describe import list_arm_notes
 from trilat_net.scenario.named_files import SHIPPED_FOLDER
-from trilat_net.scenario.scenario_reader import reseed_scenario
 from trilat_net.scenario.simulated_arm import SimulatedArm
 from trilat_net.scenario.urdf import MAX_CHARACTERS, read_urdf
 
@@ -128,10 +127,10 @@ def test_one_number_applies_to_every_joint() -> None:
     assert len(inertias) == 12
     assert all(0.1 <= inertia <= 0.2 for inertia in inertias)
     assert drawn.arms["m1"].theta[50] != drawn.arms["s"].theta[50]  # mass of the last link
-    again = reseed_scenario(drawn, 2)
+    again = load_scenario(drawn, seed=2)
     assert again.sites["s"].arm.payload_kg != drawn.sites["s"].arm.payload_kg
     assert not inertias & {*again.sites["s"].arm.armature_kg_m2}
-    assert reseed_scenario(again, 1) == drawn
+    assert load_scenario(again, seed=1) == drawn
 
 
 def test_drawn_start_poses_move_tip_operators() -> None:
@@ -139,7 +138,7 @@ def test_drawn_start_poses_move_tip_operators() -> None:
     drawn = make_six_joint_scenario(
         **{"sites.m1.q0_rad": start, "sites.m1.hands": [TIP_SPRING]}
     )
-    again = reseed_scenario(drawn, 2)
+    again = load_scenario(drawn, seed=2)
     for scenario_drawn in (drawn, again):
         spec = scenario_drawn.sites["m1"]
         assert list(spec.hands[0].from_m) == scenario_drawn.arms["m1"].end_effector(spec.q0_rad)

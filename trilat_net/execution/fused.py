@@ -22,7 +22,6 @@ import numpy as np
 from ..core import MAX_ARRIVALS, CompiledRun, CoreChange, IntArray, RunInputs, first_ticks
 from ..errors import ScenarioError, count_nouns
 from ..log import Log
-from ..own_code import find_user_laws
 from ..records import NS_PER_S
 from ..scenario import (
     HandPlayer,
@@ -138,7 +137,7 @@ def explain_not_repeatable(log: Log, *, own_laws: bool = False) -> str:
     if scenario.external:
         arms = ", ".join(sorted(scenario.external))
         return f"the reaction of the external arm of {arms} is not known"
-    if find_user_laws(scenario) and not own_laws:
+    if scenario.find_user_laws() and not own_laws:
         return "the imported control laws may not run (permit them with --law FILE)"
     if set(log.executed_sites) != set(log.sites):
         return "in a rerun, the sites whose records were copied did not react"

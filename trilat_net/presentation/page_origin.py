@@ -15,9 +15,14 @@ from markupsafe import Markup
 
 from ..errors import count_nouns, join_words
 from ..log import Log, describe_unknown_ends
-from ..own_code import find_user_laws
 from ..results import JsonObject
-from ..scenario import Scenario, compare_scenarios, list_arm_notes, list_shipped, load_scenario
+from ..scenario import (
+    Scenario,
+    ScenarioDifference,
+    list_arm_notes,
+    list_shipped,
+    load_scenario,
+)
 from .html_templates import render_macro
 from .page_html import (
     render_code,
@@ -104,7 +109,7 @@ def describe_changes(scenario: Scenario) -> str:
     if shipped.title != scenario.title:
         return ""
 
-    all_differences = compare_scenarios([shipped, scenario])
+    all_differences = ScenarioDifference.list_between([shipped, scenario])
     differences = [entry for entry in all_differences if entry.key not in _STATED_KEYS]
     phrases = []
     for difference in differences[:_MAX_CHANGES]:
@@ -208,7 +213,7 @@ def _list_law_files(scenario: Scenario) -> list[str]:
     A log names the module of a law, such as "mine.laws", and not the folder of its file.
     """
     files = []
-    for law in find_user_laws(scenario):
+    for law in scenario.find_user_laws():
         module, _, _ = law.code.partition(":")
         files.append(f"{module.replace('.', '/')}.py")
     return list(dict.fromkeys(files))

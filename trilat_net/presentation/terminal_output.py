@@ -363,9 +363,7 @@ def warn_user_laws(log: "Log") -> None:
     Args:
         log: The log.
     """
-    from ..own_code import find_user_laws
-
-    for law in find_user_laws(log.scenario):
+    for law in log.scenario.find_user_laws():
         if law.allowed:
             print_note(f"executing this log runs code from outside: {law}")
         else:

@@ -24,10 +24,12 @@ from ..core import (
     Array,
     ChainJoint,
     DelayKind,
+    IntArray,
     link_key,
 )
 from ..errors import count_nouns
 from ..laws import ArmLoad, LawSettings, LawSituation, StabilityCondition
+from ..records import NS_PER_S
 from .arms import TASK_AXES, Arm
 from .delay_models import LinkBase
 from .operators.kernel_operators import (
@@ -39,7 +41,6 @@ from .operators.kernel_operators import (
     ViscousEnvironment,
 )
 from .rest_bounds import find_rest_bounds
-from .sample_uses import count_silences, draw_used_samples
 from .scenario_reader import load_scenario
 from .scenario_types import Scenario
 from .site_spec import SiteSpec
@@ -497,14 +498,13 @@ def _describe_silences(scenario: Scenario) -> list[str]:
             link = scenario.links[f"{peer}->{name}"]
             if link.measured or not scenario.dominance[name].get(peer):
                 continue
-            used = draw_used_samples(
-                link=link,
+            used = link.draw_used_samples(
                 key=link_key(scenario.seed, f"{peer}->{name}"),
                 receiver_hz=spec.rate_hz,
                 sender_hz=scenario.sites[peer].rate_hz,
                 duration_s=scenario.duration_s,
             )
-            count = count_silences(used, spec.rate_hz, spec.on_stale.rule.age_ns)
+            count = _count_silences(used, spec.rate_hz, spec.on_stale.rule.age_ns)
             if not count:
                 continue
             per_minute = 60.0 * count / scenario.duration_s
@@ -517,6 +517,26 @@ def _describe_silences(scenario: Scenario) -> list[str]:
                 f"not counted{advice}"
             )
     return lines
+
+
+def _count_silences(used: IntArray, receiver_hz: int, silence_ns: int) -> int:
+    """Counts how often an arm receives nothing new from another arm for longer than a limit.
+
+    The time before the first message does not count.
+
+    Args:
+        used: Number of the sample in use in every tick. -1 before the first sample.
+        receiver_hz: Tick rate of the site, in Hz.
+        silence_ns: Longest time without a new sample that is not counted as a silence, in ns.
+    """
+    new_sample_ticks = np.flatnonzero(np.diff(used, prepend=-1) > 0)
+    if not len(new_sample_ticks):
+        return 0
+    gap_ticks = np.diff(new_sample_ticks, append=len(used))
+    gaps_ns = gap_ticks * NS_PER_S // receiver_hz
+    # Without a silence, the distance between new samples is one period.
+    period_ns = NS_PER_S // receiver_hz
+    return int(np.count_nonzero(gaps_ns - period_ns > silence_ns))
 
 
 def _describe_stops(scenario: Scenario) -> list[str]:
@@ -585,6 +605,39 @@ class ScenarioDifference(NamedTuple):
     owners: tuple[str, ...]
     values: tuple[str, ...]
 
+    @classmethod
+    def list_between(cls, scenarios: Sequence[Scenario]) -> list["ScenarioDifference"]:
+        """Finds the settings in which several experiments differ.
+
+        Settings that only some of the experiments have are included.
+
+        Args:
+            scenarios: Descriptions of at least two experiments.
+
+        Returns:
+            One entry for each difference, in the order of the keys. Empty if the experiments
+            are equal.
+        """
+        differences: list[ScenarioDifference] = []
+        site_lists = [", ".join(scenario.names) for scenario in scenarios]
+        if len(set(site_lists)) > 1:
+            differences.append(cls("sites", (), tuple(site_lists)))
+        tables: list[dict[str, Any]] = [msgspec.to_builtins(scenario) for scenario in scenarios]
+        common_tables = [_omit_keys(table, _NOT_COMPARED) for table in tables]
+        differences += _compare_tables(common_tables)
+
+        # Sites with the same difference are collected in one entry.
+        owners: dict[tuple[str, tuple[str, ...]], list[str]] = {}
+        for site in scenarios[0].names:
+            if not all(site in other.sites for other in scenarios):
+                continue
+            site_tables = [table["sites"][site] for table in tables]
+            for difference in _compare_tables(site_tables):
+                owners.setdefault((difference.key, difference.values), []).append(site)
+        for (key, values), sites in owners.items():
+            differences.append(cls(key, tuple(sites), values))
+        return differences + _compare_links(scenarios)
+
     @property
     def concerns_link(self) -> bool:
         """True if the differing key belongs to a network link, such as "link m1->s"."""
@@ -593,39 +646,6 @@ class ScenarioDifference(NamedTuple):
     def __str__(self) -> str:
         """Returns the key that differs, with the names of the arms for which it does."""
         return f"{self.key} of {', '.join(self.owners)}" if self.owners else self.key
-
-
-def compare_scenarios(scenarios: Sequence[Scenario]) -> list[ScenarioDifference]:
-    """Finds the settings in which several experiments differ.
-
-    Settings that only some of the experiments have are included.
-
-    Args:
-        scenarios: Descriptions of at least two experiments.
-
-    Returns:
-        One entry for each difference, in the order of the keys. Empty if the experiments are
-        equal.
-    """
-    differences: list[ScenarioDifference] = []
-    site_lists = [", ".join(scenario.names) for scenario in scenarios]
-    if len(set(site_lists)) > 1:
-        differences.append(ScenarioDifference("sites", (), tuple(site_lists)))
-    tables: list[dict[str, Any]] = [msgspec.to_builtins(scenario) for scenario in scenarios]
-    common_tables = [_omit_keys(table, _NOT_COMPARED) for table in tables]
-    differences += _compare_tables(common_tables)
-
-    # Sites with the same difference are collected in one entry.
-    owners: dict[tuple[str, tuple[str, ...]], list[str]] = {}
-    for site in scenarios[0].names:
-        if not all(site in other.sites for other in scenarios):
-            continue
-        site_tables = [table["sites"][site] for table in tables]
-        for difference in _compare_tables(site_tables):
-            owners.setdefault((difference.key, difference.values), []).append(site)
-    for (key, values), sites in owners.items():
-        differences.append(ScenarioDifference(key, tuple(sites), values))
-    return differences + _compare_links(scenarios)
 
 
 def _omit_keys(table: Mapping[str, Any], keys: Sequence[str]) -> dict[str, Any]:

@@ -12,7 +12,7 @@ Invariant:
 import pickle
 import re
 import tomllib
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from functools import lru_cache
 from pathlib import Path
 from threading import RLock
@@ -113,15 +113,18 @@ def load_scenario(
             `source` is a `Scenario`, a key of a group such as `control` applies to all sites or
             links, see `override`.
         duration_s: Duration in s. By default, that of the scenario.
-        seed: Seed of the random numbers. By default, that of the scenario.
+        seed: Seed of the random numbers. By default, that of the scenario. Numbers that the
+            scenario states as distributions are drawn again with another seed.
 
     Raises:
         ScenarioError: The source cannot be read or is not a valid scenario.
     """
     source = getattr(source, "scenario", source)
-    pairs = _join_overrides(overrides, duration_s, seed)
     if isinstance(source, Scenario):
+        changed_seed = seed if overrides or seed != source.seed else None
+        pairs = _join_overrides(overrides, duration_s, changed_seed)
         return _change_scenario(source, pairs)
+    pairs = _join_overrides(overrides, duration_s, seed)
     experiment = ExperimentText.read(source)
     is_text = isinstance(source, Mapping) or "\n" in str(source)
     label = "scenario" if is_text else experiment.label
@@ -243,21 +246,6 @@ class ExperimentText(NamedTuple):
         return ExperimentText(str(source), text, folder)
 
 
-def reseed_scenario(scenario: Scenario, seed: int) -> Scenario:
-    """Returns the same experiment with other random numbers.
-
-    Numbers that the scenario states as distributions are drawn again.
-
-    Args:
-        scenario: The experiment.
-        seed: Seed of the random numbers. The same seed always gives the same numbers.
-
-    Raises:
-        ScenarioError: The seed is not valid, or a number that is drawn with it is out of range.
-    """
-    return load_scenario(scenario, {"seed": seed}) if scenario.seed != seed else scenario
-
-
 def _read_source(source: str | Path) -> tuple[str, Path]:
     """Reads the TOML text of a scenario from the package or from a file.
 
@@ -367,15 +355,3 @@ def parse_embedded(text: str, source: str = "") -> Scenario:
             "the traces are not written out separately for every link", source=source
         )
     return scenario
-
-
-def embedded_names_reader(source: str) -> Callable[[str], tuple[str, ...]]:
-    """Returns a function that extracts the names of the arms from the text of an experiment.
-
-    The text may come from a log or another computer. Therefore it is not trusted, see
-    `parse_embedded`.
-
-    Args:
-        source: Name of the text, for error messages.
-    """
-    return lambda text: parse_embedded(text, source).names

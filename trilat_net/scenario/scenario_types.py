@@ -43,7 +43,7 @@ from ..core import (
 from ..errors import ScenarioError, suggest_nearest
 from ..fields import Frozen
 from ..laws import SentVectorSpecs
-from ..own_code import build_channel
+from ..own_code import CodeKey, ImportedLaw, LoggedUserLaw, build_channel, list_named_code
 from ..recorded_change import SiteOrder
 from ..records import NS_PER_S, Layout
 from .arms import START_MARGIN_RAD, Arm, ArmModel, build_arm, start_margin
@@ -479,6 +479,29 @@ class Scenario(Frozen, frozen=True, dict=True):
                     f"rehearse it with a simulated arm, add: {options}"
                 )
             raise ScenarioError(problem, path=f"sites.{name}.plant", source=self.name)
+
+    @property
+    def imported_code(self) -> list[tuple[str, str]]:
+        """Users' Python classes that run with the experiment: laws, operators and plants.
+
+        Each class is given by its name, such as "mylaws:Spring", and the SHA-256 hash of its
+        file.
+        """
+        named = [(code.code, code.source_sha256) for code in list_named_code(self)]
+        return list(dict.fromkeys(named))
+
+    def find_user_laws(self) -> list[LoggedUserLaw]:
+        """Returns the control laws that are users' classes, without running their code.
+
+        Each entry states whether the law may run, and which file would be used. The files and
+        the permissions are read again in each call.
+        """
+        laws: dict[CodeKey, tuple[ImportedLaw, list[str]]] = {}
+        for name, spec in self.sites.items():
+            if isinstance(spec.control, ImportedLaw):
+                law_and_sites = laws.setdefault(CodeKey.of(spec.control), (spec.control, []))
+                law_and_sites[1].append(name)
+        return [LoggedUserLaw.inspect(law, tuple(sites)) for law, sites in laws.values()]
 
     @property
     def open_hands(self) -> tuple[str, ...]:

@@ -48,7 +48,7 @@ from numpy.typing import NDArray
 from scipy.linalg import expm
 
 from ...core import Array, IntArray, Law, Scheme, SiteSetup
-from ...scenario import LinkBase, draw_used_samples
+from ...scenario import LinkBase
 from ..blas_threads import limit_blas_threads
 from ..delay_period import MAX_NEAR_PERIOD_S, find_delay_period
 from .characteristic_roots import (
@@ -376,7 +376,7 @@ class SamplesInUse(NamedTuple):
             ticks = np.arange(round(span_s * hz))
             if conditions.varying:
                 link, key = conditions.links[i, j]
-                drawn = draw_used_samples(link, key, hz, peer_hz, start_s + span_s)
+                drawn = link.draw_used_samples(key, hz, peer_hz, start_s + span_s)
                 first_tick = round(start_s * hz)
                 first_sample = round(start_s * peer_hz)
                 samples = drawn[first_tick + ticks]

@@ -40,7 +40,7 @@ from ...files import find_page
 from ...laws import LinearForm, LinearSituation
 from ...own_code import ImportedLaw
 from ...records import NS_PER_S
-from ...scenario import LinkBase, Scenario, draw_used_samples
+from ...scenario import LinkBase, Scenario
 from ..delay_period import (
     MAX_PERIOD_TICKS,
     find_final_link,
@@ -459,8 +459,7 @@ def compute_effective_delay(
         # ages are complete when the samples of a whole period have arrived
         longest_s = 2e-3 * sum(link.moments())
         duration_s = max(duration_s, period_s + longest_s)
-    used_samples = draw_used_samples(
-        link=link,
+    used_samples = link.draw_used_samples(
         key=link_key(scenario.seed, f"{peer}->{site}"),
         receiver_hz=site_hz,
         sender_hz=peer_hz,

@@ -46,7 +46,6 @@ def sim_command(
     It writes the same kind of log as a live session.
     """
     from ...execution import record_virtual
-    from ...own_code import find_user_laws
     from .options import parse_viz_rate
 
     chosen = options.load_chosen_scenario(scenario, overrides, duration, seed)
@@ -88,7 +87,9 @@ def sim_command(
         terminal.print_json(open_log(path).to_dict())
     else:
         terminal.print_text(f"{path}: {_describe_length(chosen, path)}")
-        permissions = {f" --law {shlex.quote(str(law.file))}" for law in find_user_laws(chosen)}
+        permissions = {
+            f" --law {shlex.quote(str(law.file))}" for law in chosen.find_user_laws()
+        }
         report = f"trilat report {shlex.quote(str(path))}{''.join(sorted(permissions))}"
         terminal.print_text(f"next: {report}")
 

@@ -33,7 +33,6 @@ from ...analysis import (
 from ...core import LINK_PARAMETERS, Array
 from ...execution import simulate_without_operators
 from ...log import Log
-from ...own_code import find_user_laws
 from .. import plot_signals, style
 from ..appearance import REPORT_SIZE, FigureSize
 from .figure_entry import draws, unless
@@ -94,7 +93,7 @@ def _explain_absent_displacement(log: Log) -> str:
     """
     if not any(site.hands for site in log.scenario.sites.values()):
         return NO_OPERATOR
-    for law in find_user_laws(log.scenario):
+    for law in log.scenario.find_user_laws():
         if not law.allowed:
             return str(law)
     return ""

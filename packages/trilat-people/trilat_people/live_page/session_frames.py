@@ -39,7 +39,7 @@ from trilat_net.core import Array, HandInForce, LifeAlarm
 from trilat_net.net import Event
 from trilat_net.presentation import describe_energy_obstacle
 from trilat_net.records import NS_PER_S
-from trilat_net.scenario import Scenario, describe_event
+from trilat_net.scenario import Change, Scenario
 
 from .session_view import SessionView, SiteView, Tail
 
@@ -847,7 +847,7 @@ def render_event(event: Event) -> Json:
         The parts of its line, as plain values for JSON.
     """
     t_s = None if event.t_ns < 0 else event.t_ns / NS_PER_S
-    text = describe_event(event.kind, event.text, event.command)
+    text = Change.describe_event(event.kind, event.text, event.command)
     return {
         "t": t_s,
         "member": event.member,

@@ -44,11 +44,11 @@ from trilat_net.analysis import (
     decision_facts,
     judge_virtual_run,
 )
-from trilat_net.core import Array
+from trilat_net.core import Array, TorqueKind
 from trilat_net.errors import CodeFailed, UsageError
 from trilat_net.files import make_results_folder, refuse_link, write_whole
 from trilat_net.records import NS_PER_S
-from trilat_net.scenario import Scenario, ViscousEnvironment
+from trilat_net.scenario import Scenario
 from trilat_net.work import (
     Progress,
     RunJournal,
@@ -452,10 +452,10 @@ def _compute_hand_torque(scenario: Scenario, name: str, record: RecordBatch) -> 
         The torque in N m, shape (records, joints).
     """
     operator_torque: Array = -record.tau_x
-    for source in scenario.sites[name].environment:
-        if isinstance(source, ViscousEnvironment):
-            damping = np.array(source.damping_nm_s_rad)
-            operator_torque = operator_torque + damping * record.qd
+    for part in scenario.sites[name].environment:
+        source = part.actor
+        if source.kind is TorqueKind.VISCOUS:
+            operator_torque = operator_torque + np.array(source.B) * record.qd
     return operator_torque
 
 

@@ -25,7 +25,6 @@ import numpy as np
 from trilat_net.analysis import find_root_crossings
 from trilat_net.errors import ScenarioError, UsageError, count_nouns
 from trilat_net.files import write_whole
-from trilat_net.own_code import list_imported_code
 from trilat_net.presentation import TextTable
 from trilat_net.results import Result
 from trilat_net.scenario import Scenario
@@ -341,7 +340,7 @@ def search_margins(
         searches += [_MarginItem(plan, grid_point, seed, within) for seed in seeds]
 
     # The workers need the files of control laws that users wrote.
-    laws = list_imported_code([plan.base])
+    laws = plan.base.imported_code
     with open_worker_pool(jobs, on, most=len(searches), laws=laws) as pool:
         return pool.map(_search_margin_task, searches, progress)
 

@@ -38,7 +38,6 @@ from trilat_net.errors import (
 from trilat_net.execution import FusedRun, simulate_scenario
 from trilat_net.files import make_results_folder, write_whole
 from trilat_net.net import SystemClock
-from trilat_net.own_code import list_imported_code
 from trilat_net.scenario import Scenario
 from trilat_net.work import (
     Progress,
@@ -587,7 +586,7 @@ def run_sweep(
                 tally.note(entry)
         started_ns = clock.monotonic_ns()
         left = plan.cells * len(plan.seeds) - len(journal.done)
-        laws = list_imported_code([plan.base])
+        laws = plan.base.imported_code
         workers = on if left else None  # no cluster is needed if nothing is left to run
         with open_worker_pool(jobs, workers, most=left, laws=laws, hint=_RESUME_HINT) as pool:
             count = pool.workers

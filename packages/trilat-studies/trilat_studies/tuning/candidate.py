@@ -53,7 +53,7 @@ from trilat_net.analysis import (
     find_hanging_sites,
     left_perron_vector,
 )
-from trilat_net.core import Array
+from trilat_net.core import Array, TorqueKind
 from trilat_net.errors import CodeFailed, ScenarioError
 from trilat_net.laws import LawSettings, TuningRun
 from trilat_net.log import Log
@@ -61,9 +61,7 @@ from trilat_net.records import NS_PER_S
 from trilat_net.scenario import (
     END_WINDOW_S,
     ExperimentText,
-    JointSpring,
     Scenario,
-    Wall,
     parse_scenario,
 )
 from trilat_net.work import MeanInterval
@@ -146,8 +144,10 @@ def build_twin(scenario: Scenario) -> Scenario | None:
     """
     sites = {}
     for name, spec in scenario.sites.items():
-        hands = tuple(hand for hand in spec.hands if isinstance(hand, JointSpring))
-        environment = tuple(part for part in spec.environment if not isinstance(part, Wall))
+        hands = tuple(hand for hand in spec.hands if hand.actor.kind is TorqueKind.HAND)
+        environment = tuple(
+            part for part in spec.environment if part.actor.kind is not TorqueKind.WALL
+        )
         sites[name] = msgspec.structs.replace(spec, hands=hands, environment=environment)
     if sites == scenario.sites:
         return None
@@ -229,13 +229,14 @@ def _list_springs(scenario: Scenario, t_s: Array) -> Iterator[_SpringHistory]:
     """
     for name, spec in scenario.sites.items():
         for hand in spec.hands:
-            if not isinstance(hand, JointSpring):
+            source = hand.actor
+            if source.kind is not TorqueKind.HAND:
                 continue
-            acts = (t_s >= hand.start_s) & (t_s < hand.end_s)
-            target_rad, _ = SourceRows(hand.actor).find_target_motion(t_s)
+            acts = (t_s >= source.start_s) & (t_s < source.end_s)
+            target_rad, _ = SourceRows(source).find_target_motion(t_s)
             yield _SpringHistory(
                 site=name,
-                stiffness_nm_rad=np.array(hand.stiffness_nm_rad),
+                stiffness_nm_rad=np.array(source.K),
                 acts=acts[:, np.newaxis].astype(np.float64),
                 target_rad=target_rad,
             )
