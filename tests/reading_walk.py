@@ -57,7 +57,7 @@ CERTIFICATE = house.ROOT / "trilat_net/analysis/certificate"
 SCENARIO = house.ROOT / "trilat_net/scenario"
 TABLE_MODULES = [
     SCENARIO / f"{name}.py"
-    for name in ("resolve", "written_tables", "site_tables", "control_tables", "link_tables")
+    for name in ("resolve", "written_tables", "site_tables", "link_tables")
 ]
 """Modules that the tables of a scenario file pass on their way to a complete scenario."""
 

@@ -84,7 +84,7 @@ def test_hidden_memory_shows_at_a_restart() -> None:
 
 def test_reports_explain_hidden_memory() -> None:
     log = open_bytes(make_own_law_bytes("tests.laws:Forgetful"))
-    (law,) = log.scenario.find_user_laws()[:1]
+    (law,) = log.scenario.inspect_user_laws()[:1]
 
     def find_text(**settings: int) -> str:
         findings = LogCheckReport.of_log(log, virtual=False, **settings).findings
@@ -142,11 +142,11 @@ def make_log_stream(file: Path) -> io.BytesIO:
 def test_changed_files_are_judged_on_request(file: Path) -> None:
     stream = make_log_stream(file)
     log = open_log(stream)
-    (law,) = log.scenario.find_user_laws()
+    (law,) = log.scenario.inspect_user_laws()
     assert (law.sites, law.allowed, law.changed) == (("m", "s"), True, "")
     assert "is the one that ran" in str(law)
     file.write_text(file.read_text() + "# a word\n")
-    (law,) = log.scenario.find_user_laws()
+    (law,) = log.scenario.inspect_user_laws()
     assert not law.allowed
     assert f"--law {file} --other-version (it was changed" in str(law)
     verdict = verify_log(log)
@@ -171,7 +171,7 @@ def reopen_log(stream: io.BytesIO, **how: Any) -> Log:
 def test_a_missing_file_names_the_remedy(file: Path) -> None:
     log = open_log(make_log_stream(file))
     file.unlink()
-    (law,) = log.scenario.find_user_laws()
+    (law,) = log.scenario.inspect_user_laws()
     assert str(law).endswith("external code, which may not run; if you trust it: --law FILE")
     assert verify_log(log).withheld == ["m", "s"]
 

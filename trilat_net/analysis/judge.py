@@ -19,7 +19,7 @@ import msgspec
 
 from ..execution import FusedRun, simulate_columns, simulate_scenario
 from ..log import MIN_COVERAGE, Log
-from ..scenario import Scenario, describe_law_conditions, list_law_situations
+from ..scenario import Scenario
 from .blas_threads import limit_blas_threads
 from .certificate.certificate_result import Certificate
 from .certificate.observed_energy import find_energy_laws
@@ -52,7 +52,7 @@ def list_law_proofs(scenario: Scenario) -> list[str]:
     links = {name: find_final_link(scenario, name) for name in scenario.links}
     final_scenario = msgspec.structs.replace(scenario, links=links, timeline=())
     proofs = []
-    for _, law, situation in list_law_situations(final_scenario):
+    for _, law, situation in final_scenario.law_situations():
         condition = law.condition(situation)
         if condition is None or not condition.proves_decay:
             return []
@@ -93,7 +93,7 @@ def certify_run(
 
     final_scenario = resolve_final_scenario(log)
     roots = find_log_roots(log, own_laws=own_laws)
-    conditions = describe_law_conditions(final_scenario, ticks_grow=roots.is_refutation)
+    conditions = final_scenario.describe_law_conditions(ticks_grow=roots.is_refutation)
 
     return replace(
         certificate,

@@ -27,7 +27,6 @@ from ..scenario import (
     HandPlayer,
     PlantPlayer,
     Scenario,
-    make_hand_players,
 )
 
 
@@ -102,7 +101,7 @@ class FusedRun(CompiledRun):
         setups = [scenario.setup(name) for name in names]
         live_hands: Mapping[str, HandPlayer] = {}
         if inputs is None:
-            live_hands = {**make_hand_players(scenario), **hands}
+            live_hands = {**HandPlayer.make_all(scenario), **hands}
         # The torque sources of a site are its operators, followed by its environment.
         first_environments = [
             len(spec.hands) if spec.environment else -1 for spec in scenario.sites.values()
@@ -137,7 +136,7 @@ def explain_not_repeatable(log: Log, *, own_laws: bool = False) -> str:
     if scenario.external:
         arms = ", ".join(sorted(scenario.external))
         return f"the reaction of the external arm of {arms} is not known"
-    if scenario.find_user_laws() and not own_laws:
+    if scenario.inspect_user_laws() and not own_laws:
         return "the imported control laws may not run (permit them with --law FILE)"
     if set(log.executed_sites) != set(log.sites):
         return "in a rerun, the sites whose records were copied did not react"

@@ -196,7 +196,7 @@ def _check_log(
 
     yield _check_coverage(log, result)
     yield Finding("integrity", result.integrity.text, result.integrity.passed)
-    for law in log.scenario.find_user_laws():
+    for law in log.scenario.inspect_user_laws():
         yield Finding("user law", str(law), law.allowed, law.allowed)
     yield _check_execution(result, recorded)
     if log.scenario.external:
@@ -380,7 +380,7 @@ def _add_memory_advice(finding: Finding, log: Log, result: VerifyResult) -> Find
     Returns:
         The finding, with the advice if it says that whole runs of users' laws agree.
     """
-    files = list(dict.fromkeys(str(law.file) for law in log.scenario.find_user_laws()))
+    files = list(dict.fromkeys(str(law.file) for law in log.scenario.inspect_user_laws()))
     have_runs_agreed = finding.check == "executed again" and finding.passed and result.whole_run
     if not files or not have_runs_agreed or result.withheld:
         return finding

@@ -912,7 +912,7 @@ def _execute_sites(
     samples = make_sample_table(log) if result.whole_run else None
     if samples is None:
         _map_records(log, lazy=False)  # raises an error if a record cannot be read
-    withheld_laws = [law for law in log.scenario.find_user_laws() if not law.allowed]
+    withheld_laws = [law for law in log.scenario.inspect_user_laws() if not law.allowed]
     withheld_sites = [name for law in withheld_laws for name in law.sites if name in sites]
     result.withheld += withheld_sites
     for name in withheld_sites:

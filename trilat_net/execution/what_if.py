@@ -632,7 +632,7 @@ def _describe_limits(result: Rerun) -> Iterator[str]:
         )
     if not log.complete:
         yield "the log is incomplete: it is executed up to its last record"
-    for law in request.scenario.find_user_laws():
+    for law in request.scenario.inspect_user_laws():
         if law.changed and any(site in request.replaced for site in law.sites):
             yield f"the law is executed as its file is now: {law}"
     yield from _describe_later_changes(result)

@@ -414,7 +414,7 @@ class Log(Result, Mapping[str, SiteLog]):
         Whoever permitted the laws of a log also permitted what computes its run again, for
         example copies of the run that start slightly displaced (twins).
         """
-        return all(law.allowed for law in self.scenario.find_user_laws())
+        return all(law.allowed for law in self.scenario.inspect_user_laws())
 
     @property
     def failed_hands(self) -> list[str]:

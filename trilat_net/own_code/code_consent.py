@@ -34,7 +34,6 @@ from .imported_code import (
     NamedCode,
     ScenarioWithCode,
     allowed_code,
-    check_class,
     describe_setting,
     read_code,
     remembered_settings,
@@ -282,7 +281,7 @@ def _allow_file(
             versions = _compare_hashes(key, sha256)
             problem = f"is not the file that ran as {key.code}: {versions}"
             raise UsageError(f"--law {file} {problem}; --other-version accepts it")
-        check_class(source, key.code, "--law", logged[key].method)
+        source.check_class(key.code, "--law", logged[key].method)
         allowed_code[key] = CodeConsent(source.file, sha256)
     return sha256, keys
 
@@ -335,7 +334,7 @@ class LoggedUserLaw(NamedTuple):
         file = None
         with suppress(ScenarioError):
             source = read_code(key.code, "", consent and consent.file)
-            check_class(source, key.code, "")
+            source.check_class(key.code, "")
             sha256 = source.sha256
             file = source.file
 

@@ -213,7 +213,7 @@ def _list_law_files(scenario: Scenario) -> list[str]:
     A log names the module of a law, such as "mine.laws", and not the folder of its file.
     """
     files = []
-    for law in scenario.find_user_laws():
+    for law in scenario.inspect_user_laws():
         module, _, _ = law.code.partition(":")
         files.append(f"{module.replace('.', '/')}.py")
     return list(dict.fromkeys(files))

@@ -363,7 +363,7 @@ def warn_user_laws(log: "Log") -> None:
     Args:
         log: The log.
     """
-    for law in log.scenario.find_user_laws():
+    for law in log.scenario.inspect_user_laws():
         if law.allowed:
             print_note(f"executing this log runs code from outside: {law}")
         else:

@@ -45,7 +45,6 @@ __all__ = [
     "is_distribution",
     "is_number",
     # Links and delays
-    "ConstantDelay",
     "LinkBase",
     "PictureDelay",
     # Operators and environments
@@ -57,8 +56,6 @@ __all__ = [
     "OwnPlant",
     "PlantContext",
     "PlantPlayer",
-    "make_hand_players",
-    "make_plant_players",
     # Changes during a run
     "LinkTables",
     "parse_core_change",
@@ -71,47 +68,36 @@ __all__ = [
     "IRREVERSIBLE_SHARES",
     "ScenarioDifference",
     "describe_law",
-    "describe_law_conditions",
     "describe_scenario",
     "describe_value",
     "flatten_table",
     "list_arm_notes",
-    "list_law_situations",
 ]
 
 if TYPE_CHECKING:
     from .arms import TASK_AXES, ArmModel
     from .change import Change
     from .delay_models import LinkBase
-    from .delay_models.kernel_delays import ConstantDelay
     from .delay_traces import TracePoint, import_trace
     from .describe import (
         IRREVERSIBLE_SHARES,
         ScenarioDifference,
         describe_law,
-        describe_law_conditions,
         describe_scenario,
         describe_value,
         flatten_table,
         list_arm_notes,
-        list_law_situations,
     )
     from .expect import ALL_SITES_QUANTITIES, END_WINDOW_S, Expect
     from .key_checks import check_finite, is_distribution, is_number
     from .laws import BUILT_IN, LAWS
     from .link_presets import GRID_LOSSES_PERCENT, GRID_ROUND_TRIPS_MS
     from .operators.kernel_operators import LiveHand
-    from .operators.program_hand import (
-        FAILED_HAND,
-        POLICY,
-        HandPlayer,
-        HandSite,
-        make_hand_players,
-    )
+    from .operators.program_hand import FAILED_HAND, POLICY, HandPlayer, HandSite
     from .override import split_assignment
     from .own_plant import OwnPlant
     from .picture_delay import PictureDelay
-    from .plant_player import PlantContext, PlantPlayer, make_plant_players
+    from .plant_player import PlantContext, PlantPlayer
     from .run_changes import LinkTables, parse_core_change, resolve_change
     from .scenario_reader import (
         ExperimentText,
@@ -133,25 +119,21 @@ else:
             "arms": "ArmModel TASK_AXES",
             "change": "Change",
             "delay_models": "LinkBase",
-            "delay_models.kernel_delays": "ConstantDelay",
             "delay_traces": "TracePoint import_trace",
             "describe": (
-                "IRREVERSIBLE_SHARES ScenarioDifference describe_law "
-                "describe_law_conditions describe_scenario describe_value flatten_table "
-                "list_arm_notes list_law_situations"
+                "IRREVERSIBLE_SHARES ScenarioDifference describe_law describe_scenario "
+                "describe_value flatten_table list_arm_notes"
             ),
             "expect": "ALL_SITES_QUANTITIES END_WINDOW_S Expect",
             "key_checks": "check_finite is_distribution is_number",
             "laws": "BUILT_IN LAWS",
             "link_presets": "GRID_LOSSES_PERCENT GRID_ROUND_TRIPS_MS",
             "operators.kernel_operators": "LiveHand",
-            "operators.program_hand": (
-                "FAILED_HAND HandPlayer HandSite POLICY make_hand_players"
-            ),
+            "operators.program_hand": "FAILED_HAND HandPlayer HandSite POLICY",
             "override": "split_assignment",
             "own_plant": "OwnPlant",
             "picture_delay": "PictureDelay",
-            "plant_player": "PlantContext PlantPlayer make_plant_players",
+            "plant_player": "PlantContext PlantPlayer",
             "run_changes": "LinkTables parse_core_change resolve_change",
             "scenario_reader": (
                 "ExperimentText list_shipped load_scenario parse_embedded parse_scenario "

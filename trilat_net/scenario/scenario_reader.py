@@ -25,15 +25,7 @@ from ..files import open_regular
 from ..own_code import allow_own_code, name_law_classes
 from ..toml_text import parse_toml
 from .named_files import SHIPPED_FOLDER
-from .override import (
-    Override,
-    apply_overrides,
-    expand_overrides,
-    find_written_path,
-    nest_overrides,
-    parse_overrides,
-    split_entries,
-)
+from .override import ScenarioOverrides, find_written_path
 from .resolve import resolve_scenario
 from .scenario_types import Scenario
 from .validate import build_scenario
@@ -157,19 +149,19 @@ def _change_scenario(
     Raises:
         ScenarioError: An override is not valid.
     """
-    pairs: list[Override] = []
+    parsed = ScenarioOverrides(())
     try:
-        pairs = parse_overrides(overrides)
-        expanded = expand_overrides(scenario, pairs)
+        parsed = ScenarioOverrides.parse(overrides)
+        values = dict(parsed.expand(scenario).pairs)
         changed = scenario
         if overrides:
-            changed = parse_scenario(scenario.text, scenario.name, expanded)
+            changed = parse_scenario(scenario.text, scenario.name, values)
         # A person who names the class of a law, hand or plant in an override permits its code
         # to run.
-        named_classes = re.findall(r"[\w.]+:\w+", repr(list(expanded.values())))
+        named_classes = re.findall(r"[\w.]+:\w+", repr(list(values.values())))
         return allow_own_code(changed, named_classes, scenario)
     except ScenarioError as error:
-        path = find_written_path(error, nest_overrides(pairs))
+        path = find_written_path(error, parsed.nest())
         raise ScenarioError(error.problem, path=path, source=scenario.name) from None
 
 
@@ -199,7 +191,7 @@ class ExperimentText(NamedTuple):
             ScenarioError: The text is not TOML, or an override is not valid.
         """
         tables: dict[str, Any] = pickle.loads(_parse_toml(self.text))
-        apply_overrides(tables, overrides)
+        ScenarioOverrides.parse(overrides).apply_to(tables)
         return tables
 
     def load(self, overrides: Sequence[str] = ()) -> Scenario:
@@ -301,14 +293,15 @@ def parse_scenario(
         try:
             tables = pickle.loads(_parse_toml(text))
             written = tables
-            pairs, entry_pairs = split_entries(tables, parse_overrides(overrides))
-            apply_overrides(tables, pairs)
+            parsed = ScenarioOverrides.parse(overrides)
+            applicable, waiting = parsed.split_entries(tables)
+            applicable.apply_to(tables)
             scenario = build_scenario(resolve_scenario(tables, folder))
-            if entry_pairs:
+            if waiting.pairs:
                 # The vectors of these entries exist only in the resolved scenario.
-                written = nest_overrides(entry_pairs)
+                written = waiting.nest()
                 tables = tomllib.loads(scenario.text)
-                apply_overrides(tables, expand_overrides(scenario, entry_pairs))
+                waiting.expand(scenario).apply_to(tables)
                 scenario = build_scenario(resolve_scenario(tables, folder))
             return scenario
         except ScenarioError as error:

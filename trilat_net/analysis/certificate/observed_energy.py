@@ -26,7 +26,6 @@ import numpy as np
 from ...core import Array, LawEnergies, LawRecords, PeerRecords, Scheme, StaleAction
 from ...hooks import find_hook
 from ...log import Log
-from ...own_code import ImportedLaw
 from ...results import JsonObject
 from ...scenario import Scenario
 from ..aligned import hold_torque
@@ -283,9 +282,10 @@ def find_energy_laws(scenario: Scenario, *, own_laws: bool = False) -> dict[str,
         ScenarioError: The file of a law that is not part of this program is missing.
     """
     laws: dict[str, Any] = {}
-    for site, spec in scenario.sites.items():
+    user_laws = scenario.user_laws
+    for site in scenario.names:
         setup = scenario.setup(site)
-        is_allowed = own_laws or not isinstance(spec.control, ImportedLaw)
+        is_allowed = own_laws or site not in user_laws
         if setup.law_factory is not None and is_allowed:
             law = setup.law_factory(setup.law_context())
             if callable(getattr(law, "energies", None)):

@@ -32,7 +32,7 @@ from ...errors import ScenarioError, UsageError
 from ...execution import FusedRun
 from ...log import Log
 from ...results import Result
-from ...scenario import IRREVERSIBLE_SHARES, Scenario, describe_law_conditions, load_scenario
+from ...scenario import IRREVERSIBLE_SHARES, Scenario, load_scenario
 from ..blas_threads import limit_blas_threads
 from ..stability_decision import NEAR_REST_RAD
 from .characteristic_roots import CharacteristicRoot, Spectrum
@@ -163,7 +163,7 @@ class LinearAnalysis(Result):
         if self.scenario.has_irreversible_shares:
             notes.append(IRREVERSIBLE_SHARES.removeprefix("note: "))
         ticks_grow = self.sampled is not None and self.sampled.verdict == "unstable"
-        return (*notes, *describe_law_conditions(self.scenario, ticks_grow=ticks_grow))
+        return (*notes, *self.scenario.describe_law_conditions(ticks_grow=ticks_grow))
 
     def headline(self) -> str:
         """The scenario, the verdict and the delay margin in one line, for the user.

@@ -35,9 +35,8 @@ from ...core import BUCKETS_PER_S, Array
 from ...errors import ScenarioError
 from ...execution import FusedRun
 from ...log import Ints, Log
-from ...own_code import ImportedLaw
 from ...records import NS_PER_S, Mode
-from ...scenario import ConstantDelay, LinkBase, Scenario
+from ...scenario import Scenario
 from ..blas_threads import limit_blas_threads
 from ..decision_facts import LoopRoots
 from ..delay_period import find_final_link, is_ending_trace
@@ -359,11 +358,10 @@ def _compute_roots(loop: _EndLoop) -> LoopRoots:
     if not loop.conditions.has_forms:
         sampled_loop = SampledLoop(loop.conditions, loop.uses)
         sampled = sampled_loop.compute_spectrum(loop.rest, _ROOTS)
-        laws = loop.scenario.controls
-        has_imported_law = any(isinstance(law, ImportedLaw) for law in laws)
         # Roots show growth, but may miss what happens beyond a threshold: in a user's law, or
         # when an arm touches a sampled wall again.
-        has_threshold = has_imported_law or _has_sampled_wall(loop.scenario)
+        has_user_law = bool(loop.scenario.user_laws)
+        has_threshold = has_user_law or _has_sampled_wall(loop.scenario)
         is_proof_possible = not has_threshold or sampled.verdict == "unstable"
         # A program that reacts to the arms may make a loop unstable, or stable.
         exact = sampled.is_exact and is_proof_possible and not loop.programs
@@ -374,7 +372,7 @@ def _compute_roots(loop: _EndLoop) -> LoopRoots:
         return roots._replace(
             distance_rad=loop.distance_rad,
             programs=loop.programs,
-            is_numerical=has_imported_law,
+            is_numerical=has_user_law,
             span_s=sampled.span_s,
             repeats=sampled.is_exact,
             deviation_per_s=sampled.deviation_per_s,
@@ -449,16 +447,14 @@ def _end_traces(scenario: Scenario) -> Scenario:
         scenario: The scenario up to the end of the run.
     """
     end_us = 1e6 * scenario.duration_s
-    links: dict[str, LinkBase] = dict(scenario.links)
-    timeline = list(scenario.timeline)
+    last_delays_ms = {}
     for name in scenario.links:
         link = find_final_link(scenario, name)
         points = link.points
         if not is_ending_trace(link) or points is None or not points[-1, 0] <= end_us:
             continue
-        links[name] = ConstantDelay(delay_ms=1e-3 * float(points[-1, 1]))
-        timeline = [change for change in timeline if change.link != name]
-    return msgspec.structs.replace(scenario, links=links, timeline=tuple(timeline))
+        last_delays_ms[name] = 1e-3 * float(points[-1, 1])
+    return scenario.with_constant_delays(last_delays_ms)
 
 
 def _list_unknown_delays(scenario: Scenario) -> dict[str, bool]:
@@ -497,7 +493,6 @@ def _fix_delays(
     if not any(has_unknown_delay.values()):
         return _FixedDelays(scenario, None, {})
 
-    links: dict[str, LinkBase] = dict(scenario.links)
     rates_hz = [scenario.sites[name].rate_hz for name in scenario.names]
     common_hz = math.gcd(*rates_hz)
     # start and end of the last quarter, in ticks of the common rate
@@ -509,7 +504,7 @@ def _fix_delays(
 
     used = {}
     mean_age_s = {}
-    timeline = list(scenario.timeline)
+    delays_ms = {}
     for (i, site), (j, peer) in permutations(enumerate(scenario.names), 2):
         first_tick = start * rates_hz[i] // common_hz
         end_tick = end * rates_hz[i] // common_hz
@@ -525,13 +520,11 @@ def _fix_delays(
         if has_unknown_delay[name]:
             ages_s = ticks / rates_hz[i] - samples / rates_hz[j]
             mean_age_s[i, j] = float(ages_s.mean())
-            links[name] = ConstantDelay(delay_ms=1e3 * mean_age_s[i, j])
-            timeline = [change for change in timeline if change.link != name]
+            delays_ms[name] = 1e3 * mean_age_s[i, j]
 
     span_s = (end - start) / common_hz
     uses = SamplesInUse(span_s, used)
-    fixed_scenario = msgspec.structs.replace(scenario, links=links, timeline=tuple(timeline))
-    return _FixedDelays(fixed_scenario, uses, mean_age_s)
+    return _FixedDelays(scenario.with_constant_delays(delays_ms), uses, mean_age_s)
 
 
 def _choose_end_state(

@@ -88,7 +88,7 @@ def sim_command(
     else:
         terminal.print_text(f"{path}: {_describe_length(chosen, path)}")
         permissions = {
-            f" --law {shlex.quote(str(law.file))}" for law in chosen.find_user_laws()
+            f" --law {shlex.quote(str(law.file))}" for law in chosen.inspect_user_laws()
         }
         report = f"trilat report {shlex.quote(str(path))}{''.join(sorted(permissions))}"
         terminal.print_text(f"next: {report}")

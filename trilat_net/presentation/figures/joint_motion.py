@@ -93,7 +93,7 @@ def _explain_absent_displacement(log: Log) -> str:
     """
     if not any(site.hands for site in log.scenario.sites.values()):
         return NO_OPERATOR
-    for law in log.scenario.find_user_laws():
+    for law in log.scenario.inspect_user_laws():
         if not law.allowed:
             return str(law)
     return ""

@@ -227,6 +227,23 @@ class LinkBase(Frozen, frozen=True, tag_field="model", omit_defaults=True):
             playout_us=ms_to_us(self.playout_ms),
         )
 
+    def find_effective_delay(self, receiver_hz: int) -> float:
+        """Returns the delay with which the receiver of the link uses samples, in s.
+
+        A constant delay is rounded up to whole control periods of the receiver. The result is
+        NaN for a delay that varies, and for a link that loses samples.
+
+        Args:
+            receiver_hz: Tick rate of the receiver, in Hz.
+        """
+        model = self.to_core_model()
+        if model.kind != DelayKind.CONSTANT or self.loss or self.measured:
+            return math.nan
+        delay_us = max(round(model.location), model.playout_us)
+        # rounded up, because without a delay a sample is used from the next tick on
+        ticks = max(1, -(-delay_us * receiver_hz // 1_000_000))
+        return ticks / receiver_hz
+
     def _loss_chain(self) -> _LossChain:
         """Computes the Markov chain that produces the stated losses.
 

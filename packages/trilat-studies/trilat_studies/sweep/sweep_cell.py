@@ -33,7 +33,6 @@ from trilat_net.analysis import (
     judge_virtual_run,
 )
 from trilat_net.execution import FusedRun, check_fusable
-from trilat_net.own_code import ImportedLaw
 from trilat_net.results import finite_or_none
 from trilat_net.scenario import Scenario, parse_scenario
 
@@ -308,8 +307,8 @@ class _CellInProgress:
         run_end = run_trace.classify_end(self._scenario)
         self._outcome = _build_result(self.run, run_end, self._totals, self._extended)
         self._is_finished = self._outcome.is_conclusive
-        has_own_law = any(isinstance(law, ImportedLaw) for law in self._scenario.controls)
-        if self._is_finished and has_own_law and run_end.stability is Stability.NOT_STABLE:
+        has_user_law = bool(self._scenario.user_laws)
+        if self._is_finished and has_user_law and run_end.stability is Stability.NOT_STABLE:
             roots = find_run_roots(self._scenario, self.run)
             self._is_finished = roots.measure_decay_misfit(run_end) > 1.0
 
