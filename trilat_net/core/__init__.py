@@ -99,17 +99,13 @@ __all__ = [
     "MAX_DELAY_US",
     "ROW_SUM_TOLERANCE",
     "DelayKind",
+    "DominanceMatrix",
     "LinkModel",
     "LinkSchedule",
     "TraceEnd",
-    "dominance",
     "draw_pair",
-    "find_balancing_weights",
-    "find_reach",
     "first_ticks",
-    "is_irreducible",
     "link_key",
-    "perron_vector",
     # Live hands and hands of users
     "GRIP_NS",
     "SILENCE_NS",
@@ -181,7 +177,6 @@ if TYPE_CHECKING:
     from .life.resting import REST_RATE_1_S
     from .life.safeguards import BLEND_S
     from .life.session_life import HELD_OVERRUN_TICKS
-    from .links import dominance
     from .links.channel import LOST
     from .links.delay import (
         LINK_MODEL_DTYPE,
@@ -191,13 +186,7 @@ if TYPE_CHECKING:
         TraceEnd,
         draw_pair,
     )
-    from .links.dominance import (
-        ROW_SUM_TOLERANCE,
-        find_balancing_weights,
-        find_reach,
-        is_irreducible,
-        perron_vector,
-    )
+    from .links.dominance import ROW_SUM_TOLERANCE, DominanceMatrix
     from .links.link import AHEAD_LIMIT_NS
     from .links.link_schedule import LinkSchedule, first_ticks
     from .links.philox import link_key
@@ -279,10 +268,7 @@ else:
             "links.delay": (
                 "DelayKind LINK_MODEL_DTYPE LinkModel MAX_DELAY_US TraceEnd draw_pair"
             ),
-            "links.dominance": (
-                "ROW_SUM_TOLERANCE dominance find_balancing_weights find_reach "
-                "is_irreducible perron_vector"
-            ),
+            "links.dominance": "DominanceMatrix ROW_SUM_TOLERANCE",
             "links.link": "AHEAD_LIMIT_NS",
             "links.link_schedule": "LinkSchedule first_ticks",
             "links.philox": "link_key",

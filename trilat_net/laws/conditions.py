@@ -18,7 +18,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ..core import Array, find_balancing_weights
+from ..core import Array, DominanceMatrix
 
 PASSIVE_OUTSIDE = "operators and environments are passive (*sufficient*)"
 """The premise of each law that balances energy, as part of a sentence."""
@@ -128,33 +128,14 @@ class StabilityCondition(NamedTuple):
     proves_decay: bool = False
 
 
-def find_least_reversible(alpha: Array) -> float | None:
-    """Returns the least eigenvalue of a dominance matrix, or None if it is not reversible.
-
-    Row i of the matrix alpha contains the weights with which arm i follows the others. The
-    matrix is reversible if positive weights D_i exist with D_i alpha_ij = D_j alpha_ji. Then
-    all eigenvalues are real. The negative of the least eigenvalue is a lower bound on d / (K
-    T), where d is the damping, K the stiffness and T the delay, see `judge_position_exchange`.
-
-    Args:
-        alpha: Dominance matrix, shape (N, N).
-
-    Returns:
-        The eigenvalue. None if the matrix is not reversible.
-    """
-    if find_balancing_weights(alpha) is None:
-        return None
-    eigenvalues = np.linalg.eigvals(alpha)
-    return float(eigenvalues.real.min())
-
-
 def judge_position_exchange(situation: LawSituation, damping: str) -> StabilityCondition | None:
     """Evaluates whether arms that are coupled by springs and braked by dampers are stable.
 
     The control law is called P+d. Its condition holds for arms of any mass. For two arms, it is
     due to Nuno, Basanez, Ortega and Spong, IJRR 28, 2009. More than two arms need the same
     stiffness K, damping d and delay T at all arms, and reversible weights with which they
-    follow each other, see `find_least_reversible` (docs/theory/damping-conditions.md, 13).
+    follow each other, see `DominanceMatrix.find_balancing_weights`
+    (docs/theory/damping-conditions.md, 13).
 
     A torque that is held for the period h acts h / 2 later. Therefore d is reduced by K h / 2
     and T increased by h / 2, for arms whose least inertia is above d h / 2
@@ -299,7 +280,7 @@ def _judge_several_sites(
     if gains_differ or np.ptp(delays_s):
         text = "known for more than two sites only with one K, one d and one delay"
         return StabilityCondition(None, text)
-    least = find_least_reversible(situation.alpha)
+    least = DominanceMatrix(situation.alpha).find_least_eigenvalue()
     if least is None:
         text = "shares that are not reversible: some heavy arms are unstable at any d"
         return StabilityCondition(False, text)

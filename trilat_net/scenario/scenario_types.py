@@ -26,6 +26,7 @@ from ..core import (
     ArmLinks,
     Array,
     CoreChange,
+    DominanceMatrix,
     DominanceRamp,
     Gains,
     LawChannel,
@@ -35,8 +36,6 @@ from ..core import (
     RestGains,
     Scheme,
     SiteSetup,
-    dominance,
-    find_balancing_weights,
     link_key,
     make_layout,
 )
@@ -214,7 +213,7 @@ class Scenario(Frozen, frozen=True, dict=True):
         laws = [spec.control for spec in self.sites.values()]
         if not all(law.exchanges_positions() for law in laws):
             return False
-        return find_balancing_weights(self.alpha) is None
+        return DominanceMatrix(self.alpha).find_balancing_weights() is None
 
     @cached_property
     def controls(self) -> tuple[ChosenLaw, ...]:
@@ -236,9 +235,8 @@ class Scenario(Frozen, frozen=True, dict=True):
         value is None if a site follows some other site neither directly nor through other
         sites, because beta is not unique then.
         """
-        if not dominance.is_irreducible(self.alpha):
-            return None
-        return dominance.perron_vector(self.alpha)
+        matrix = DominanceMatrix(self.alpha)
+        return matrix.find_beta() if matrix.is_irreducible else None
 
     @cached_property
     def text(self) -> str:

@@ -25,7 +25,7 @@ from ..core import (
     MAX_LINKS_BYTES,
     ROW_SUM_TOLERANCE,
     Array,
-    is_irreducible,
+    DominanceMatrix,
     links_bytes,
 )
 from ..errors import ScenarioError, count_nouns
@@ -757,7 +757,7 @@ def _can_lose_master(scenario: Scenario, name: str) -> bool:
         # the dominance matrix without the row and the column of this master
         remaining = np.delete(np.delete(alpha, n, 0), n, 1)
         follows_others = shares[n] > 0.0 and shares.sum() > shares[n]
-        if follows_others and is_irreducible(remaining):
+        if follows_others and DominanceMatrix(remaining).is_irreducible:
             return True
     return False
 
