@@ -26,7 +26,6 @@ __all__ = [
     "CoreChange",
     "DominanceRamp",
     "LifeAlarm",
-    "LifeOrder",
     "LifeReason",
     "PlantState",
     "TickInput",
@@ -53,8 +52,6 @@ __all__ = [
     "StaleRule",
     "TaskSetup",
     "TickRepeater",
-    "links_bytes",
-    "make_layout",
     # Numbers and vectors
     "Array",
     "IntArray",
@@ -84,7 +81,6 @@ __all__ = [
     "chain_stages",
     "forward_kinematics",
     "regressor",
-    "theta_from_links",
     "two_link_stages",
     # Torques of operators and environments
     "LIVE_KINDS",
@@ -134,10 +130,9 @@ __all__ = [
     "PeerView",
     "SentVector",
     "UserLaw",
+    "UserModel",
     "UserLawFactory",
-    "compile_to_address",
     "compiled",
-    "list_numbers",
     "plug_law",
     # Runs of several sites, alone and side by side
     "CompiledRun",
@@ -159,7 +154,7 @@ if TYPE_CHECKING:
     from .arms.frame_pose import FramePose
     from .arms.rotation import rotation_matrix
     from .arms.task_space import POSE, POSITION
-    from .arms.two_link_arm import ArmLinks, forward_kinematics, regressor, theta_from_links
+    from .arms.two_link_arm import ArmLinks, forward_kinematics, regressor
     from .lanes.lane_episodes import LaneEpisodes
     from .lanes.lane_structure import describe_structure
     from .lanes.run_groups import RunGroup, group_runs, prepare_lanes
@@ -193,7 +188,7 @@ if TYPE_CHECKING:
     from .plug.compiled_law import compiled, plug_law
     from .plug.law_channel import MAX_RECORD_SENT, MAX_SENT, LawChannel, SentVector
     from .plug.law_energy import LawEnergies, LawRecords, PeerRecords
-    from .plug.plugged import compile_to_address, list_numbers
+    from .plug.plugged import UserModel
     from .plug.user_law import LawContext, LawInput, PeerView, UserLaw, UserLawFactory
     from .step.compiled_run import CompiledRun
     from .step.control import ROBUST_RESIDUE
@@ -201,13 +196,7 @@ if TYPE_CHECKING:
     from .step.jit import compiling_notice, is_core_cached, leaf, loop_leaf
     from .step.recorded_ticks import RecordedRows, TickRepeater
     from .step.run_inputs import RunInputs
-    from .step.site_arrays import (
-        MAX_CHANGES,
-        MAX_LINKS_BYTES,
-        MAX_RAMPS,
-        SiteArrays,
-        links_bytes,
-    )
+    from .step.site_arrays import MAX_CHANGES, MAX_LINKS_BYTES, MAX_RAMPS, SiteArrays
     from .step.site_setup import (
         ChainSetup,
         Gains,
@@ -220,7 +209,6 @@ if TYPE_CHECKING:
         StaleAction,
         StaleRule,
         TaskSetup,
-        make_layout,
     )
     from .step.site_step import Site
     from .step.ticks import (
@@ -230,7 +218,6 @@ if TYPE_CHECKING:
         CoreChange,
         DominanceRamp,
         LifeAlarm,
-        LifeOrder,
         LifeReason,
         PlantState,
         TickInput,
@@ -251,7 +238,7 @@ else:
             "arms.frame_pose": "FramePose",
             "arms.rotation": "rotation_matrix",
             "arms.task_space": "POSE POSITION",
-            "arms.two_link_arm": "ArmLinks forward_kinematics regressor theta_from_links",
+            "arms.two_link_arm": "ArmLinks forward_kinematics regressor",
             "arms.two_link_stages": "two_link_stages",
             "lanes.lane_episodes": "LaneEpisodes",
             "lanes.lane_structure": "describe_structure",
@@ -275,7 +262,7 @@ else:
             "plug.compiled_law": "compiled plug_law",
             "plug.law_channel": "LawChannel MAX_RECORD_SENT MAX_SENT SentVector",
             "plug.law_energy": "LawEnergies LawRecords PeerRecords",
-            "plug.plugged": "compile_to_address list_numbers",
+            "plug.plugged": "UserModel",
             "plug.user_law": "LawContext LawInput PeerView UserLaw UserLawFactory",
             "step.compiled_run": "CompiledRun",
             "step.control": "ROBUST_RESIDUE",
@@ -283,16 +270,15 @@ else:
             "step.jit": "compiling_notice is_core_cached leaf loop_leaf",
             "step.recorded_ticks": "RecordedRows TickRepeater",
             "step.run_inputs": "RunInputs",
-            "step.site_arrays": "MAX_CHANGES MAX_LINKS_BYTES MAX_RAMPS SiteArrays links_bytes",
+            "step.site_arrays": "MAX_CHANGES MAX_LINKS_BYTES MAX_RAMPS SiteArrays",
             "step.site_setup": (
                 "ChainSetup Gains Law LinkSetup MotionLimits RestGains Scheme SiteSetup "
-                "StaleAction StaleRule TaskSetup make_layout"
+                "StaleAction StaleRule TaskSetup"
             ),
             "step.site_step": "Site",
             "step.ticks": (
-                "BUCKETS_PER_S CoreChange DominanceRamp LifeAlarm LifeOrder LifeReason "
-                "MAX_ARRIVALS PlantState RELEASE_REASONS TickInput describe_mode "
-                "first_tick_at tick_ns"
+                "BUCKETS_PER_S CoreChange DominanceRamp LifeAlarm LifeReason MAX_ARRIVALS "
+                "PlantState RELEASE_REASONS TickInput describe_mode first_tick_at tick_ns"
             ),
             "step.vectors": "Array IntArray Pair Points Vector",
         },

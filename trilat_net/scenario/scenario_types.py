@@ -30,14 +30,12 @@ from ..core import (
     DominanceRamp,
     Gains,
     LawChannel,
-    LifeOrder,
     LinkSetup,
     MotionLimits,
     RestGains,
     Scheme,
     SiteSetup,
     link_key,
-    make_layout,
 )
 from ..errors import ScenarioError, suggest_nearest
 from ..fields import Frozen
@@ -521,7 +519,7 @@ class Scenario(Frozen, frozen=True, dict=True):
             site: Name of the site.
         """
         sends: SentVectorSpecs = getattr(self.sites[site].control, "sends", {})
-        layout = make_layout(self.arms[site].chain)
+        layout = SiteSetup.make_layout(self.arms[site].chain)
         return build_channel(sends, layout, len(self.names) - 1)
 
     def layout(self, site: str) -> Layout:
@@ -535,7 +533,9 @@ class Scenario(Frozen, frozen=True, dict=True):
         """
         live_hand = self.sites[site].find_live_hand()
         actors = () if live_hand is None else (live_hand.actor,)
-        layout = make_layout(self.arms[site].chain, self.channel(site).record_size, actors)
+        layout = SiteSetup.make_layout(
+            self.arms[site].chain, self.channel(site).record_size, actors
+        )
         return layout._replace(bodies=_POSE_NUMBERS * len(self.bodies_m(site)))
 
     def bodies_m(self, site: str) -> dict[str, tuple[float, float, float]]:
@@ -805,7 +805,7 @@ class Scenario(Frozen, frozen=True, dict=True):
         text = msgspec.json.encode(change).decode()
         site = change.owner
         if change.order:
-            return CoreChange(text, order=LifeOrder[change.order.upper()], skipped=change.ticks)
+            return CoreChange.give_order(text, change.order, change.ticks)
         if change.dominance:
             ramp = self.ramp(site, change.to, change.start_ns, change.ramp_s)
             return CoreChange(text, ramp=ramp)

@@ -26,7 +26,7 @@ from ..core import (
     ROW_SUM_TOLERANCE,
     Array,
     DominanceMatrix,
-    links_bytes,
+    SiteArrays,
 )
 from ..errors import ScenarioError, count_nouns
 from ..fields import TomlTable
@@ -662,7 +662,7 @@ def check_links_memory(scenario: Scenario, site: str) -> None:
         ScenarioError: The limit is exceeded. The error contains the path of the site.
     """
     setup = scenario.setup(site)
-    size_bytes = links_bytes(setup)
+    size_bytes = SiteArrays.count_link_bytes(setup)
     if size_bytes > MAX_LINKS_BYTES:
         raise ScenarioError(
             f"the links of this site would need {size_bytes / 2**20:.0f} MiB, but at most "

@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from ...records import NS_PER_S, Mode
 from ..step.compiled_run import CompiledRun
 from ..step.fused_run import NEVER_NS, ReplayedInputs
-from ..step.jit import find_lane_address, is_lane_code_stored, leaf, read_lane_assembly
+from ..step.jit import LaneCode, leaf
 from ..step.run_state import RunMemory
 from ..step.site_arrays import SiteArrays
 from ..step.ticks import BUCKETS_PER_S, first_tick_at, tick_ns
@@ -31,9 +31,8 @@ from ..step.vectors import Array, IntArray
 from .chain_lane_stages import advance_chain_site
 from .lane_deliveries import (
     BLOCK_TICKS,
-    copy_link_states,
-    find_draw_addresses,
-    keep_link_states,
+    DrawAddresses,
+    LinkStates,
     repeat_deliveries,
     use_samples,
     use_samples_of_rates,
@@ -246,7 +245,7 @@ def _find_addresses(run: CompiledRun, structure: RunStructure, clock: types.Type
     addresses = []
     for site in structure.sites:
         arguments = _list_argument_types(layout, structure, site, clock)
-        addresses.append(find_lane_address(_choose_code(layout), arguments))
+        addresses.append(LaneCode(_choose_code(layout), arguments).find_address())
     return np.array(addresses)
 
 
@@ -284,7 +283,7 @@ def read_assembly(run: CompiledRun, i: int) -> str:
     structure = find_structure(run)
     layout = _find_layout(run)
     arguments = _list_argument_types(layout, structure, structure.sites[i])
-    return read_lane_assembly(_choose_code(layout), arguments)
+    return LaneCode(_choose_code(layout), arguments).read_assembly()
 
 
 @leaf
@@ -318,7 +317,9 @@ def has_lane_code(run: CompiledRun) -> bool:
     structure = find_structure(run)
     layout = _find_layout(run)
     return all(
-        is_lane_code_stored(_choose_code(layout), _list_argument_types(layout, structure, site))
+        LaneCode(
+            _choose_code(layout), _list_argument_types(layout, structure, site)
+        ).is_stored()
         for site in structure.sites
     )
 
@@ -439,8 +440,8 @@ class LaneRun:
         self._next_ns = np.zeros(self._sites, np.int64)
         self._latest = np.zeros((3, self._sites), np.int64)
         self._next_samples = np.zeros((self._sites, structure.peers), np.int64)
-        self._deliveries = copy_link_states(tables)
-        self._draws = find_draw_addresses()
+        self._deliveries = LinkStates.copy_from(tables)
+        self._draws = DrawAddresses.find()
         self._links_of_runs = [_LinksOfRun(run) for run in runs]
 
         self._pages = _FIRST_PAGES
@@ -746,7 +747,7 @@ class LaneRun:
             lane_table[..., : len(lanes)] = lane_table[..., lanes]
         self._states[:, :, : len(lanes)] = self._states[:, :, lanes]
         self._ended.ticks[:] = -1
-        self._deliveries = keep_link_states(self._deliveries, lanes)
+        self._deliveries = self._deliveries.keep(lanes)
         self._links_of_runs = [self._links_of_runs[lane] for lane in lanes]
         self.runs = [self.runs[lane] for lane in lanes]
 

@@ -318,7 +318,7 @@ def _compile_law(torque: Callable[..., Any], form: LawForm) -> Any:
     return function
 
 
-def _read_numbers(law: Any) -> dict[str, np.ndarray[Any, Any]]:
+def _read_numbers(law: Any, remembered: Sequence[str]) -> dict[str, np.ndarray[Any, Any]]:
     """Collects the gains and the memory of a law, which its compiled form keeps in an array.
 
     These are the attributes of the instance, and the attributes of its class whose names occur
@@ -332,6 +332,7 @@ def _read_numbers(law: Any) -> dict[str, np.ndarray[Any, Any]]:
 
     Args:
         law: An instance of the law's class.
+        remembered: Names of the attributes that the law keeps from tick to tick.
 
     Returns:
         Arrays by attribute name: first the numbers that the law remembers, in their order, then

@@ -36,7 +36,7 @@ from .fused_run import (
 )
 from .run_inputs import RunInputs
 from .run_state import RunMemory, RunState
-from .site_arrays import SiteArrays, apply_change
+from .site_arrays import SiteArrays
 from .site_setup import SiteSetup
 from .ticks import BUCKETS_PER_S, PlantState, tick_ns
 from .vectors import Array, IntArray, Row, RowArray
@@ -305,7 +305,7 @@ class CompiledRun:
             if t_ns > last_ns:
                 break
             self._step_until(t_ns - 1)
-            apply_change(self.arrays(i), change, t_ns)
+            self.arrays(i).apply_change(change, t_ns)
             self._changes.popleft()
         if self.diverged_s is None:
             self._step_until(last_ns)

@@ -28,8 +28,7 @@ from ...core import (
     DelayKind,
     LinkModel,
     Points,
-    compile_to_address,
-    list_numbers,
+    UserModel,
 )
 from ...fields import Frozen, KeyProblem, TomlTable, find_kinds
 
@@ -354,7 +353,7 @@ class OwnDelay(LinkBase, frozen=True, kw_only=True):
         delays stores its measurements there. This model stores its floating-point settings bit
         by bit in the same table, two in each row.
         """
-        numbers = list_numbers(self)
+        numbers = UserModel(self).numbers
         rows = math.ceil(max(len(numbers), 1) / 2)
         return np.resize(numbers, (rows, 2)).view(np.int64)
 
@@ -376,7 +375,8 @@ class OwnDelay(LinkBase, frozen=True, kw_only=True):
                 the common start time of all sites.
         """
         model = super().to_core_model(from_ns)
-        return model._replace(call=compile_to_address(self, "draw", LINK_MODEL_DTYPE))
+        address = UserModel(self).compile_to_address("draw", LINK_MODEL_DTYPE)
+        return model._replace(call=address)
 
 
 DELAY_MODELS = {
