@@ -18,7 +18,6 @@ from trilat_net.laws.conditions import (
     COMMON_MOTION_SHARE,
     LawSituation,
     StabilityCondition,
-    judge_position_exchange,
 )
 from trilat_net.scenario import load_scenario
 from trilat_net.scenario.describe import describe_law_conditions
@@ -256,7 +255,7 @@ def judge_equal_sites(count: int, ticks: int, d: float) -> StabilityCondition:
     situation = LawSituation(
         0, names, laws, make_equal_shares(count), delay_s, (1e3,), 30, hold_s=TICK_S
     )
-    condition = judge_position_exchange(situation, "d")
+    condition = situation.judge_position_exchange("d")
     assert condition is not None
     return condition
 

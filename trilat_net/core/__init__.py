@@ -100,7 +100,6 @@ __all__ = [
     "LinkSchedule",
     "TraceEnd",
     "draw_pair",
-    "first_ticks",
     "link_key",
     # Live hands and hands of users
     "GRIP_NS",
@@ -183,7 +182,7 @@ if TYPE_CHECKING:
     )
     from .links.dominance import ROW_SUM_TOLERANCE, DominanceMatrix
     from .links.link import AHEAD_LIMIT_NS
-    from .links.link_schedule import LinkSchedule, first_ticks
+    from .links.link_schedule import LinkSchedule
     from .links.philox import link_key
     from .plug.compiled_law import compiled, plug_law
     from .plug.law_channel import MAX_RECORD_SENT, MAX_SENT, LawChannel, SentVector
@@ -257,7 +256,7 @@ else:
             ),
             "links.dominance": "DominanceMatrix ROW_SUM_TOLERANCE",
             "links.link": "AHEAD_LIMIT_NS",
-            "links.link_schedule": "LinkSchedule first_ticks",
+            "links.link_schedule": "LinkSchedule",
             "links.philox": "link_key",
             "plug.compiled_law": "compiled plug_law",
             "plug.law_channel": "LawChannel MAX_RECORD_SENT MAX_SENT SentVector",

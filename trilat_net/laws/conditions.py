@@ -109,6 +109,73 @@ class LawSituation(NamedTuple):
             hands=tuple(self.hands[n] for n in sites) if self.hands else (),
         )
 
+    def judge_position_exchange(self, damping: str) -> "StabilityCondition | None":
+        """Evaluates whether arms that are coupled by springs and braked by dampers are stable.
+
+        The control law is called P+d. Its condition holds for arms of any mass. For two arms,
+        it is due to Nuno, Basanez, Ortega and Spong, IJRR 28, 2009. More than two arms need the
+        same stiffness K, damping d and delay T at all arms, and reversible weights with which
+        they follow each other, see `DominanceMatrix.find_balancing_weights`
+        (docs/theory/damping-conditions.md, 13).
+
+        A torque that is held for the period h acts h / 2 later. Therefore d is reduced by
+        K h / 2 and T increased by h / 2, for arms whose least inertia is above d h / 2
+        (docs/reference/laws-springs.md).
+
+        Args:
+            damping: Name of the law's attribute with d.
+
+        Returns:
+            The condition. It is undecided for delays that vary, for several tick rates, in task
+            space, if the sites have different laws or ratios Kd / K, and if another site does
+            not compensate gravity exactly. None if the law of this site does not compensate
+            gravity exactly, because then no condition is known.
+        """
+        laws = self.laws
+        gravity_factors = [getattr(law, "gravity", 1.0) for law in laws]
+        if gravity_factors[self.site] != 1.0:
+            return None
+        if self.in_task_space:
+            # The stiffness belongs to coordinates of the end effector, and the damping to
+            # joints.
+            return StabilityCondition(None, "known only for joints that follow joints")
+        if not self.alpha.any():
+            text = (
+                "no arm follows another, so there is no loop: stable in continuous time for "
+                "every delay and d > 0"
+            )
+            return StabilityCondition(True, text)
+        hold_s = self.hold_s
+        K = np.array([getattr(law, "K", [np.nan]) for law in laws])
+        d = np.array([getattr(law, damping, [np.nan]) for law in laws])
+
+        # Cases in which no condition is known. A law without K has NaN here.
+        if np.isnan(self.longest_s) or np.isnan(K).any():
+            text = "known for constant delays, and with this law at all sites"
+            return StabilityCondition(None, text)
+        if any(factor != 1.0 for factor in gravity_factors):
+            return StabilityCondition(None, "known for gravity = 1 at all sites")
+        error_dampings = [np.broadcast_to(getattr(law, "Kd", 0.0), K.shape[1:]) for law in laws]
+        ratios_s = np.array(error_dampings) / K
+        if not np.allclose(ratios_s, ratios_s[0], rtol=1e-9, atol=0.0):
+            # docs/theory/damping-conditions.md: with other ratios some arms are unstable
+            return StabilityCondition(None, "known for one ratio Kd / K at all sites")
+        if np.isnan(hold_s):
+            text = "known for held torques only with one tick rate at all sites"
+            return StabilityCondition(None, text)
+
+        scope = "sufficient in continuous time, whatever the masses"
+        if hold_s:
+            damps_error = any(np.any(getattr(law, "Kd", 0.0)) for law in laws)
+            least_inertia = 0.5 * float(d.max()) * hold_s
+            scope = f"sufficient for arms above d h / 2 = {least_inertia:.3g} kg m^2"
+            if damps_error:
+                scope = "sufficient for heavy arms"
+
+        if len(laws) == 2:
+            return _judge_two_sites(self, K, d, scope)
+        return _judge_several_sites(self, K, d, scope)
+
 
 class StabilityCondition(NamedTuple):
     """Answer to the question whether a control law is stable at one arm of an experiment.
@@ -126,74 +193,6 @@ class StabilityCondition(NamedTuple):
     holds: bool | None
     text: str
     proves_decay: bool = False
-
-
-def judge_position_exchange(situation: LawSituation, damping: str) -> StabilityCondition | None:
-    """Evaluates whether arms that are coupled by springs and braked by dampers are stable.
-
-    The control law is called P+d. Its condition holds for arms of any mass. For two arms, it is
-    due to Nuno, Basanez, Ortega and Spong, IJRR 28, 2009. More than two arms need the same
-    stiffness K, damping d and delay T at all arms, and reversible weights with which they
-    follow each other, see `DominanceMatrix.find_balancing_weights`
-    (docs/theory/damping-conditions.md, 13).
-
-    A torque that is held for the period h acts h / 2 later. Therefore d is reduced by K h / 2
-    and T increased by h / 2, for arms whose least inertia is above d h / 2
-    (docs/reference/laws-springs.md).
-
-    Args:
-        situation: The situation of the site.
-        damping: Name of the law's attribute with d.
-
-    Returns:
-        The condition. It is undecided for delays that vary, for several tick rates, in task
-        space, if the sites have different laws or ratios Kd / K, and if another site does not
-        compensate gravity exactly. None if the law of this site does not compensate gravity
-        exactly, because then no condition is known.
-    """
-    laws = situation.laws
-    gravity_factors = [getattr(law, "gravity", 1.0) for law in laws]
-    if gravity_factors[situation.site] != 1.0:
-        return None
-    if situation.in_task_space:
-        # The stiffness belongs to coordinates of the end effector, and the damping to joints.
-        return StabilityCondition(None, "known only for joints that follow joints")
-    if not situation.alpha.any():
-        text = (
-            "no arm follows another, so there is no loop: stable in continuous time for every "
-            "delay and d > 0"
-        )
-        return StabilityCondition(True, text)
-    hold_s = situation.hold_s
-    K = np.array([getattr(law, "K", [np.nan]) for law in laws])
-    d = np.array([getattr(law, damping, [np.nan]) for law in laws])
-
-    # Cases in which no condition is known. A law without K has NaN here.
-    if np.isnan(situation.longest_s) or np.isnan(K).any():
-        text = "known for constant delays, and with this law at all sites"
-        return StabilityCondition(None, text)
-    if any(factor != 1.0 for factor in gravity_factors):
-        return StabilityCondition(None, "known for gravity = 1 at all sites")
-    error_dampings = [np.broadcast_to(getattr(law, "Kd", 0.0), K.shape[1:]) for law in laws]
-    ratios_s = np.array(error_dampings) / K
-    if not np.allclose(ratios_s, ratios_s[0], rtol=1e-9, atol=0.0):
-        # docs/theory/damping-conditions.md: with other ratios some arms are unstable
-        return StabilityCondition(None, "known for one ratio Kd / K at all sites")
-    if np.isnan(hold_s):
-        text = "known for held torques only with one tick rate at all sites"
-        return StabilityCondition(None, text)
-
-    scope = "sufficient in continuous time, whatever the masses"
-    if hold_s:
-        damps_error = any(np.any(getattr(law, "Kd", 0.0)) for law in laws)
-        least_inertia = 0.5 * float(d.max()) * hold_s
-        scope = f"sufficient for arms above d h / 2 = {least_inertia:.3g} kg m^2"
-        if damps_error:
-            scope = "sufficient for heavy arms"
-
-    if len(laws) == 2:
-        return _judge_two_sites(situation, K, d, scope)
-    return _judge_several_sites(situation, K, d, scope)
 
 
 def _judge_two_sites(

@@ -40,7 +40,7 @@ from .lane_deliveries import (
 from .lane_laws import LawCode
 from .lane_rows import LANES, LaneTable, Words, allocate_words, read_words
 from .lane_stages import STAGES_DTYPE, EndedRuns, RecordedHands, advance_site, run_block
-from .lane_structure import RunStructure, SiteStructure, find_structure
+from .lane_structure import RunStructure, SiteStructure
 
 _FIRST_PAGES = 256
 """Initial number of ticks whose states are kept, a power of two."""
@@ -235,7 +235,7 @@ def _find_addresses(run: CompiledRun, structure: RunStructure, clock: types.Type
 
     Args:
         run: One of the runs.
-        structure: The structure that all these runs have, see `find_structure`.
+        structure: The structure that all these runs have, see `RunStructure`.
         clock: Numba's type of the ticks, see `_list_argument_types`.
 
     Raises:
@@ -264,7 +264,7 @@ def explain_uncompilable(run: CompiledRun, clock: types.Type = types.int64) -> s
         The reason. Empty if all laws can be compiled.
     """
     try:
-        _find_addresses(run, find_structure(run), clock)
+        _find_addresses(run, RunStructure.find(run), clock)
     except NumbaError:
         return "control laws that cannot be compiled side by side"
     return ""
@@ -280,7 +280,7 @@ def read_assembly(run: CompiledRun, i: int) -> str:
         run: The run.
         i: Index of the site.
     """
-    structure = find_structure(run)
+    structure = RunStructure.find(run)
     layout = _find_layout(run)
     arguments = _list_argument_types(layout, structure, structure.sites[i])
     return LaneCode(_choose_code(layout), arguments).read_assembly()
@@ -314,7 +314,7 @@ def has_lane_code(run: CompiledRun) -> bool:
     Args:
         run: The run. `find_obstacle` must find no reason against computing it in a lane.
     """
-    structure = find_structure(run)
+    structure = RunStructure.find(run)
     layout = _find_layout(run)
     return all(
         LaneCode(
@@ -410,7 +410,7 @@ class LaneRun:
 
     Args:
         runs: The runs before their first tick (control period), at most `LANES`. They must have
-            the same structure, see `find_structure`, and no obstacle, see `find_obstacle`.
+            the same structure, see `RunStructure`, and no obstacle, see `find_obstacle`.
         record_rows: Number of latest records of each site (arm controller) that are kept, a
             power of two.
 
@@ -423,8 +423,8 @@ class LaneRun:
 
     def __init__(self, runs: Sequence[CompiledRun], record_rows: int = 1) -> None:
         assert 0 < len(runs) <= LANES
-        structure = find_structure(runs[0])
-        assert all(find_structure(run) == structure for run in runs)
+        structure = RunStructure.find(runs[0])
+        assert all(RunStructure.find(run) == structure for run in runs)
         assert all(run.ran_s == 0.0 for run in runs)
         self.runs = list(runs)
         self._structure = structure

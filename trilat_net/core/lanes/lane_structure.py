@@ -18,7 +18,7 @@ import numpy as np
 from ..arms.exogenous import OWN_KINDS
 from ..step.compiled_run import CompiledRun
 from ..step.site_setup import StaleAction
-from .lane_laws import LaneLaw, describe_lane_law
+from .lane_laws import LaneLaw
 from .lane_rows import Constants
 
 SITE_CONSTANTS: tuple[str, ...] = (
@@ -74,6 +74,43 @@ class RunStructure(NamedTuple):
     duration_s: float
     settled_rad: float
 
+    @classmethod
+    def find(cls, run: CompiledRun) -> "RunStructure":
+        """Returns the properties of a run that decide with which other runs it can be computed.
+
+        For example, two runs with the same control laws but different gains have the same
+        result.
+
+        Args:
+            run: The run. `find_obstacle` must find no reason against computing it in a lane.
+        """
+        memory = run.memory
+        tables = memory.tables
+        sites = []
+        pairs = zip(tables.site, tables.actors, memory.sums, strict=True)
+        for i, (site, actors, sums) in enumerate(pairs):
+            rows = _list_actors(actors)
+            columns = None if tables.channel is None else tables.channel.columns[i]
+            names = SITE_CONSTANTS
+            if site[0]["on_stale"] == StaleAction.GLIDE:
+                names = tuple(name for name in names if name not in _CHANGED_BY_GLIDE)
+            structure = SiteStructure(
+                constants=_read_constants(site[0], names),
+                actors=tuple(_read_constants(row, _ACTOR_CONSTANTS) for row in rows),
+                first_environment=int(sums["first_environment"]),
+                law=LaneLaw.describe(memory.compiled_laws.get(i), columns),
+                prismatic=_list_prismatic(tables.chain, i, int(site[0]["joints"])),
+            )
+            sites.append(structure)
+        return cls(
+            sites=tuple(sites),
+            peers=tables.links.shape[1],
+            ramps=tables.ramps.shape[1],
+            table=(tables.table.shape, tables.table.tobytes()),
+            duration_s=run.duration_s,
+            settled_rad=memory.settled_rad,
+        )
+
 
 def _read_constants(row: np.void, names: tuple[str, ...]) -> Constants:
     """Returns the values of integer fields of a row, with their names."""
@@ -116,42 +153,6 @@ def _list_prismatic(chain: Any, i: int, joints: int) -> tuple[int, ...]:
     return () if chain is None else tuple(chain["prismatic"][i, :joints].tolist())
 
 
-def find_structure(run: CompiledRun) -> RunStructure:
-    """Returns the properties of a run that decide with which other runs it can be computed.
-
-    For example, two runs with the same control laws but different gains have the same result.
-
-    Args:
-        run: The run. `find_obstacle` must find no reason against computing it in a lane.
-    """
-    memory = run.memory
-    tables = memory.tables
-    sites = []
-    pairs = zip(tables.site, tables.actors, memory.sums, strict=True)
-    for i, (site, actors, sums) in enumerate(pairs):
-        rows = _list_actors(actors)
-        columns = None if tables.channel is None else tables.channel.columns[i]
-        names = SITE_CONSTANTS
-        if site[0]["on_stale"] == StaleAction.GLIDE:
-            names = tuple(name for name in names if name not in _CHANGED_BY_GLIDE)
-        structure = SiteStructure(
-            constants=_read_constants(site[0], names),
-            actors=tuple(_read_constants(row, _ACTOR_CONSTANTS) for row in rows),
-            first_environment=int(sums["first_environment"]),
-            law=describe_lane_law(memory.compiled_laws.get(i), columns),
-            prismatic=_list_prismatic(tables.chain, i, int(site[0]["joints"])),
-        )
-        sites.append(structure)
-    return RunStructure(
-        sites=tuple(sites),
-        peers=tables.links.shape[1],
-        ramps=tables.ramps.shape[1],
-        table=(tables.table.shape, tables.table.tobytes()),
-        duration_s=run.duration_s,
-        settled_rad=memory.settled_rad,
-    )
-
-
 def describe_structure(run: CompiledRun) -> Hashable:
     """Returns a key for sorting runs into groups that can be simulated side by side.
 
@@ -163,4 +164,4 @@ def describe_structure(run: CompiledRun) -> Hashable:
     Returns:
         The structure of the run. If the run must be computed alone, the reason for this.
     """
-    return find_obstacle(run) or find_structure(run)
+    return find_obstacle(run) or RunStructure.find(run)

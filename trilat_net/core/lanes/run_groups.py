@@ -16,7 +16,7 @@ from collections.abc import Callable, Iterator, Sequence
 from ..step.compiled_run import CompiledRun
 from .lane_rows import LANES
 from .lane_run import LaneRun, explain_uncompilable, has_lane_code
-from .lane_structure import RunStructure, find_obstacle, find_structure
+from .lane_structure import RunStructure, find_obstacle
 
 LEAST_RUNS = 4
 """Number of runs from which lanes are faster than one run after the other."""
@@ -145,7 +145,7 @@ def group_runs(runs: Sequence[CompiledRun], record_rows: int = 1) -> Iterator[Ru
         if obstacle:
             yield RunGroup([index], [run], in_lanes=False, obstacle=obstacle)
         else:
-            groups.setdefault(find_structure(run), []).append(index)
+            groups.setdefault(RunStructure.find(run), []).append(index)
 
     # A group has at most as many runs as the vector code has lanes.
     for indices in groups.values():

@@ -30,7 +30,7 @@ from ...core import (
     Points,
     UserModel,
 )
-from ...fields import Frozen, KeyProblem, TomlTable, find_kinds
+from ...fields import Frozen, KeyProblem, TomlTable
 
 MAX_DELAY_MS = MAX_DELAY_US / 1000
 """Longest delay of a link, in ms."""
@@ -379,9 +379,7 @@ class OwnDelay(LinkBase, frozen=True, kw_only=True):
         return model._replace(call=address)
 
 
-DELAY_MODELS = {
-    str(kind.__struct_config__.tag): kind for kind in find_kinds(__name__, LinkBase)
-}
+DELAY_MODELS = {str(kind.__struct_config__.tag): kind for kind in LinkBase.find_kinds(__name__)}
 """Classes of all delay models, by the name of the model."""
 if TYPE_CHECKING:
     Link = LinkBase
