@@ -139,9 +139,6 @@ __all__ = [
     "RunGroup",
     "RunInputs",
     "TwinLanes",
-    "describe_structure",
-    "group_runs",
-    "prepare_lanes",
 ]
 
 if TYPE_CHECKING:
@@ -155,8 +152,7 @@ if TYPE_CHECKING:
     from .arms.task_space import POSE, POSITION
     from .arms.two_link_arm import ArmLinks, forward_kinematics, regressor
     from .lanes.lane_episodes import LaneEpisodes
-    from .lanes.lane_structure import describe_structure
-    from .lanes.run_groups import RunGroup, group_runs, prepare_lanes
+    from .lanes.run_groups import RunGroup
     from .lanes.twin_lanes import TwinLanes
     from .life.live_hand import (
         GRIP_NS,
@@ -240,8 +236,7 @@ else:
             "arms.two_link_arm": "ArmLinks forward_kinematics regressor",
             "arms.two_link_stages": "two_link_stages",
             "lanes.lane_episodes": "LaneEpisodes",
-            "lanes.lane_structure": "describe_structure",
-            "lanes.run_groups": "RunGroup group_runs prepare_lanes",
+            "lanes.run_groups": "RunGroup",
             "lanes.twin_lanes": "TwinLanes",
             "life.live_hand": (
                 "GRIP_NS HandCommand HandInForce HandReach HandRules SILENCE_NS TAKEN"

@@ -22,7 +22,6 @@ from ..links.channel import (
     LOST,
     advance_losses,
     delay_sample,
-    find_delay_us,
     find_due_ns,
     loses_samples,
     select_model,
@@ -34,6 +33,7 @@ from ..links.delay import (
     DelayKind,
     clamp_delay_us,
     draw_delay_us,
+    find_delay_us,
 )
 from ..links.link import ChannelArrays, LinkArrays, accept_sample, release_sample
 from ..links.philox import DrawKey, uniforms

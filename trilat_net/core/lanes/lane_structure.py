@@ -9,7 +9,6 @@ Invariant:
     - Two runs with the same structure use the same compiled code and the same number tables.
 """
 
-from collections.abc import Hashable
 from typing import Any, NamedTuple
 
 import numba
@@ -151,17 +150,3 @@ def find_obstacle(run: CompiledRun, *, hand_site: int = -1) -> str:
 def _list_prismatic(chain: Any, i: int, joints: int) -> tuple[int, ...]:
     """Returns 1 for each prismatic joint of a site and 0 for others; () for planar arms."""
     return () if chain is None else tuple(chain["prismatic"][i, :joints].tolist())
-
-
-def describe_structure(run: CompiledRun) -> Hashable:
-    """Returns a key for sorting runs into groups that can be simulated side by side.
-
-    The key is equal for runs that differ in numbers only, such as gains.
-
-    Args:
-        run: The run before its first tick.
-
-    Returns:
-        The structure of the run. If the run must be computed alone, the reason for this.
-    """
-    return find_obstacle(run) or RunStructure.find(run)
