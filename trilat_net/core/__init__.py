@@ -98,7 +98,6 @@ __all__ = [
     "DominanceMatrix",
     "LinkModel",
     "LinkSchedule",
-    "TraceEnd",
     "draw_pair",
     "link_key",
     # Live hands and hands of users
@@ -168,14 +167,7 @@ if TYPE_CHECKING:
     from .life.safeguards import BLEND_S
     from .life.session_life import HELD_OVERRUN_TICKS
     from .links.channel import LOST
-    from .links.delay import (
-        LINK_MODEL_DTYPE,
-        MAX_DELAY_US,
-        DelayKind,
-        LinkModel,
-        TraceEnd,
-        draw_pair,
-    )
+    from .links.delay import LINK_MODEL_DTYPE, MAX_DELAY_US, DelayKind, LinkModel, draw_pair
     from .links.dominance import ROW_SUM_TOLERANCE, DominanceMatrix
     from .links.link import AHEAD_LIMIT_NS
     from .links.link_schedule import LinkSchedule
@@ -246,9 +238,7 @@ else:
             "life.safeguards": "BLEND_S",
             "life.session_life": "HELD_OVERRUN_TICKS",
             "links.channel": "LOST",
-            "links.delay": (
-                "DelayKind LINK_MODEL_DTYPE LinkModel MAX_DELAY_US TraceEnd draw_pair"
-            ),
+            "links.delay": "DelayKind LINK_MODEL_DTYPE LinkModel MAX_DELAY_US draw_pair",
             "links.dominance": "DominanceMatrix ROW_SUM_TOLERANCE",
             "links.link": "AHEAD_LIMIT_NS",
             "links.link_schedule": "LinkSchedule",

@@ -122,6 +122,21 @@ class LinkModel(NamedTuple):
     stamp_ns: int = 0
     drawn_us: float = 0.0
 
+    @classmethod
+    def follow_trace(cls, at_end: str) -> "LinkModel":
+        """Creates a model whose delays are those of a recorded trace.
+
+        Args:
+            at_end: How the trace continues after its last entry: "hold" or "loop", see
+                `TraceEnd`.
+        """
+        return cls(kind=DelayKind.TRACE, at_end=TraceEnd[at_end.upper()])
+
+    @property
+    def has_ending_trace(self) -> bool:
+        """True if the delays are those of a trace that does not start again at its end."""
+        return self.kind == DelayKind.TRACE and self.at_end == TraceEnd.HOLD
+
 
 LINK_MODEL_DTYPE = np.dtype(
     (
