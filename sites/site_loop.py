@@ -46,7 +46,7 @@ from trilat_net.net import (
     encode,
     encode_sample,
     encode_state,
-    make_reader,
+    make_sample_reader,
 )
 from trilat_net.records import NS_PER_S, Arrival, Mode, TickRecord
 from trilat_net.scenario import Scenario
@@ -62,7 +62,7 @@ def make_sample_readers(setup: SiteSetup) -> list[Callable[[bytes], PeerSample |
         setup: Settings of the site. The decoders have the order of its links.
     """
     layouts = [setup.layout._replace(sent=link.channel.record_size) for link in setup.links]
-    return [make_reader(PeerSample, layout) for layout in layouts]
+    return [make_sample_reader(layout) for layout in layouts]
 
 
 _GLIDE_AHEAD_LIMIT_NS = NS_PER_S

@@ -22,8 +22,8 @@ from trilat_net.net import (
     EventPublisher,
     LateSites,
     SessionJoin,
+    SystemClock,
     describe_member,
-    make_system_clock,
     share_threads,
     topics,
 )
@@ -77,7 +77,7 @@ def run_site(
     share_threads()
 
     with Interrupt() as interrupt:
-        clock = make_system_clock(options.clock_offset_s, options.clock_drift_ppm)
+        clock = SystemClock.with_error(options.clock_offset_s, options.clock_drift_ppm)
 
         bus = options.connection.open_bus(
             clock=clock,

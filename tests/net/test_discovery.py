@@ -13,7 +13,7 @@ from trilat_net.app.running_session import RunningSession
 from trilat_net.errors import SessionError
 from trilat_net.net import discovery, topics
 from trilat_net.net.clock import SystemClock
-from trilat_net.net.connection import Connection, default_endpoint, find_free_endpoints
+from trilat_net.net.connection import Connection, DefaultEndpoints, find_free_endpoints
 from trilat_net.net.discovery import SessionMembers, connect_to_session
 from trilat_net.net.membership import EventPublisher, liveliness_token
 from trilat_net.net.messages import VERSION, Info
@@ -136,7 +136,7 @@ def test_answers_of_other_versions_name_their_member() -> None:
 
 def test_waiting_recorders_announce_themselves_first() -> None:
     session = f"discovery-{CLOCK.monotonic_ns()}"
-    first = ZenohBus([default_endpoint(session, 0)])
+    first = ZenohBus([DefaultEndpoints(session).of_site(0)])
     presence = first.presence(topics.presence_key(session, "*"))
     scenario = load_scenario("two_sites")
     info = answer_info("m", 1, scenario=scenario.text, scenario_sha256=scenario.sha256)

@@ -26,12 +26,12 @@ from ..net import (
     Bus,
     Clock,
     Connection,
+    DefaultEndpoints,
     Info,
     LinkStats,
     MemberQuery,
     Pinger,
     connect_to_session,
-    default_endpoint,
     read_messages,
 )
 
@@ -288,7 +288,7 @@ def ping_session(
         raise RunFailed(str(error)) from None
 
     if not ping.infos:
-        endpoints = connection.connect or [default_endpoint(session, 0)]
+        endpoints = connection.connect or [DefaultEndpoints(session).of_site(0)]
         raise RunFailed(
             f"no member of session {session!r} answered at {', '.join(map(str, endpoints))} "
             f"within {timeout_s:g} s; check the name of the session and whether the session "

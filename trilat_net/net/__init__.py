@@ -25,6 +25,7 @@ __all__ = [
     "ROUTER",
     "Bus",
     "Connection",
+    "DefaultEndpoints",
     "Endpoint",
     "Inbox",
     "Query",
@@ -33,18 +34,12 @@ __all__ = [
     "StampedInbox",
     "ZenohBus",
     "check_hosts",
-    "default_endpoint",
-    "default_endpoints",
     "describe_role",
-    "find_endpoint_addresses",
     "find_free_endpoints",
     "is_loopback",
     "make_site_known",
     "matches_key",
     "open_zenoh",
-    "read_zenoh_file",
-    "reserve_session_endpoints",
-    "run_router",
     "share_threads",
     "stop_at_once",
     # Keys of members
@@ -85,7 +80,6 @@ __all__ = [
     "HandViewMessage",
     "Info",
     "LinkStats",
-    "ModeMeaning",
     "OrderName",
     "PeerSample",
     "PeerSeen",
@@ -102,7 +96,7 @@ __all__ = [
     "join_states",
     "json_schema",
     "make_decoder",
-    "make_reader",
+    "make_sample_reader",
     "messages",
     "number_message",
     "skipped_numbers",
@@ -123,7 +117,6 @@ __all__ = [
     "SiteStandIn",
     "answer_backfill",
     "find_turn_ns",
-    "make_system_clock",
     # Joining and finding a session
     "REPLY_TIMEOUT_S",
     "Epoch",
@@ -135,9 +128,7 @@ __all__ = [
     "describe_member",
     "SessionMembers",
     "new_boot",
-    "open_playback_bus",
     "read_messages",
-    "read_records",
     # Programs outside a session
     "ArmClient",
     "Hand",
@@ -149,25 +140,16 @@ if TYPE_CHECKING:
     from . import messages, topics
     from .arm_client import ArmClient, Hand, HandSender, SiteClient, SwitchClient
     from .bus import Bus, Inbox, Query, QueryInbox, StampedInbox, matches_key
-    from .clock import Clock, SystemClock, make_system_clock
+    from .clock import Clock, SystemClock
     from .connection import (
         ENCRYPTED,
         ENDS_SOON,
         Connection,
-        default_endpoint,
-        default_endpoints,
-        find_endpoint_addresses,
+        DefaultEndpoints,
         find_free_endpoints,
         is_loopback,
-        reserve_session_endpoints,
-        run_router,
     )
-    from .discovery import (
-        REPLY_TIMEOUT_S,
-        SessionMembers,
-        connect_to_session,
-        open_playback_bus,
-    )
+    from .discovery import REPLY_TIMEOUT_S, SessionMembers, connect_to_session
     from .host_names import check_hosts
     from .known_sites import make_site_known, stop_at_once
     from .member_keys import (
@@ -190,7 +172,6 @@ if TYPE_CHECKING:
         describe_member,
         new_boot,
         read_messages,
-        read_records,
     )
     from .messages import (
         HALTED_MODES,
@@ -205,7 +186,6 @@ if TYPE_CHECKING:
         Event,
         Info,
         LinkStats,
-        ModeMeaning,
         PeerSample,
         RecorderStats,
         Stamp,
@@ -255,10 +235,10 @@ if TYPE_CHECKING:
         encode_state,
         join_states,
         make_decoder,
-        make_reader,
+        make_sample_reader,
         split_states,
     )
-    from .zenoh_bus import RouterSilent, ZenohBus, open_zenoh, read_zenoh_file, share_threads
+    from .zenoh_bus import RouterSilent, ZenohBus, open_zenoh, share_threads
     from .zenoh_config import BRIDGE, OPERATOR, ROLES, ROUTER, Endpoint, describe_role
 else:
     __getattr__ = import_on_use(
@@ -266,13 +246,12 @@ else:
         {
             "arm_client": "ArmClient Hand HandSender SiteClient SwitchClient",
             "bus": "Bus Inbox Query QueryInbox StampedInbox matches_key",
-            "clock": "Clock SystemClock make_system_clock",
+            "clock": "Clock SystemClock",
             "connection": (
-                "Connection ENCRYPTED ENDS_SOON default_endpoint default_endpoints "
-                "find_endpoint_addresses find_free_endpoints is_loopback "
-                "reserve_session_endpoints run_router"
+                "Connection DefaultEndpoints ENCRYPTED ENDS_SOON find_free_endpoints "
+                "is_loopback"
             ),
-            "discovery": "REPLY_TIMEOUT_S SessionMembers connect_to_session open_playback_bus",
+            "discovery": "REPLY_TIMEOUT_S SessionMembers connect_to_session",
             "host_names": "check_hosts",
             "known_sites": "make_site_known stop_at_once",
             "member_keys": (
@@ -281,12 +260,12 @@ else:
             ),
             "membership": (
                 "Epoch EventPublisher LateSites MemberQuery describe_member new_boot "
-                "read_messages read_records"
+                "read_messages"
             ),
             "messages": (
-                "Event HALTED_MODES Info LinkStats MODES MODE_WORDS ModeMeaning PeerSample "
-                "READABLE RESTING_MODES RecorderStats SENT_TIME_SINCE STATE_VECTORS Stamp "
-                "State TASK_VECTORS TickNumber VERSION json_schema messages"
+                "Event HALTED_MODES Info LinkStats MODES MODE_WORDS PeerSample READABLE "
+                "RESTING_MODES RecorderStats SENT_TIME_SINCE STATE_VECTORS Stamp State "
+                "TASK_VECTORS TickNumber VERSION json_schema messages"
             ),
             "offset": "OffsetEstimator OffsetLimit",
             "pinging": "PING_PACE_NS Pinger answer_backfill",
@@ -306,9 +285,9 @@ else:
             ),
             "wire": (
                 "MAX_BYTES decode encode encode_sample encode_state join_states "
-                "make_decoder make_reader split_states"
+                "make_decoder make_sample_reader split_states"
             ),
-            "zenoh_bus": "RouterSilent ZenohBus open_zenoh read_zenoh_file share_threads",
+            "zenoh_bus": "RouterSilent ZenohBus open_zenoh share_threads",
             "zenoh_config": "BRIDGE Endpoint OPERATOR ROLES ROUTER describe_role",
         },
     )

@@ -18,11 +18,11 @@ from dataclasses import replace
 import msgspec
 from msgspec import UNSET
 
-from ..errors import ScenarioError, SessionError, UsageError, WireError
+from ..errors import ScenarioError, SessionError, WireError
 from . import topics
 from .bus import Bus
 from .clock import Clock
-from .connection import Connection, default_endpoint, default_endpoints
+from .connection import Connection, DefaultEndpoints
 from .known_sites import find_known_endpoints
 from .membership import MemberQuery, liveliness_token
 from .messages import Event, Info
@@ -174,6 +174,26 @@ class SessionMembers:
                 first = backfill.first + len(backfill.payloads)
                 published = backfill.made
 
+    def require_absent(self, stopped: Callable[[], bool]) -> None:
+        """Checks that no member is present, before the session's name is used for a playback.
+
+        Args:
+            stopped: Function that returns True to end the check early.
+
+        Raises:
+            SessionError: A site (arm controller) of the session replies.
+        """
+        for info in self.find(stopped=stopped, timeout_s=_NAME_CHECK_S):
+            if info.member == topics.RECORDER:
+                continue
+            state = "is waiting to begin"
+            if info.running:
+                state = f"is running ({info.member} is at tick {info.ticks})"
+            raise SessionError(
+                f"session {self._session!r} already exists and {state}; replay the log under "
+                "another name with --prefix or --session"
+            )
+
     def _query_once(
         self,
         key: str,
@@ -253,7 +273,8 @@ def connect_to_session(
         if connection.connect is None and recorder_boot is None:
             connection = replace(connection, connect=find_known_endpoints(session, connection))
         if connection.connect is None:
-            first_endpoint = default_endpoint(session, 0)
+            default_endpoints = DefaultEndpoints(session)
+            first_endpoint = default_endpoints.of_site(0)
             first_bus = connect(replace(connection, listen=(), connect=[first_endpoint]))
             sites = None
             if first_bus is not None:
@@ -271,7 +292,7 @@ def connect_to_session(
             if sites is None:  # the caller has stopped the search
                 yield None
                 return
-            endpoints = list(default_endpoints(session, sites).values()) or [first_endpoint]
+            endpoints = list(default_endpoints.by_site(sites).values()) or [first_endpoint]
             connection = replace(connection, connect=endpoints)
         yield connect(connection)
 
@@ -319,82 +340,7 @@ def _query_sites(
     if stopped():
         return None
     raise SessionError(
-        f"no site of session {session!r} answered at {default_endpoint(session, 0)} "
+        f"no site of session {session!r} answered at {DefaultEndpoints(session).of_site(0)} "
         f"within {timeout_s:g} s; check the name of the session, or name other endpoints with "
         "--connect"
     )
-
-
-def open_playback_bus(
-    connection: Connection,
-    clock: Clock,
-    session: str,
-    stopped: Callable[[], bool],
-    say: Callable[[str], None],
-) -> Bus | None:
-    """Opens the network connection of a playback, which publishes the messages of a log again.
-
-    If the port is in use, the error says whether a session of the same name uses it.
-
-    Args:
-        connection: Endpoints of the playback.
-        clock: Clock of the caller.
-        session: Name under which the log will be played back.
-        stopped: Function that returns True to give up.
-        say: Function that prints a line for the user.
-
-    Returns:
-        The connection. None if `stopped` returned True.
-
-    Raises:
-        SessionError: A session of the same name is running.
-        UsageError: An endpoint cannot be used.
-    """
-    try:
-        bus = connection.open_bus(clock=clock, stopped=stopped, timeout_s=None, say=say)
-    except UsageError:
-        if not connection.listen:
-            raise
-        # The port may be in use by a site of a session with the same name.
-        target = replace(connection, listen=(), connect=connection.listen)
-        session_bus = target.open_bus(clock=clock, stopped=stopped, timeout_s=1.0, say=say)
-        if session_bus is not None:
-            with closing(session_bus):
-                refuse_running_session(session_bus, clock, session, stopped)
-        raise
-    if bus is not None:
-        with ExitStack() as stack:
-            stack.enter_context(closing(bus))
-            refuse_running_session(bus, clock, session, stopped)
-            stack.pop_all()  # the connection stays open
-    return bus
-
-
-def refuse_running_session(
-    bus: Bus,
-    clock: Clock,
-    session: str,
-    stopped: Callable[[], bool],
-) -> None:
-    """Checks that no process of a session is present, before its name is used for a playback.
-
-    Args:
-        bus: Network connection that would reach the session.
-        clock: Clock of the caller.
-        session: Name of the session.
-        stopped: Function that returns True to end the check early.
-
-    Raises:
-        SessionError: A site (arm controller) of that session replies.
-    """
-    members = SessionMembers(bus, clock, session)
-    for info in members.find(stopped=stopped, timeout_s=_NAME_CHECK_S):
-        if info.member == topics.RECORDER:
-            continue
-        state = "is waiting to begin"
-        if info.running:
-            state = f"is running ({info.member} is at tick {info.ticks})"
-        raise SessionError(
-            f"session {session!r} already exists and {state}; replay the log under another "
-            "name with --prefix or --session"
-        )

@@ -101,43 +101,29 @@ def liveliness_token(session: str, member: str, boot: int) -> str:
     return topics.key(session, member, topics.ALIVE) + f"/{boot}"
 
 
-def read_messages(inbox: Inbox, kind: type[M]) -> Iterator[M]:
+def read_messages(inbox: Inbox, kind: type[M], layout: Layout | None = None) -> Iterator[M]:
     """Removes all waiting messages from an inbox, and yields those of one type.
 
     Payloads that cannot be decoded as this type are skipped without an error, because any
-    program on the network can publish under the key of the inbox.
+    program on the network can publish under the key of the inbox. Sites (arm controllers)
+    publish their records in blocks. If a record of a block cannot be decoded, the rest of the
+    block is skipped as well.
 
     Args:
         inbox: Queue of the encoded messages that have arrived.
         kind: Expected type of the messages.
+        layout: Expected numbers of joints and peers (other sites). A message that differs
+            counts as undecodable. If None, all numbers are accepted.
 
     Yields:
         The decoded messages, in the order of their arrival.
     """
     while (message := inbox.poll()) is not None:
-        _key, payload = message
+        _key, block = message
         # Sites and recorders count the payloads that they cannot decode.
         with suppress(WireError):
-            yield decode(payload, kind)
-
-
-def read_records(inbox: Inbox, layout: Layout | None = None) -> Iterator[State]:
-    """Removes all waiting messages from an inbox, and yields the records that they contain.
-
-    A record is the result of one tick of a site's control loop. Sites (arm controllers) publish
-    their records in blocks. If a record of a block cannot be decoded, that record and the rest
-    of the block are skipped without an error.
-
-    Args:
-        inbox: Inbox of the records of one site.
-        layout: Expected numbers of joints and peers (other sites). A record that differs counts
-            as undecodable. If None, all numbers are accepted.
-    """
-    while (message := inbox.poll()) is not None:
-        _key, block = message
-        with suppress(WireError):
-            for payload in split_states(block):
-                yield decode(payload, State, layout=layout)
+            for payload in split_states(block) if kind is State else [block]:
+                yield decode(payload, kind, layout=layout)
 
 
 class EventPublisher:

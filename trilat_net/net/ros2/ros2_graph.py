@@ -37,7 +37,7 @@ import zenoh
 from zenoh import CongestionControl, Reliability, handlers
 
 from ...errors import TrilatError, UsageError
-from .. import Clock, Endpoint, check_hosts, find_endpoint_addresses, open_zenoh
+from .. import Clock, Endpoint, check_hosts, open_zenoh
 
 TYPE_HASHES = {
     "diagnostic_msgs/msg/DiagnosticArray": (
@@ -459,7 +459,7 @@ class Ros2Graph:
         distro: str = "jazzy",
     ) -> None:
         """Connects to a Zenoh router of ROS 2, and announces a node to ROS 2 programs."""
-        check_hosts(find_endpoint_addresses(routers))
+        check_hosts(routers)
         self._session = open_zenoh(
             listen=[],
             connect=routers,
