@@ -140,37 +140,38 @@ class LogCheckReport(CheckReport):
             findings = [_add_memory_advice(finding, log, result) for finding in findings]
         return LogCheckReport(log, result, findings)
 
+    @classmethod
+    def check_files(
+        cls, sources: Sequence[str], min_coverage: float, allowed: CodeConsents
+    ) -> list[Finding]:
+        """Checks one log, as a function that a worker process of a pool can run.
+
+        Many logs can thus be checked in parallel: the arguments and the result can be sent to
+        another process. A user's control law that cannot be created gives a failed finding
+        instead of an error.
+
+        Args:
+            sources: Paths of the files that the log consists of.
+            min_coverage: Smallest fraction of the ticks (control periods) of every site that
+                must be compared.
+            allowed: Permissions to run users' code, in addition to the permissions of this
+                process.
+
+        Returns:
+            One finding for each check.
+        """
+        allowed_code.update(allowed)
+        log = open_log(*sources)
+        try:
+            return cls.of_log(log, virtual=True, min_coverage=min_coverage).findings
+        except ScenarioError as error:
+            return [Finding("executed again", f"cannot be: {error}", False)]
+
 
 def _to_range(gap: tuple[str, int, int]) -> dict[str, Any]:
     """Returns a range of ticks as plain values."""
     site, first, last = gap
     return {"site": site, "first": first, "last": last}
-
-
-def check_log_files(
-    sources: Sequence[str], min_coverage: float, allowed: CodeConsents
-) -> list[Finding]:
-    """Checks one log, as a function that a worker process of a pool can run.
-
-    Many logs can thus be checked in parallel: the arguments and the result can be sent to
-    another process. A user's control law that cannot be created gives a failed finding instead
-    of an error.
-
-    Args:
-        sources: Paths of the files that the log consists of.
-        min_coverage: Smallest fraction of the ticks (control periods) of every site that must
-            be compared.
-        allowed: Permissions to run users' code, in addition to the permissions of this process.
-
-    Returns:
-        One finding for each check.
-    """
-    allowed_code.update(allowed)
-    log = open_log(*sources)
-    try:
-        return LogCheckReport.of_log(log, virtual=True, min_coverage=min_coverage).findings
-    except ScenarioError as error:
-        return [Finding("executed again", f"cannot be: {error}", False)]
 
 
 def _check_log(

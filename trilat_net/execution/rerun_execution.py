@@ -50,9 +50,7 @@ from .resumption import (
 from .verification import (
     PROGRESS_EVERY,
     RecordDifference,
-    equal_bits,
     equal_record,
-    find_first_difference,
 )
 from .virtual_network import Deliveries
 
@@ -606,11 +604,10 @@ class RerunSite:
             if not same and not self._changed and self._inputs.is_uncertain(state, output):
                 return self._keep_record(row)
             if not same and self.first is None:
-                self.first = find_first_difference(
+                self.first = RecordDifference.find(
                     logged=state,
                     computed=comparable,
                     peers=self._site_log.peers,
-                    equal=equal_bits,
                     channel=self._channel,
                 )
 

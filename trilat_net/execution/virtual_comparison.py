@@ -18,7 +18,6 @@ from contextlib import suppress
 from functools import partial
 from typing import NamedTuple
 
-import msgspec
 import numpy as np
 
 from .. import process
@@ -26,15 +25,12 @@ from ..core import PlantState, Site
 from ..errors import LawFailed, LogError
 from ..log import Log, Progress, SiteLog
 from ..records import NS_PER_S, TickRecord
-from ..scenario import Scenario
 from . import virtual
 from .resumption import ArrivalEntry, find_recorded_hand
 from .verification import (
     PROGRESS_EVERY,
     RecordDifference,
-    equal_bits,
     equal_record,
-    find_first_difference,
 )
 from .virtual_network import Deliveries, Network, RecordedNetwork
 
@@ -113,7 +109,7 @@ def _compare_records(
             if equal_record(state, computed, peers):
                 identical += 1
                 continue
-            difference = find_first_difference(state, computed, peers, equal_bits)
+            difference = RecordDifference.find(state, computed, peers)
             if first is None or (difference is not None and difference.tick < first.tick):
                 first = difference
     except LawFailed as failure:  # the law did not fail when the log was recorded
@@ -286,7 +282,7 @@ def compare_with_virtual(log: Log, progress: Progress | None = None) -> _Virtual
         progress: Function that is called now and then with the number of executed ticks and
             their total.
     """
-    scenario = _cut_to_records(log)
+    scenario = virtual.cut_to_records(log)
     total = 2 * sum(map(scenario.ticks, scenario.names))
     peers = {name: scenario.peers(name) for name in scenario.names}
     arm_states = {
@@ -350,27 +346,3 @@ def _read_arrivals(log: Log, name: str) -> Mapping[int, Sequence[ArrivalEntry]]:
     with suppress(LogError):
         return Deliveries.complete(site_log, rates_hz, ends).entries
     return Deliveries.read(site_log).entries
-
-
-def _cut_to_records(log: Log) -> Scenario:
-    """Returns the scenario of a log, shortened so that it ends at the last record."""
-    ends_s = [
-        (log[name].last_tick + 1) / log[name].rate_hz for name in log.sites if len(log[name])
-    ]
-    duration_s = min(log.scenario.duration_s, max(ends_s, default=log.scenario.duration_s))
-    return msgspec.structs.replace(log.scenario, duration_s=duration_s)
-
-
-def simulate_without_operators(log: Log) -> Log:
-    """Simulates the experiment of a log in virtual time, but without operators.
-
-    An operator is a person or program that moves an arm. The result shows how the arms move
-    without operators.
-
-    Args:
-        log: The log that contains the scenario.
-
-    Returns:
-        The log of the simulation.
-    """
-    return virtual.simulate_scenario(_cut_to_records(log).without_hands())
