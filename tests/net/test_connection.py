@@ -17,7 +17,7 @@ from trilat_net.net.connection import (
     find_free_endpoints,
 )
 from trilat_net.net.zenoh_bus import ZenohBus
-from trilat_net.net.zenoh_config import ZenohFile, check_zenoh_file
+from trilat_net.net.zenoh_config import ZenohFile
 
 HERE = ["tcp/127.0.0.1:1"]
 THERE = ["tcp/127.0.0.1:2"]
@@ -27,7 +27,7 @@ C = "tcp/c:1"
 
 
 def check_file(**stated: object) -> ZenohFile:
-    return check_zenoh_file("mine.json5", stated, lambda _: "")
+    return ZenohFile.check("mine.json5", stated, lambda _: "")
 
 
 def make_member_connection(

@@ -11,13 +11,14 @@ from sites.change_server import ChangeServer
 from tests.net.manual_clock import ManualClock
 from trilat_net.app.running_session import RunningSession
 from trilat_net.errors import SessionError
-from trilat_net.net import discovery, topics
+from trilat_net.net import topics
 from trilat_net.net.clock import SystemClock
 from trilat_net.net.connection import Connection, DefaultEndpoints, find_free_endpoints
-from trilat_net.net.discovery import SessionMembers, connect_to_session
+from trilat_net.net.discovery import connect_to_session
 from trilat_net.net.membership import EventPublisher, liveliness_token
 from trilat_net.net.messages import VERSION, Info
 from trilat_net.net.requests import ChangeReply, ChangeRequest
+from trilat_net.net.session_members import SessionMembers
 from trilat_net.net.wire import encode
 from trilat_net.net.zenoh_bus import ZenohBus
 from trilat_net.scenario import load_scenario, parse_scenario
@@ -64,7 +65,7 @@ class Answering:
 
 @pytest.fixture(autouse=True)
 def impatient(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(discovery, "REPLY_TIMEOUT_S", 0.8)
+    monkeypatch.setattr(session_members, "REPLY_TIMEOUT_S", 0.8)
 
 
 @pytest.fixture

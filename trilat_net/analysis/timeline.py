@@ -19,7 +19,7 @@ import numpy as np
 from ..core import HELD_OVERRUN_TICKS, DelayKind, LifeAlarm
 from ..errors import count_nouns
 from ..log import Log
-from ..net import MODES
+from ..net import MODES, ModeMeaning
 from ..scenario import Change, LinkBase, describe_event, find_requester
 
 
@@ -84,6 +84,14 @@ class _ModeInterval(NamedTuple):
     mode: str
     from_s: float
     to_s: float
+
+    @property
+    def meaning(self) -> ModeMeaning:
+        """A sentence on what the arm does in this mode, such as holding its position.
+
+        Names of modes such as "hold" explain too little to a reader.
+        """
+        return MODES[self.mode]
 
 
 class _RaisedAlarm(NamedTuple):

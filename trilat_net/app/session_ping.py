@@ -29,8 +29,8 @@ from ..net import (
     DefaultEndpoints,
     Info,
     LinkStats,
-    MemberQuery,
     Pinger,
+    SessionMembers,
     connect_to_session,
     read_messages,
 )
@@ -111,7 +111,7 @@ class SessionPing:
         self._clock = clock
         self._session = session
         self._trips_per_member = count
-        self._members = MemberQuery(bus, clock, session)
+        self._members = SessionMembers(bus, clock, session)
         self._stats = bus.inbox(topics.key(session, "*", topics.LINK), 256)
         self.pinger = Pinger(bus, clock, session, count)
         self._first_ns: int | None = None

@@ -149,39 +149,39 @@ class FusedRun(CompiledRun):
                 return f"records of {name} are missing"
         return ""
 
+    @staticmethod
+    def read_inputs(log: Log) -> RunInputs:
+        """Reads from a log everything that is needed to repeat its run.
 
-def read_run_inputs(log: Log) -> RunInputs:
-    """Reads from a log everything that is needed to repeat its run.
+        These inputs are the ticks (periods of the control loop) in which samples (sent states)
+        of other sites arrived, the changes of settings, and the actions of live operators
+        (persons or programs that moved an arm). The run must be repeatable, see
+        `explain_not_repeatable`.
 
-    These inputs are the ticks (periods of the control loop) in which samples (sent states) of
-    other sites arrived, the changes of settings, and the actions of live operators (persons or
-    programs that moved an arm). The run must be repeatable, see
-    `FusedRun.explain_not_repeatable`.
+        Args:
+            log: Log of the run.
 
-    Args:
-        log: Log of the run.
+        Returns:
+            The inputs, as the argument `inputs`.
 
-    Returns:
-        The inputs, ready for `FusedRun`.
+        Raises:
+            LogError: The log contains a text that is not a change of the scenario.
+        """
+        names = log.scenario.names
+        ticks = max(len(log[name]) for name in log.sites)
+        inputs = RunInputs.prompt(len(names))._replace(changes=_read_changes(log))
+        # In a log of virtual time, all samples arrived at once.
+        if log.driver != "virtual":
+            first_arrivals, sample_ticks, late_ns = _read_arrivals(log, ticks)
+            feed = inputs.feed._replace(first=first_arrivals, samples=sample_ticks)
+            inputs = inputs._replace(feed=feed, late_ns=late_ns)
 
-    Raises:
-        LogError: The log contains a text that is not a change of the scenario.
-    """
-    names = log.scenario.names
-    ticks = max(len(log[name]) for name in log.sites)
-    inputs = RunInputs.prompt(len(names))._replace(changes=_read_changes(log))
-    # In a log of virtual time, all samples arrived at once.
-    if log.driver != "virtual":
-        first_arrivals, sample_ticks, late_ns = _read_arrivals(log, ticks)
-        feed = inputs.feed._replace(first=first_arrivals, samples=sample_ticks)
-        inputs = inputs._replace(feed=feed, late_ns=late_ns)
-
-    setups = [log.scenario.setup(name) for name in names]
-    sites = [i for i, setup in enumerate(setups) if setup.live_actor >= 0]
-    inputs = inputs.with_hands(setups, sites, ticks)
-    for i in sites:
-        inputs.write_actions(i, 0, log[names[i]].hand)
-    return inputs
+        setups = [log.scenario.setup(name) for name in names]
+        sites = [i for i, setup in enumerate(setups) if setup.live_actor >= 0]
+        inputs = inputs.with_hands(setups, sites, ticks)
+        for i in sites:
+            inputs.write_actions(i, 0, log[names[i]].hand)
+        return inputs
 
 
 def _read_changes(log: Log) -> list[tuple[int, int, CoreChange]]:

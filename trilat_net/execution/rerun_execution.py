@@ -431,7 +431,7 @@ class RerunTick(NamedTuple):
     stats: LinkStats | None
 
 
-class RerunSite:
+class _RerunSite:
     """Executes one site (arm controller) of a log again, tick (control period) by tick.
 
     The state of the site is certain if it follows from the ticks before. It becomes uncertain
@@ -693,7 +693,7 @@ class RerunExecution:
         # The computed samples are added to these dictionaries during the execution.
         samples |= self._recent
         self.sites = {
-            name: RerunSite(
+            name: _RerunSite(
                 log=log,
                 request=request,
                 name=name,
@@ -782,7 +782,7 @@ class RerunExecution:
             if progress is not None and executed % PROGRESS_EVERY == 0:
                 progress(executed, total)
 
-    def _keep_sample(self, site: RerunSite) -> None:
+    def _keep_sample(self, site: _RerunSite) -> None:
         """Stores the newest state of an executed site, which its peers will receive.
 
         States that are too old to arrive are removed.

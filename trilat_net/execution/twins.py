@@ -30,7 +30,7 @@ from ..errors import NotRepeatable, UsageError, count_nouns
 from ..log import Ints, Log
 from ..records import NS_PER_S
 from ..scenario import Scenario
-from .fused import FusedRun, read_run_inputs
+from .fused import FusedRun
 
 MAX_PUSHES = 32
 """Largest number of pushes that are chosen if the user states no number."""
@@ -257,7 +257,7 @@ class Twins(NamedTuple):
             scenario=log.scenario,
             pushes=pushes,
             ticks=[len(log[name]) for name in log.scenario.names],
-            inputs=read_run_inputs(log),
+            inputs=FusedRun.read_inputs(log),
             log=log,
         )
 

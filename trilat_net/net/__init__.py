@@ -80,6 +80,7 @@ __all__ = [
     "HandViewMessage",
     "Info",
     "LinkStats",
+    "ModeMeaning",
     "OrderName",
     "PeerSample",
     "PeerSeen",
@@ -122,7 +123,6 @@ __all__ = [
     "Epoch",
     "EventPublisher",
     "LateSites",
-    "MemberQuery",
     "SessionJoin",
     "connect_to_session",
     "describe_member",
@@ -149,7 +149,7 @@ if TYPE_CHECKING:
         find_free_endpoints,
         is_loopback,
     )
-    from .discovery import REPLY_TIMEOUT_S, SessionMembers, connect_to_session
+    from .discovery import connect_to_session
     from .host_names import check_hosts
     from .known_sites import make_site_known, stop_at_once
     from .member_keys import (
@@ -168,7 +168,6 @@ if TYPE_CHECKING:
         Epoch,
         EventPublisher,
         LateSites,
-        MemberQuery,
         describe_member,
         new_boot,
         read_messages,
@@ -186,6 +185,7 @@ if TYPE_CHECKING:
         Event,
         Info,
         LinkStats,
+        ModeMeaning,
         PeerSample,
         RecorderStats,
         Stamp,
@@ -210,6 +210,7 @@ if TYPE_CHECKING:
         PeerSeen,
     )
     from .session import SessionJoin
+    from .session_members import REPLY_TIMEOUT_S, SessionMembers
     from .site_stand_in import SiteStandIn
     from .timing import (
         ClockNotice,
@@ -251,7 +252,7 @@ else:
                 "Connection DefaultEndpoints ENCRYPTED ENDS_SOON find_free_endpoints "
                 "is_loopback"
             ),
-            "discovery": "REPLY_TIMEOUT_S SessionMembers connect_to_session",
+            "discovery": "connect_to_session",
             "host_names": "check_hosts",
             "known_sites": "make_site_known stop_at_once",
             "member_keys": (
@@ -259,13 +260,12 @@ else:
                 "create_keys read_member_keys renew_keys"
             ),
             "membership": (
-                "Epoch EventPublisher LateSites MemberQuery describe_member new_boot "
-                "read_messages"
+                "Epoch EventPublisher LateSites describe_member new_boot read_messages"
             ),
             "messages": (
-                "Event HALTED_MODES Info LinkStats MODES MODE_WORDS PeerSample READABLE "
-                "RESTING_MODES RecorderStats SENT_TIME_SINCE STATE_VECTORS Stamp State "
-                "TASK_VECTORS TickNumber VERSION json_schema messages"
+                "Event HALTED_MODES Info LinkStats MODES MODE_WORDS ModeMeaning PeerSample "
+                "READABLE RESTING_MODES RecorderStats SENT_TIME_SINCE STATE_VECTORS Stamp "
+                "State TASK_VECTORS TickNumber VERSION json_schema messages"
             ),
             "offset": "OffsetEstimator OffsetLimit",
             "pinging": "PING_PACE_NS Pinger answer_backfill",
@@ -275,6 +275,7 @@ else:
                 "OrderName PeerSeen"
             ),
             "session": "SessionJoin",
+            "session_members": "REPLY_TIMEOUT_S SessionMembers",
             "site_stand_in": "SiteStandIn",
             "timing": (
                 "ClockNotice LinkTimingMonitor LoopStats PeerClock SiteTiming find_turn_ns"

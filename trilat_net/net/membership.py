@@ -36,8 +36,8 @@ from . import topics
 from .bus import Bus, Inbox
 from .clock import Clock
 from .messages import Event, Info, State
-from .pinging import RepeatedQuery
 from .scenario_difference import describe_scenario_difference
+from .session_members import SessionMembers
 from .wire import M, decode, encode, split_states
 
 
@@ -201,54 +201,6 @@ class EventPublisher:
             query.reply(encode(self.info))
 
 
-class MemberQuery:
-    """Queries the members of a session repeatedly for their identities.
-
-    A query may be lost, and members (processes of a session) may start at any time. Therefore
-    the query is repeated as long as the owner of this object calls `poll`.
-
-    Args:
-        bus: Network connection of the member that sends the query.
-        clock: Clock of that member.
-        session: Name of the session.
-        member: Name of the member to query. "*" queries all members.
-
-    Attributes:
-        unreadable: Reasons why replies cannot be decoded, by the name of the member that sent
-            the reply.
-    """
-
-    def __init__(
-        self,
-        bus: Bus,
-        clock: Clock,
-        session: str,
-        member: str = "*",
-    ) -> None:
-        self.unreadable: dict[str, str] = {}
-        self._query = RepeatedQuery(bus, clock, topics.key(session, member, topics.INFO))
-
-    def poll(self) -> Iterator[Info]:
-        """Yields the identities that have arrived, and repeats the query if it is due.
-
-        A reply is skipped if it cannot be decoded, or if the name in the identity differs from
-        the name in the key under which the reply arrived.
-        """
-        while (reply := self._query.poll()) is not None:
-            _, key, payload = reply
-            parts = topics.parse_key(key)
-            if parts is None:
-                continue
-            try:
-                info = decode(payload, Info)
-            except WireError as error:  # another version of this program, or another program
-                self.unreadable[parts.member] = str(error)
-                continue
-            if parts.member == info.member:
-                yield info
-        self._query.repeat()
-
-
 class LateSites(NamedTuple):
     """Whether a site may join a running session, and which sites a start waits for.
 
@@ -310,7 +262,7 @@ class Membership:
         # Liveliness tokens show which processes are present, and replies to queries identify
         # them.
         self._presence = bus.presence(topics.presence_key(session, "*"))
-        self._query = MemberQuery(bus, clock, session)
+        self._members = SessionMembers(bus, clock, session)
         self._refused_boots: set[int] = set()  # members whose refusal was published
         self._recorder_boots: set[str] = set()  # recorders that are present
 
@@ -338,7 +290,7 @@ class Membership:
         expected_members = (*self._sites, topics.RECORDER)
         return {
             name: reason
-            for name, reason in self._query.unreadable.items()
+            for name, reason in self._members.unreadable.items()
             if name in expected_members
         }
 
@@ -433,7 +385,7 @@ class Membership:
         Raises:
             SessionError: This member cannot be part of the session.
         """
-        for info in self._query.poll():
+        for info in self._members.poll():
             self.receive_identity(info, may_have_started=may_have_started)
         for parts, is_alive in topics.read_presence(self._presence):
             self._update_presence(parts.member, parts.boot, is_alive=is_alive)

@@ -38,7 +38,6 @@ from ..analysis import Timeline
 from ..core import Array
 from ..files import write_whole
 from ..log import Ints, Log, SiteLog
-from ..net import MODES
 from ..records import Mode
 from ..scenario import TASK_AXES
 from .appearance import REPORT_SIZE, SITE_COLOURS, FigureSize, list_site_colours
@@ -927,7 +926,7 @@ class TimeFigure:
         """Returns a sentence that explains the shaded times. Empty if nothing is shaded."""
         meanings = set()
         for intervals in self._modes.values():
-            meanings |= {MODES[interval.mode] for interval in intervals}
+            meanings |= {interval.meaning for interval in intervals}
         if not meanings:
             return ""
 

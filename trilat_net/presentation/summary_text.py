@@ -33,7 +33,6 @@ from ..analysis import (
 from ..errors import count_nouns
 from ..execution import LogCheckReport, Rerun
 from ..log import Log, LogCheckResult, Recovery
-from ..net import MODES
 from ..results import Result
 from .plot_signals import shared_unit
 from .result_text import MARKS, Block, MarkedText, TextTable
@@ -186,7 +185,7 @@ def _format_mode_lines(log: Log) -> list[str]:
         phrases = []
         for interval in intervals[:MOST_LINES]:
             period = f"{interval.from_s:.3f}-{interval.to_s:.3f} s"
-            phrases.append(f"{MODES[interval.mode].did} {period}")
+            phrases.append(f"{interval.meaning.did} {period}")
         if len(intervals) > MOST_LINES:
             phrases.append(f"and {len(intervals) - MOST_LINES} more")
         lines.append(f"{site}: {', '.join(phrases)}")

@@ -28,11 +28,11 @@ from trilat_net.log.log_layout import ChannelFilter
 from trilat_net.log.message_identity import compute_virtual_boot
 from trilat_net.net import topics
 from trilat_net.net.bus import Bus, Inbox
-from trilat_net.net.discovery import SessionMembers
 from trilat_net.net.membership import Epoch, EventPublisher, liveliness_token
 from trilat_net.net.messages import Event, Info, State
 from trilat_net.net.requests import Backfill, BackfillRequest, Pong
 from trilat_net.net.session import SessionJoin
+from trilat_net.net.session_members import SessionMembers
 from trilat_net.net.wire import decode, encode
 
 from .clocks import LookedAt
