@@ -11,7 +11,7 @@ from sites.change_server import ChangeServer
 from tests.net.manual_clock import ManualClock
 from trilat_net.app.running_session import RunningSession
 from trilat_net.errors import SessionError
-from trilat_net.net import topics
+from trilat_net.net import session_members, topics
 from trilat_net.net.clock import SystemClock
 from trilat_net.net.connection import Connection, DefaultEndpoints, find_free_endpoints
 from trilat_net.net.discovery import connect_to_session
