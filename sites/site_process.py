@@ -35,7 +35,6 @@ from trilat_net.signals import Interrupt
 from .external_arm import ExternalArm
 from .hand_server import RemoteHand
 from .running_site import RunningSite
-from .site_end import SiteEnd
 from .site_parts import SiteOptions, SiteParts
 
 POLL_NS = 5_000_000
@@ -110,8 +109,9 @@ def run_site(
 class _LinePrinter:
     """Prints lines in a separate thread, so that a control loop never waits for the terminal.
 
-    It is used as a context manager. Up to 256 lines wait to be printed, and further lines are
-    lost.
+    A terminal may block a program that prints, for example while its user has paused the
+    output. The printer is used as a context manager. Up to 256 lines wait to be printed, and
+    further lines are lost.
 
     Args:
         print_line: Function that prints a line.
@@ -182,9 +182,7 @@ def join_and_run(parts: SiteParts) -> int:
     if running is None:
         return parts.interrupt.exit_code
 
-    outcome = running.run()
-    end = SiteEnd(parts, running.publisher, running.link_monitors, outcome)
-    return end.leave_session()
+    return running.run().leave_session()
 
 
 def _join_session(parts: SiteParts, give_up_ns: int) -> RunningSite | None:

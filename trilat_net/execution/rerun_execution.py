@@ -45,7 +45,6 @@ from .resumption import (
     RecordedInputs,
     find_recorded_hand,
     make_arrival,
-    read_output,
 )
 from .verification import (
     PROGRESS_EVERY,
@@ -641,7 +640,7 @@ class _RerunSite:
             row: Index of the record in the log.
         """
         self._certain = False
-        output = read_output(self._site_log.states[row], self._site_log.peers)
+        output = self._site_log.states[row].to_tick_record(self._site_log.peers)
         self.output = output
         return RerunTick(
             site=self.name,

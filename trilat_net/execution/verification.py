@@ -57,7 +57,7 @@ from ..recorded_change import count_skipped_ticks
 from ..records import TickRecord
 from ..scenario import parse_core_change
 from .recorded_rows import LEAST_ROWS, PlainRows, SampleTable
-from .resumption import ArrivalEntry, RecordedInputs, read_output
+from .resumption import ArrivalEntry, RecordedInputs
 
 TOLERANCE = 1e-9
 """Numbers a and b of different platforms count as equal if |a - b| <= TOLERANCE (1 + |a|)."""
@@ -730,8 +730,8 @@ class _SiteVerifier:
         # On another platform, each tick is computed from the two records before it.
         follows_two = row - 2 >= self._start_row and states[row - 2].tick == state.tick - 2
         if follows_two and not result.whole_run:
-            before = read_output(states[row - 2], peers)
-            last = read_output(states[row - 1], peers)
+            before = states[row - 2].to_tick_record(peers)
+            last = states[row - 1].to_tick_record(peers)
             self._site.restore_state(before, last)
 
         arrivals, missing = self._inputs.find_arrivals(state.rx)

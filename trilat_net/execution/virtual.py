@@ -63,7 +63,7 @@ from ..own_code import ImportedLaw
 from ..recorded_change import count_skipped_ticks
 from ..records import NS_PER_S, Arrival, Mode, TickRecord
 from ..scenario import POLICY, PlantPlayer, Scenario, make_hand_players, make_plant_players
-from .resumption import read_output, select_peer_channels
+from .resumption import select_peer_channels
 from .virtual_network import Network, PromptNetwork
 
 
@@ -233,7 +233,7 @@ class SiteChannels:
                 site=state.site,
                 boot=state.boot,
                 peers=self.peers,
-                output=read_output(state, self.peers),
+                output=state.to_tick_record(self.peers),
                 arrivals=arrivals,
                 late_us=state.late_us,
                 busy_us=state.busy_us,

@@ -22,8 +22,8 @@ import numpy as np
 
 from .. import process
 from ..core import PlantState, Site
-from ..errors import LawFailed, LogError
-from ..log import Log, Progress, SiteLog
+from ..errors import LawFailed, LogError, count_nouns
+from ..log import Finding, Log, Progress, SiteLog
 from ..records import NS_PER_S, TickRecord
 from . import virtual
 from .resumption import ArrivalEntry, find_recorded_hand
@@ -35,7 +35,7 @@ from .verification import (
 from .virtual_network import Deliveries, Network, RecordedNetwork
 
 
-class RecordComparison(NamedTuple):
+class _RecordComparison(NamedTuple):
     """Result of comparing the records of a log with another execution of the same run.
 
     Attributes:
@@ -48,6 +48,21 @@ class RecordComparison(NamedTuple):
     records: int
     identical: int
     first: RecordDifference | None
+
+    def to_finding(self, label: str, excused_from: int | None) -> Finding:
+        """Returns the finding that states whether a log equals another execution of its run.
+
+        Args:
+            label: Name of the check.
+            excused_from: Tick (control period) from which differences are expected and do not
+                fail the check. None if there is no such tick.
+        """
+        first = self.first
+        text = f"{self.identical}/{count_nouns(self.records, 'record')} identical"
+        if first is None:
+            return Finding(label, text, True)
+        excused = excused_from is not None and first.tick >= excused_from
+        return Finding(label, f"{text}; the first that differs: {first}", excused)
 
 
 class _LateSample(NamedTuple):
@@ -83,7 +98,7 @@ class _LateSample(NamedTuple):
 
 def _compare_records(
     log: Log, executed: Iterable[tuple[str, TickRecord]], *, arrivals: bool
-) -> RecordComparison:
+) -> _RecordComparison:
     """Compares every record of a log with another execution of the run, bit for bit.
 
     Args:
@@ -114,7 +129,7 @@ def _compare_records(
                 first = difference
     except LawFailed as failure:  # the law did not fail when the log was recorded
         first = first or RecordDifference.of_law_failure(failure)
-    return RecordComparison(records, identical, first)
+    return _RecordComparison(records, identical, first)
 
 
 def find_absent_samples(log: Log) -> list[_LateSample]:
@@ -240,8 +255,8 @@ class _VirtualComparison(NamedTuple):
             they were due.
     """
 
-    fed: RecordComparison
-    plain: RecordComparison
+    fed: _RecordComparison
+    plain: _RecordComparison
     absent: list[_LateSample]
 
     @property
@@ -329,7 +344,7 @@ def compare_with_virtual(log: Log, progress: Progress | None = None) -> _Virtual
         arrivals = {name: _read_arrivals(log, name) for name in log.sites}
         fed = _compare_records(log, execute(RecordedNetwork(arrivals, peers), 0), arrivals=True)
         if arm_states:
-            plain = RecordComparison(0, 0, None)
+            plain = _RecordComparison(0, 0, None)
         else:
             plain = _compare_records(log, execute(None, total // 2), arrivals=False)
         return _VirtualComparison(fed, plain, find_absent_samples(log))

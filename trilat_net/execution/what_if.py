@@ -51,7 +51,6 @@ from ..own_code import find_user_laws
 from ..records import NS_PER_S, Mode
 from ..results import Result, finite_or_none
 from .rerun_execution import RerunExecution, RerunOverrides, RerunRequest, RerunTick
-from .resumption import read_output
 from .verification import RecordDifference
 from .virtual import SiteChannels, SiteEntry, render_accounts
 
@@ -596,7 +595,7 @@ def _make_executed_entries(
     for tick in ticks:
         state = decode(tick.payload, State, READABLE)
         yield channels.make_record_entry(state, tick.payload)
-        output = read_output(state, channels.peers)
+        output = state.to_tick_record(channels.peers)
         yield from channels.make_tick_entries(output, tick.stats)
     yield channels.make_end_entry()
 
