@@ -32,7 +32,7 @@ from . import realtime
 from .peer_admission import PeerAdmission
 from .site_end import SiteEnd
 from .site_loop import PeerInbox, run_loop
-from .site_news import SiteNews, publish_clocks
+from .site_news import SiteNews
 from .site_parts import SiteParts
 
 _NO_BOOT = -1
@@ -236,7 +236,7 @@ class RunningSite:
                 ticks=first_tick,
             )
         parts.say(f"{begins}; {obtained['scheduling']}, memory {obtained['memory']}")
-        publish_clocks(self._publisher, self._timing.list_initial_notices(), 0)
+        self._publisher.publish_clocks(self._timing.list_initial_notices(), 0)
 
         if parts.arm is not None:
             warning = parts.arm.bind(parts.scenario.sites[parts.name].q0_rad)
@@ -324,7 +324,7 @@ class RunningSite:
         self._publisher.answer_queries()
 
         notices = self._timing.update_clocks(next_tick, parts.clock.monotonic_ns())
-        publish_clocks(self._publisher, notices, output.t_ns)
+        self._publisher.publish_clocks(notices, output.t_ns)
         self._admission.watch_members(output.t_ns)
         self._admission.rejoin(output.t_ns)
         self._news.publish_news(output)

@@ -106,7 +106,6 @@ __all__ = [
     # Clocks and timing
     "PING_PACE_NS",
     "Clock",
-    "ClockNotice",
     "LinkTimingMonitor",
     "LoopStats",
     "OffsetEstimator",
@@ -212,14 +211,7 @@ if TYPE_CHECKING:
     from .session import SessionJoin
     from .session_members import REPLY_TIMEOUT_S, SessionMembers
     from .site_stand_in import SiteStandIn
-    from .timing import (
-        ClockNotice,
-        LinkTimingMonitor,
-        LoopStats,
-        PeerClock,
-        SiteTiming,
-        find_turn_ns,
-    )
+    from .timing import LinkTimingMonitor, LoopStats, PeerClock, SiteTiming, find_turn_ns
     from .topics import (
         RECORDER,
         STATS_PER_SECOND,
@@ -277,9 +269,7 @@ else:
             "session": "SessionJoin",
             "session_members": "REPLY_TIMEOUT_S SessionMembers",
             "site_stand_in": "SiteStandIn",
-            "timing": (
-                "ClockNotice LinkTimingMonitor LoopStats PeerClock SiteTiming find_turn_ns"
-            ),
+            "timing": "LinkTimingMonitor LoopStats PeerClock SiteTiming find_turn_ns",
             "topics": (
                 "RECORDER STATS_PER_SECOND count_messages count_under_way number_message "
                 "skipped_numbers topics"

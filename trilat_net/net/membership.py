@@ -24,9 +24,9 @@ Invariant:
 import hashlib
 import platform
 import secrets
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import msgspec
 
@@ -183,6 +183,19 @@ class EventPublisher:
         self._keep(payload)
         self._publish(payload)
         return event
+
+    def publish_clocks(self, notices: Iterable[Mapping[str, Any]], t_ns: int) -> None:
+        """Publishes events about the offsets and faults of the peers' clocks.
+
+        Recorders store these events, so that a reader of the log knows how well the clocks
+        agreed.
+
+        Args:
+            notices: Fields of the events, by name.
+            t_ns: Time of the events, in ns since the epoch (the common start of the session).
+        """
+        for notice in notices:
+            self.publish(**notice, t_ns=t_ns)
 
     def update(self, **fields: object) -> None:
         """Changes fields of this process's identity, which other processes can query.
