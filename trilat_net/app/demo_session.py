@@ -46,7 +46,7 @@ from trilat_net.signals import Interrupt
 from ..core import compiling_notice, is_core_cached
 from ..files import refuse_link
 from ..log import Log, open_log
-from ..net import Clock, SystemClock, ZenohBus, reserve_session_endpoints
+from ..net import Clock, DefaultEndpoints, SystemClock, ZenohBus
 from ..own_code import list_imported_code
 from ..records import NS_PER_S
 from ..scenario import HandSite, check_outside_arms
@@ -345,7 +345,8 @@ def run_demo(
         load_warning = check_machine_load(clock)
         if load_warning:
             display.say(f"warning: {load_warning}")
-        endpoints = reserved.enter_context(reserve_session_endpoints(session, scenario.names))
+        default_endpoints = DefaultEndpoints(session)
+        endpoints = reserved.enter_context(default_endpoints.reserve(len(scenario.names)))
         patience_s = JOIN_S if begins is None else WAIT_S
         starter, sites, start_recorder = _start(
             scenario=scenario,
