@@ -37,7 +37,7 @@ from setproctitle import setproctitle
 from sites import check_machine_load, warm_up
 from trilat_net.entry_points import COMMANDS, load_entry
 from trilat_net.errors import LogRefused, RunFailed
-from trilat_net.files import find_page, make_results_folder, make_subfolder, write_whole
+from trilat_net.files import find_page, make_folder, make_results_folder, write_whole
 from trilat_net.net import topics
 from trilat_net.process import freeze_gc
 from trilat_net.scenario import Scenario, load_scenario
@@ -448,7 +448,7 @@ def _start(
     log = folder / "run.mcap"
     output = folder / "processes"
     write_whole(scenario_file, scenario.text)
-    make_subfolder(output)
+    make_folder(output, may_be_link=False)
     log.unlink(missing_ok=True)  # of an earlier run, in a folder that may be replaced
     starter = reserved.enter_context(closing(ProcessStarter(scenario_file, output)))
 

@@ -19,7 +19,7 @@ from collections.abc import Collection, Mapping
 
 import numpy as np
 
-from ..core import MAX_ARRIVALS, CompiledRun, CoreChange, IntArray, RunInputs, first_ticks
+from ..core import MAX_ARRIVALS, CompiledRun, CoreChange, IntArray, LinkSchedule, RunInputs
 from ..errors import ScenarioError, count_nouns
 from ..log import Log
 from ..own_code import find_user_laws
@@ -228,7 +228,7 @@ def _read_arrivals(log: Log, ticks: int) -> tuple[IntArray, IntArray, int]:
             sample_ticks = sent_ticks[selected]
             stamps_ns = sample_ticks * NS_PER_S // log[peer].rate_hz
             # A sample is not used before the first tick after its stamp (L2).
-            earliest = first_ticks(stamps_ns + 1, part.rate_hz)
+            earliest = LinkSchedule.first_ticks(stamps_ns + 1, part.rate_hz)
             delivery_ticks = np.maximum(arrival_ticks[selected], earliest)
             order = np.argsort(delivery_ticks, kind="stable")
             starts = np.searchsorted(delivery_ticks[order], np.arange(ticks + 1))

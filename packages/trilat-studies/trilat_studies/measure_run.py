@@ -389,9 +389,9 @@ def _finish_together(compiled: Sequence[_CompiledRun]) -> Iterator[tuple[int, st
         an empty text.
     """
     # A single run must not load the code of lanes.
-    from trilat_net.core import group_runs
+    from trilat_net.core import RunGroup
 
-    for group in group_runs([member.run for member in compiled], _RECORD_ROWS):
+    for group in RunGroup.divide([member.run for member in compiled], _RECORD_ROWS):
         members = [compiled[index] for index in group.members]
         while running := [member for member in members if not member.run.is_finished]:
             # Runs of a group have the same duration, and advance together.

@@ -366,12 +366,12 @@ def classify_cells(scenarios: Iterable[Scenario], longest_s: float) -> Iterator[
         The results in the order of the cells.
     """
     # A single run must not load the code of lanes.
-    from trilat_net.core import group_runs
+    from trilat_net.core import RunGroup
 
     cells = [_CellInProgress(scenario, longest_s) for scenario in scenarios]
     runs = [cell.run for cell in cells]
     obstacles = [""] * len(cells)
-    for group in group_runs(runs):
+    for group in RunGroup.divide(runs):
         for index in group.members:
             obstacles[index] = group.obstacle
         _run_group(group, cells)

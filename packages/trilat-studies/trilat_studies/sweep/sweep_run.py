@@ -541,7 +541,7 @@ def _prepare_lanes(plan: SweepPlan, runs: int) -> bool:
     if plan.judge == "linear" or (runs < 2 and not is_large):
         return False
     # A sweep of single runs must not load the code of lanes.
-    from trilat_net.core import prepare_lanes
+    from trilat_net.core import RunGroup
 
     try:
         scenario = _build_scenario(CellItem(plan, plan.cell(0), plan.seeds[0]))
@@ -549,9 +549,9 @@ def _prepare_lanes(plan: SweepPlan, runs: int) -> bool:
         return is_large  # the workers compile the code of other cells
     make_run = partial(FusedRun, scenario)
     if is_large:
-        prepare_lanes(make_run, LANE_RUNS, least_site_ticks=0)
+        RunGroup.prepare_lanes(make_run, LANE_RUNS, least_site_ticks=0)
         return True
-    return prepare_lanes(make_run, runs, least_site_ticks=math.inf)
+    return RunGroup.prepare_lanes(make_run, runs, least_site_ticks=math.inf)
 
 
 def run_sweep(
