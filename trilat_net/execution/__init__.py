@@ -16,7 +16,6 @@ __all__ = [
     "check_fusable",
     "check_virtual",
     "execute_virtual",
-    "explain_not_repeatable",
     "find_absent_samples",
     "record_virtual",
     "simulate_columns",
@@ -39,7 +38,7 @@ __all__ = [
 ]
 
 if TYPE_CHECKING:
-    from .fused import FusedRun, check_fusable, explain_not_repeatable
+    from .fused import FusedRun, check_fusable
     from .log_checks import LogCheckReport, check_log_files
     from .twins import LEAST_PUSH, MOST_PUSH, PUSH_RAD, SMALLEST, Push, TwinPath, Twins
     from .unwritten_run import simulate_columns
@@ -57,7 +56,7 @@ else:
     __getattr__ = import_on_use(
         __name__,
         {
-            "fused": "FusedRun check_fusable explain_not_repeatable",
+            "fused": "FusedRun check_fusable",
             "log_checks": "LogCheckReport check_log_files",
             "twins": "LEAST_PUSH MOST_PUSH PUSH_RAD Push SMALLEST TwinPath Twins",
             "unwritten_run": "simulate_columns",

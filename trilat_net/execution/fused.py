@@ -22,7 +22,6 @@ import numpy as np
 from ..core import MAX_ARRIVALS, CompiledRun, CoreChange, IntArray, RunInputs, first_ticks
 from ..errors import ScenarioError, count_nouns
 from ..log import Log
-from ..own_code import find_user_laws
 from ..records import NS_PER_S
 from ..scenario import (
     HandPlayer,
@@ -121,40 +120,12 @@ class FusedRun(CompiledRun):
         self.scenario = scenario
 
 
-def explain_not_repeatable(log: Log, *, own_laws: bool = False) -> str:
-    """Explains why a run cannot be repeated exactly from its log alone.
-
-    For example, the log may lack records (results of control periods), or a control law may be
-    code that must not run here.
-
-    Args:
-        log: Log of the run.
-        own_laws: True if control laws that are code of users may run.
-
-    Returns:
-        A reason for the user. Empty if the run can be repeated.
-    """
-    scenario = log.scenario
-    if scenario.external:
-        arms = ", ".join(sorted(scenario.external))
-        return f"the reaction of the external arm of {arms} is not known"
-    if find_user_laws(scenario) and not own_laws:
-        return "the imported control laws may not run (permit them with --law FILE)"
-    if set(log.executed_sites) != set(log.sites):
-        return "in a rerun, the sites whose records were copied did not react"
-    for name in log.sites:
-        part = log[name]
-        if not len(part) or not np.array_equal(part.tick, np.arange(len(part))):
-            return f"records of {name} are missing"
-    return ""
-
-
 def read_run_inputs(log: Log) -> RunInputs:
     """Reads from a log everything that is needed to repeat its run.
 
     These inputs are the ticks (periods of the control loop) in which samples (sent states) of
     other sites arrived, the changes of settings, and the actions of live operators (persons or
-    programs that moved an arm). The run must be repeatable, see `explain_not_repeatable`.
+    programs that moved an arm). The run must be repeatable, see `Log.explain_not_repeatable`.
 
     Args:
         log: Log of the run.

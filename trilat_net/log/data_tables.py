@@ -116,6 +116,13 @@ class Column(NamedTuple):
             return self.values
         return np.where(self.known, self.values, np.nan)
 
+    def texts(self) -> NDArray[Any]:
+        """Returns the values of a column of texts as NumPy strings, shape (K,).
+
+        Formats for numbers, such as .npz, store texts in this way.
+        """
+        return np.array(self.values.tolist(), dtype=np.str_)
+
     def rows(self, first: int, last: int) -> list[Any]:
         """Returns some consecutive values of the column as plain Python values, as for CSV.
 

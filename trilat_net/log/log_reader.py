@@ -23,17 +23,15 @@ Invariant:
 """
 
 import hashlib
-import math
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from functools import cached_property, lru_cache
-from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO, TypeVar
 
 import numpy as np
 
-from ..core import MAX_DELAY_US, CoreChange
+from ..core import CoreChange
 from ..errors import (
     LogError,
     ScenarioError,
@@ -50,7 +48,6 @@ from ..net import (
     Event,
     LinkStats,
     RecorderStats,
-    State,
     count_under_way,
     decode,
     topics,
@@ -66,7 +63,7 @@ from ..scenario import (
     parse_core_change,
     parse_embedded,
 )
-from .accounting import LAST, describe_unknown_ends, parse_counts
+from .accounting import LAST, Account, describe_unknown_ends
 from .data_tables import EVENTS_TABLE, SITE_TABLE_KINDS, Table
 from .log_layout import (
     ACCOUNTS,
@@ -526,7 +523,7 @@ class Log(Result, Mapping[str, SiteLog]):
         records = 1 + int(np.count_nonzero(np.diff(ticks))) if len(ticks) else 0
         # The counts of several files were computed from their records, and prove nothing.
         has_one_file = len(self.sources) == 1
-        stated = parse_counts(self.account(site)) if has_one_file else {}
+        stated = Account.parse_counts(self.account(site)) if has_one_file else {}
         counted = {"received": records, "missing": self.missing(site)}
         has_account = stated != {}
         if not self.part and has_account and stated != counted:
@@ -565,6 +562,32 @@ class Log(Result, Mapping[str, SiteLog]):
         if self.driver != RERUN_DRIVER or executed is None:
             return tuple(self.sites)
         return tuple(name for name in self.sites if name in executed.split())
+
+    def explain_not_repeatable(self, *, own_laws: bool = False) -> str:
+        """Explains why the run cannot be repeated exactly from its log alone.
+
+        For example, the log may lack records (results of control periods), or a control law may
+        be code that must not run here.
+
+        Args:
+            own_laws: True if control laws that are code of users may run.
+
+        Returns:
+            A reason for the user. Empty if the run can be repeated.
+        """
+        scenario = self.scenario
+        if scenario.external:
+            arms = ", ".join(sorted(scenario.external))
+            return f"the reaction of the external arm of {arms} is not known"
+        if find_user_laws(scenario) and not own_laws:
+            return "the imported control laws may not run (permit them with --law FILE)"
+        if set(self.executed_sites) != set(self.sites):
+            return "in a rerun, the sites whose records were copied did not react"
+        for name in self.sites:
+            part = self[name]
+            if not len(part) or not np.array_equal(part.tick, np.arange(len(part))):
+                return f"records of {name} are missing"
+        return ""
 
     @property
     def part(self) -> int:
@@ -1042,8 +1065,11 @@ class Log(Result, Mapping[str, SiteLog]):
         """
         delays = {}
         for site in self.sites:
-            for index, peer in enumerate(self.scenario.peers(site)):
-                delays[f"{peer}->{site}"] = list(_iterate_delays(self, site, index, peer))
+            for peer in self.scenario.peers(site):
+                sent_ticks = self[peer].tick.tolist() if peer in self.sites else []
+                rate_hz = self.scenario.sites[peer].rate_hz
+                samples = self[site].iterate_delays(peer, rate_hz, sent_ticks)
+                delays[f"{peer}->{site}"] = list(samples)
         return delays
 
     def recorder_stats(self) -> list[RecorderStats]:
@@ -1183,76 +1209,3 @@ def _read_links(path: Path, modified_ns: int, size: int) -> dict[str, list[Trace
         return open_log(path).link_delays
     except LogError as error:
         raise ValueError(str(error).removeprefix(f"{path}: ")) from None
-
-
-def _iterate_delays(log: Log, site: str, index: int, peer: str) -> Iterator[TracePoint]:
-    """Yields the stamp and the delay of every sample of a link, in the order of the stamps.
-
-    A sample that was sent but did not arrive has an infinite delay. It is left out if it may
-    have arrived in a tick whose record is missing.
-
-    Args:
-        log: The log.
-        site: Name of the receiver.
-        index: Index of the sender among the receiver's peers.
-        peer: Name of the sender.
-
-    Yields:
-        The stamp in s after the start of the session, and the delay in ms.
-    """
-    states = log[site].states
-    delays_us: dict[int, int] = {}
-    for state in states:
-        for sender, tick, delay_us in state.rx:
-            if sender == index and tick >= 0:
-                earlier_us = delays_us.get(tick, MAX_DELAY_US)
-                delays_us[tick] = min(earlier_us, max(delay_us, 0))
-    if not delays_us:
-        return
-
-    longest_ns = 1000 * max(delays_us.values())
-    gaps = _find_gaps_ns(states)
-    rate_hz = log.scenario.sites[peer].rate_hz
-    sent = log[peer].tick.tolist() if peer in log.sites else []
-    # Samples that were sent before the first or after the last arrival were lost as well.
-    # Without records of the sender, samples of all ticks up to the last arrival count as sent.
-    ticks = {*sent, *delays_us} if sent else range(max(delays_us) + 1)
-    for tick in sorted(ticks):
-        stamp_ns = tick * NS_PER_S // rate_hz
-        # The simulation kernel counts in whole microseconds.
-        stamp_s = stamp_ns // 1000 / 1e6
-        if tick in delays_us:
-            yield stamp_s, delays_us[tick] / 1e3
-            continue
-
-        latest_arrival_ns = stamp_ns + longest_ns
-        may_have_arrived_unseen = any(
-            stamp_ns <= gap_end and latest_arrival_ns >= gap_start
-            for gap_start, gap_end in gaps
-        )
-        if not may_have_arrived_unseen:
-            yield stamp_s, math.inf
-
-
-def _find_gaps_ns(states: Sequence[State]) -> list[tuple[int, float]]:
-    """Returns the intervals in which a sample may have arrived although no record shows it.
-
-    Records (results of control periods) are missing before the first record, between records
-    whose ticks (control periods) are not consecutive, and after the last record.
-
-    Args:
-        states: Records of the receiver, in the order of their ticks.
-
-    Returns:
-        The intervals (start, end) in ns after the start of the session.
-    """
-    if not states:
-        return [(0, math.inf)]
-    gaps: list[tuple[int, float]] = []
-    for record, next_record in pairwise(states):
-        if next_record.tick != record.tick + 1:
-            gaps.append((record.t_ns, next_record.t_ns))
-    if states[0].tick > 0:
-        gaps.append((0, states[0].t_ns))
-    gaps.append((states[-1].t_ns, math.inf))
-    return gaps

@@ -26,7 +26,7 @@ from ..net import decode, messages, topics
 from ..recorded_change import count_skipped_ticks
 from ..records import NS_PER_S
 from ..scenario import Scenario, parse_embedded
-from .accounting import Account, describe_unknown_ends, parse_counts
+from .accounting import Account, describe_unknown_ends
 from .findings import CheckReport, Finding, Findings
 from .log_layout import (
     ACCOUNTS,
@@ -799,7 +799,7 @@ class _SessionCheck:
             return finding.conclude("include other parts of the log, and were not compared")
 
         for topic, check in self.channels.items():
-            stated = parse_counts(self._accounts.get(topic, ""))
+            stated = Account.parse_counts(self._accounts.get(topic, ""))
             if check.kind != topics.STATS:
                 missing = sum(account.missing for account in self._counted.list_starts(topic))
                 counted = {"received": check.received, "missing": missing}

@@ -11,21 +11,24 @@ Invariant:
       records are decoded in blocks when they are accessed.
 """
 
+import math
 from bisect import bisect_right
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import cached_property, lru_cache
+from itertools import pairwise
 from typing import Any, Generic, NamedTuple, TypeVar, overload
 
 import numpy as np
 from numpy.typing import NDArray
 
 from .. import process
-from ..core import POSE, POSITION, Array, LawChannel
+from ..core import MAX_DELAY_US, POSE, POSITION, Array, LawChannel
 from ..errors import LogError, WireError, count_nouns
 from ..hooks import find_hook
 from ..net import READABLE, State, decode
 from ..recorded_change import count_skipped_ticks
 from ..records import NS_PER_S, Layout
+from ..scenario import TracePoint
 from .orientations import RotationVectors, align_signs
 from .packed.indexed_records import IndexedRecords
 from .packed.packed_messages import PackedMessages
@@ -783,3 +786,72 @@ class SiteLog:
         stamps_ns = used_ticks * NS_PER_S // rate_hz
         age_ns = self.t_ns - stamps_ns
         return np.where(used_ticks >= 0, age_ns / NS_PER_S, np.nan)
+
+    def iterate_delays(
+        self, peer: str, rate_hz: int, sent_ticks: Sequence[int]
+    ) -> Iterator[TracePoint]:
+        """Yields the stamp and the delay of every sample of a peer, in the order of the stamps.
+
+        A sample that was sent but did not arrive has an infinite delay. It is left out if it
+        may have arrived in a tick whose record is missing. `Log.link_delays` defines the
+        delays.
+
+        Args:
+            peer: Name of the sender.
+            rate_hz: Tick rate of the sender, in Hz.
+            sent_ticks: Ticks of the samples that the sender is known to have sent. If there are
+                none, samples of all ticks up to the last arrival count as sent.
+
+        Yields:
+            The stamp in s after the start of the session, and the delay in ms.
+        """
+        sender_index = self.peers.index(peer)
+        delays_us: dict[int, int] = {}
+        for state in self.states:
+            for sender, tick, delay_us in state.rx:
+                if sender == sender_index and tick >= 0:
+                    earlier_us = delays_us.get(tick, MAX_DELAY_US)
+                    delays_us[tick] = min(earlier_us, max(delay_us, 0))
+        if not delays_us:
+            return
+
+        longest_ns = 1000 * max(delays_us.values())
+        gaps = self._find_gaps_ns()
+        # Samples that were sent before the first or after the last arrival were lost as well.
+        ticks = {*sent_ticks, *delays_us} if sent_ticks else range(max(delays_us) + 1)
+        for tick in sorted(ticks):
+            stamp_ns = tick * NS_PER_S // rate_hz
+            # The simulation kernel counts in whole microseconds.
+            stamp_s = stamp_ns // 1000 / 1e6
+            if tick in delays_us:
+                yield stamp_s, delays_us[tick] / 1e3
+                continue
+
+            latest_arrival_ns = stamp_ns + longest_ns
+            may_have_arrived_unseen = any(
+                stamp_ns <= gap_end and latest_arrival_ns >= gap_start
+                for gap_start, gap_end in gaps
+            )
+            if not may_have_arrived_unseen:
+                yield stamp_s, math.inf
+
+    def _find_gaps_ns(self) -> list[tuple[int, float]]:
+        """Returns the intervals in which a sample may have arrived although no record shows it.
+
+        Records (results of control periods) are missing before the first record, between
+        records whose ticks (control periods) are not consecutive, and after the last record.
+
+        Returns:
+            The intervals (start, end) in ns after the start of the session.
+        """
+        states = self.states
+        if not states:
+            return [(0, math.inf)]
+        gaps: list[tuple[int, float]] = []
+        for record, next_record in pairwise(states):
+            if next_record.tick != record.tick + 1:
+                gaps.append((record.t_ns, next_record.t_ns))
+        if states[0].tick > 0:
+            gaps.append((0, states[0].t_ns))
+        gaps.append((states[-1].t_ns, math.inf))
+        return gaps
