@@ -27,7 +27,6 @@ from ..errors import LogError, count_nouns
 from ..files import reading
 from ..log import (
     SESSION,
-    Account,
     Log,
     McapReader,
     Progress,
@@ -35,7 +34,6 @@ from ..log import (
     open_log,
     shift_progress,
 )
-from ..net import topics
 from ..records import NS_PER_S
 from ..results import JsonObject, Result, finite_or_none
 from ..scenario import END_WINDOW_S, list_arm_notes
@@ -55,9 +53,6 @@ from .timeline import Timeline
 
 MOST_LISTED_GAPS = 1000
 """Largest number of gaps that are listed per channel."""
-
-Absences = Mapping[str, Sequence[tuple[int, int]]]
-"""Ticks during which a site was absent from the session, as spans (first, last), by site."""
 
 
 class _Messages(NamedTuple):
@@ -152,22 +147,12 @@ class FileInventory:
             }
         )
 
-    def channels(
-        self,
-        session: str,
-        rates_hz: Mapping[str, int],
-        absences: Absences,
-    ) -> dict[str, JsonObject]:
+    def channels(self, log: Log | None) -> dict[str, JsonObject]:
         """Describes the messages in each channel (topic) of the files, for `trilat log info`.
 
-        Missing messages are counted only for a session whose rates are known.
-
         Args:
-            session: Name of the session. Empty to count no missing messages.
-            rates_hz: Tick rates of the session's sites, the processes that run one arm each, by
-                name.
-            absences: Ticks in which sites were absent from the session, and ticks that
-                they skipped. They are not missing.
+            log: The files as a log, of which missing messages are counted. `None` if they are
+                not a log.
 
         Returns:
             Plain values by topic.
@@ -175,13 +160,7 @@ class FileInventory:
         topics_in_order = dict.fromkeys([*self._formats, *self._messages])
         channels = {}
         for topic in topics_in_order:
-            gaps = _count_gaps(
-                topic=topic,
-                sequence=self._messages[topic].sequence,
-                session=session,
-                rates_hz=rates_hz,
-                absences=absences,
-            )
+            gaps = _describe_gaps(log, topic, self._messages[topic].sequence)
             channels[topic] = self._describe_channel(topic) | gaps
         return channels
 
@@ -216,38 +195,21 @@ class FileInventory:
         }
 
 
-def _count_gaps(
-    topic: str,
-    sequence: Sequence[int],
-    session: str,
-    rates_hz: Mapping[str, int],
-    absences: Absences,
-) -> JsonObject:
-    """Counts the missing and the duplicate messages of a channel.
-
-    Only the records and the link statistics of a site have consecutive numbers. Ticks during
-    which the site was absent, or which the site skipped, are not missing.
+def _describe_gaps(log: Log | None, topic: str, sequence: Sequence[int]) -> JsonObject:
+    """Returns the numbers of missing and of duplicate messages of a channel.
 
     Args:
+        log: The log to which the channel belongs. `None` if the files are not a log.
         topic: Topic of the channel.
         sequence: Tick of every message, in the order of the file.
-        session: Name of the session.
-        rates_hz: Tick rates of the session's sites.
-        absences: Ticks that the sites did not execute.
 
     Returns:
         The number of missing messages, the gaps as spans of message numbers, and the number of
         duplicates. All are `None` for channels without consecutive numbers.
     """
-    key = topics.parse_key(topic.removeprefix("/"))
-    if key is None or key.session != session or key.member not in rates_hz:
+    account = log.count_messages(topic, sequence) if log is not None else None
+    if account is None:
         return {"missing": None, "gaps": None, "duplicates": None}
-    if key.channel not in (topics.STATE, topics.LINK):
-        return {"missing": None, "gaps": None, "duplicates": None}
-
-    account = Account.of_ticks(
-        key.channel, sequence, rates_hz[key.member], absences.get(key.member, ())
-    )
     return {
         "missing": account.missing,
         "gaps": account.gaps[:MOST_LISTED_GAPS],
@@ -344,19 +306,15 @@ def info(*files: str | Path, progress: Progress | None = None) -> FileOverview:
         "sites": {},
         "links": {},
     }
-    session = ""
-    rates_hz = {}
-    absences: Absences = {}
+    readable_log = None
     if SESSION in inventory.metadata:
         try:
             log = open_log(*paths, progress=report_pass(1))
             facts |= _describe_log(log)
-            session = log.session["session"]
-            absences = {site: log.find_unexecuted_ticks(site) for site in log.sites}
-            rates_hz = {site: log.scenario.sites[site].rate_hz for site in log.sites}
+            readable_log = log
         except LogError as error:
             facts["problem"] = str(error)
-    facts["channels"] = inventory.channels(session, rates_hz, absences)
+    facts["channels"] = inventory.channels(readable_log)
     return FileOverview(facts)
 
 

@@ -655,6 +655,32 @@ class Log(Result, Mapping[str, SiteLog]):
         """
         return self.accounts.get(self._topic(site, topics.STATE), "")
 
+    def count_messages(self, topic: str, sequence: Sequence[int]) -> Account | None:
+        """Counts the received and the missing messages of a channel.
+
+        Ticks (control periods) that the site did not execute are not missing.
+
+        Args:
+            topic: Topic of the channel.
+            sequence: Tick of every message, in the order of the file.
+
+        Returns:
+            The account of the channel. None for a channel without consecutive numbers: only the
+            records and the link statistics of a site have them.
+        """
+        key = topics.parse_key(topic.removeprefix("/"))
+        if (
+            key is None
+            or key.session != self.session["session"]
+            or key.member not in self.sites
+        ):
+            return None
+        if key.channel not in (topics.STATE, topics.LINK):
+            return None
+        rate_hz = self.scenario.sites[key.member].rate_hz
+        absences = self.find_unexecuted_ticks(key.member)
+        return Account.of_ticks(key.channel, sequence, rate_hz, absences)
+
     @cached_property
     def unknown_ends(self) -> tuple[str, ...]:
         """Names of the sites (processes that run one arm) whose end is not recorded.
