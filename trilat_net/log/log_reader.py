@@ -563,32 +563,6 @@ class Log(Result, Mapping[str, SiteLog]):
             return tuple(self.sites)
         return tuple(name for name in self.sites if name in executed.split())
 
-    def explain_not_repeatable(self, *, own_laws: bool = False) -> str:
-        """Explains why the run cannot be repeated exactly from its log alone.
-
-        For example, the log may lack records (results of control periods), or a control law may
-        be code that must not run here.
-
-        Args:
-            own_laws: True if control laws that are code of users may run.
-
-        Returns:
-            A reason for the user. Empty if the run can be repeated.
-        """
-        scenario = self.scenario
-        if scenario.external:
-            arms = ", ".join(sorted(scenario.external))
-            return f"the reaction of the external arm of {arms} is not known"
-        if find_user_laws(scenario) and not own_laws:
-            return "the imported control laws may not run (permit them with --law FILE)"
-        if set(self.executed_sites) != set(self.sites):
-            return "in a rerun, the sites whose records were copied did not react"
-        for name in self.sites:
-            part = self[name]
-            if not len(part) or not np.array_equal(part.tick, np.arange(len(part))):
-                return f"records of {name} are missing"
-        return ""
-
     @property
     def part(self) -> int:
         """Number of this file, from 1 on, if a long log was split into several files.
