@@ -92,7 +92,6 @@ __all__ = [
     "DominancePlan",
     "SharedSlave",
     "Timeline",
-    "sample_ages_ns",
     "summarise_run",
     "DominanceHistory",
 ]
@@ -117,7 +116,7 @@ if TYPE_CHECKING:
     from .dominance_history import DominanceHistory, DominancePlan
     from .file_overview import FileOverview, info, summarise_run
     from .judge import certify_run, judge_virtual_run
-    from .link_summary import DelayDistribution, sample_ages_ns
+    from .link_summary import DelayDistribution
     from .metrics.log_metrics import LogMetrics
     from .metrics.measures import Metric, Quantity
     from .metrics.motion_metrics import measure_undelayed_error
@@ -180,7 +179,7 @@ else:
             "dominance_history": "DominanceHistory DominancePlan",
             "file_overview": "FileOverview info summarise_run",
             "judge": "certify_run judge_virtual_run",
-            "link_summary": "DelayDistribution link_summary sample_ages_ns",
+            "link_summary": "DelayDistribution link_summary",
             "metrics.log_metrics": "LogMetrics",
             "metrics.measures": "Metric Quantity",
             "metrics.motion_metrics": "measure_undelayed_error",

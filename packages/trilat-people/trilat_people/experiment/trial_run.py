@@ -27,7 +27,6 @@ from trilat_net.analysis import (
     EndEffectorRows,
     TorqueSplit,
     build_arm_rows,
-    sample_ages_ns,
 )
 from trilat_net.core import Array
 from trilat_net.errors import LogError
@@ -394,7 +393,7 @@ class ExperimentTrial:
         if len(forces) > 1:
             measures |= self._measure_pair(aligned, forces, outcome.ended_s)
 
-        age_ms = sample_ages_ns(log, self.slave, users[0]) / 1e6
+        age_ms = log.sample_ages_ns(self.slave, users[0]) / 1e6
         mean_age_ms = 0.0
         if len(age_ms):
             mean_age_ms = float(age_ms.mean())
