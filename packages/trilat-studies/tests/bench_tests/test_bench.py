@@ -47,12 +47,7 @@ from trilat_studies.bench.bench_plan import (
     tune_laws,
     write_gains,
 )
-from trilat_studies.bench.bench_results import (
-    LEAST_CONTACT_N,
-    BenchCellResult,
-    BenchRun,
-    build_bench_page,
-)
+from trilat_studies.bench.bench_results import LEAST_CONTACT_N, BenchCellResult, BenchRun
 from trilat_studies.bench.bench_run import (
     MAX_RUN_TICKS,
     BenchRunItem,
@@ -103,7 +98,7 @@ def run_cell(cell: BenchCell) -> BenchRun:
 def encode_files(results: BenchResults) -> list[str]:
     """Returns the page, the table of cells and the table of runs that a benchmark writes."""
     return [
-        build_bench_page(results, "trilat bench"),
+        results.build_page("trilat bench"),
         encode_csv(results.to_rows()),
         results.encode_runs(),
     ]
@@ -284,7 +279,7 @@ def test_a_barely_touched_wall_masks_the_numbers() -> None:
         BenchPlan("round-trips", [cell], [("p_d", "level")]), {(cell.key, 1): run}
     )
     assert results.places[0].compute_mean("error_rad") is None
-    assert "no contact" in build_bench_page(results, "trilat bench")
+    assert "no contact" in results.build_page("trilat bench")
 
 
 def test_a_longer_run_stays_unstable(tmp_path: Path) -> None:
@@ -427,7 +422,7 @@ def test_a_law_without_stable_gains_has_empty_rows(monkeypatch: pytest.MonkeyPat
     plan = plan_bench("round-trips", laws=["p_d", "pd_d"], tasks=["free"], links=["rtt8"])
     assert [cell.law for cell in plan.cells] == ["p_d"]
     run = make_bench_run(plan.cells[0])
-    page = build_bench_page(BenchResults(plan, {(run.cell, 1): run}), "trilat bench")
+    page = BenchResults(plan, {(run.cell, 1): run}).build_page("trilat bench")
     assert "| pd_d (two sites) | no gains |" in page
     with pytest.raises(UsageError, match="no candidate was stable for pd_d"):
         plan_bench("round-trips", laws=["pd_d"], tasks=["free"], links=["rtt8"])

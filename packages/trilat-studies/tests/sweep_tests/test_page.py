@@ -16,14 +16,13 @@ from study_builders import (
     judge_by_condition,
     make_gapped_plane,
     make_map_plane,
+    read_tables,
 )
 from trilat_studies.sweep.fixed_gains import describe_fixed_gains
 from trilat_studies.sweep.map_page import (
     CLASS_COLOURS,
     build_map_page,
     draw_stability_map,
-    tabulate_classes,
-    tabulate_edges,
     write_map,
 )
 from trilat_studies.sweep.stability_map import CELL_CLASSES, MapLine, MapPlane, StabilityMap
@@ -78,20 +77,25 @@ def test_the_page_shows_commands_lines_and_remarks(chart: StabilityMap) -> None:
     assert "## playout 0 ms" in text
 
 
+def read_map_tables(plane: MapPlane, *lines: MapLine) -> list[list[tuple[str, ...]]]:
+    """Returns the tables of the page of a map: that of the classes, then that of the edges."""
+    return read_tables(build_map_page(StabilityMap(plane, (lines,), (), (), "map"), "map.png"))
+
+
 def test_counts_are_of_all_runs() -> None:
     plane = make_map_plane(lambda _x, _y, seed: list(CellClass)[seed - 1], seeds=3)
-    assert tabulate_classes(plane).rows == [("all", "25", "25", "25", "0")]
+    _, *rows = read_map_tables(plane)[0]
+    assert rows == [("all", "25", "25", "25", "0")]
 
 
 def test_an_edge_stands_beside_each_lines_difference() -> None:
     """A row has the measured edge, then each line's edge and its distance from the middle."""
-    plane = make_map_plane()
-    table = tabulate_edges(plane, plane.panels[0], (EXACT, HALF))
+    _, (heads, *rows) = read_map_tables(make_map_plane(), EXACT, HALF)
     measured_heads = ("delay (ms)", "edge of d (N m s/rad)", "stable is")
     line_heads = ("d = 5 T", "difference", "half of it", "difference")
-    assert table.headers == (*measured_heads, *line_heads)
-    assert [row[0] for row in table.rows] == ["100", "200", "300", "400"]
-    for row in table.rows:
+    assert heads == (*measured_heads, *line_heads)
+    assert [row[0] for row in rows] == ["100", "200", "300", "400"]
+    for row in rows:
         low, high = map(float, row[1].split(" to "))
         assert row[2] == "above"
         assert low <= float(row[3]) <= high
@@ -104,16 +108,14 @@ def test_an_edge_stands_beside_each_lines_difference() -> None:
 
 
 def test_a_missing_line_has_no_difference() -> None:
-    plane = make_map_plane()
-    table = tabulate_edges(
-        plane, plane.panels[0], (EXACT._replace(excess=np.full((5, 5), np.nan)),)
-    )
-    assert all(row[-2:] == ("-", "-") for row in table.rows)
+    missing_line = EXACT._replace(excess=np.full((5, 5), np.nan))
+    _, (_, *rows) = read_map_tables(make_map_plane(), missing_line)
+    assert [row[-2:] for row in rows] == [("-", "-")] * 4
 
 
 def test_a_map_without_an_edge_has_no_table() -> None:
     plane = make_map_plane(lambda *_, **__: CellClass.CONVERGED)
-    assert tabulate_edges(plane, plane.panels[0], (EXACT,)).rows == []
+    assert len(read_map_tables(plane, EXACT)) == 1  # only that of the classes
 
 
 LINE = MapLine("$d$", "d", "", SPARE_DAMPING, 0)

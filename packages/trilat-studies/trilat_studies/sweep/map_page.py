@@ -761,7 +761,7 @@ def build_map_page(chart: StabilityMap, picture: str) -> str:
         The text of the page.
     """
     commands = "\n".join(chart.commands)
-    class_table = tabulate_classes(chart.plane)
+    class_table = _tabulate_classes(chart.plane)
     parts = [
         f"# {chart.title}",
         f"```sh\n{commands}\n```",
@@ -775,7 +775,7 @@ def build_map_page(chart: StabilityMap, picture: str) -> str:
         parts.append("\n".join(note_lines))
 
     for panel, lines in zip(chart.plane.panels, chart.lines, strict=True):
-        table = tabulate_edges(chart.plane, panel, lines)
+        table = _tabulate_edges(chart.plane, panel, lines)
         if table.rows:
             if panel.title:
                 parts.append(f"## {panel.title}")
@@ -823,7 +823,7 @@ def _describe_refined_cells(plane: MapPlane) -> str:
     return f"{ran} of {count_nouns(cells, 'cell')} ran"
 
 
-def tabulate_classes(plane: MapPlane) -> TextTable:
+def _tabulate_classes(plane: MapPlane) -> TextTable:
     """Returns a table of how many runs of a stability map ended stable, diverged, and so on.
 
     Args:
@@ -838,7 +838,7 @@ def tabulate_classes(plane: MapPlane) -> TextTable:
     return TextTable(("runs", *CELL_CLASSES), rows)
 
 
-def tabulate_edges(plane: MapPlane, panel: MapPanel, lines: Sequence[MapLine]) -> TextTable:
+def _tabulate_edges(plane: MapPlane, panel: MapPanel, lines: Sequence[MapLine]) -> TextTable:
     """Returns a table that compares the measured edges of stability with theory.
 
     The table has one row per measured edge of the panel. For each line from theory it has the

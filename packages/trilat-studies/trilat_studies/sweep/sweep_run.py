@@ -55,20 +55,12 @@ from trilat_net.workers import count_cores
 from ..measure_run import describe_program
 from ..side_by_side import LANE_SITE_TICKS
 from . import sweep_cell
-from .cell_groups import find_cell_groups
-from .edge_refinement import NOT_KNOWN, EdgeRefinement, choose_side
-from .result_table import ResultRow, ResultTable, read_rows
+from .cell_groups import CellGroups
+from .edge_refinement import NOT_KNOWN, EdgeRefinement
+from .result_table import ResultRow, ResultTable
 from .sweep_cell import CellClass, CellResult, CellRun
 from .sweep_plan import JUDGES, SweepCell, SweepPlan
-from .sweep_results import (
-    GRID_POINTS_FILE,
-    PLAN_FILE,
-    RESULTS_FILE,
-    SweepResults,
-    build_cell_rows,
-    encode_grid_points,
-    iterate_cells,
-)
+from .sweep_results import GRID_POINTS_FILE, PLAN_FILE, RESULTS_FILE, SweepResults
 
 JOURNAL_FILE = "cells.journal"
 """Name of the journal in the folder of a sweep."""
@@ -595,10 +587,9 @@ def run_sweep(
         wall_s = (clock.monotonic_ns() - started_ns) * 1e-9
         alone = _write_table(folder, journal.done)
 
-    results = SweepResults(plan, read_rows(folder.path / RESULTS_FILE, plan))
+    results = SweepResults(plan, ResultTable(plan).read_rows(folder.path / RESULTS_FILE))
     if len(plan.seeds) > 1:
-        points = encode_grid_points(plan, results.iterate_grid_points())
-        _write_lines(folder, GRID_POINTS_FILE, points)
+        _write_lines(folder, GRID_POINTS_FILE, results.encode_grid_points())
     return FinishedSweep(
         results=results,
         folder=folder,
@@ -638,7 +629,7 @@ def _write_table(folder: SweepFolder, done: Mapping[tuple[int, int], CellRun]) -
     Returns:
         The reasons why runs were computed alone, with the number of these runs.
     """
-    plan = folder.plan
+    table = ResultTable(folder.plan)
     reasons: Counter[str] = Counter()
 
     def iterate_rows() -> Iterator[ResultRow]:
@@ -647,11 +638,11 @@ def _write_table(folder: SweepFolder, done: Mapping[tuple[int, int], CellRun]) -
         The function also counts the reasons why some simulations could not run side by side
         with others.
         """
-        for runs in iterate_cells(plan, done):
+        for runs in table.iterate_cells(done):
             reasons.update(run.alone for run in runs if run.alone)
-            yield from build_cell_rows(plan, runs)
+            yield from table.build_rows(runs)
 
-    _write_lines(folder, RESULTS_FILE, ResultTable(plan).encode(iterate_rows()))
+    _write_lines(folder, RESULTS_FILE, table.encode(iterate_rows()))
     return reasons
 
 
@@ -709,7 +700,7 @@ class _SweepWork:
             is_side_by_side = self._choose_lanes(plan.cells)
             cells: Iterable[int] = range(plan.cells)
             if is_side_by_side:
-                groups = find_cell_groups(plan)
+                groups = CellGroups.of_plan(plan)
                 cells = groups.iterate_cells(plan.shape) if groups.keys else cells
             self._execute_cells(cells, plan.cells, 0, is_side_by_side=is_side_by_side)
             return
@@ -831,4 +822,4 @@ def _find_side(plan: SweepPlan, runs: Sequence[CellRun]) -> int:
         exponents_per_s = [outcome.exponent_per_s for outcome in outcomes]
         stable = [None if rate is None else rate <= 0.0 for rate in exponents_per_s]
     decided = [is_stable for is_stable in stable if is_stable is not None]
-    return choose_side(stable=sum(decided), decided=len(decided))
+    return EdgeRefinement.choose_side(stable=sum(decided), decided=len(decided))
