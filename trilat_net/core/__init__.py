@@ -146,7 +146,6 @@ __all__ = [
     # Runs of several sites, alone and side by side
     "CompiledRun",
     "LaneEpisodes",
-    "RunGroup",
     "RunInputs",
     "TwinLanes",
     "describe_structure",
@@ -166,7 +165,7 @@ if TYPE_CHECKING:
     from .arms.two_link_arm import ArmLinks, forward_kinematics, regressor, theta_from_links
     from .lanes.lane_episodes import LaneEpisodes
     from .lanes.lane_structure import describe_structure
-    from .lanes.run_groups import RunGroup, group_runs, prepare_lanes
+    from .lanes.run_groups import group_runs, prepare_lanes
     from .lanes.twin_lanes import TwinLanes
     from .life.live_hand import (
         GRIP_NS,
@@ -266,7 +265,7 @@ else:
             "arms.two_link_stages": "two_link_stages",
             "lanes.lane_episodes": "LaneEpisodes",
             "lanes.lane_structure": "describe_structure",
-            "lanes.run_groups": "RunGroup group_runs prepare_lanes",
+            "lanes.run_groups": "group_runs prepare_lanes",
             "lanes.twin_lanes": "TwinLanes",
             "life.live_hand": (
                 "GRIP_NS HandCommand HandInForce HandReach HandRules SILENCE_NS TAKEN"

@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from trilat_net.app import flag, options, show_progress, value
+from trilat_net.app import options, show_progress, value
 from trilat_net.errors import UsageError, count_nouns, format_wall_time
 from trilat_net.net import SystemClock
 from trilat_net.presentation import terminal_output as terminal
@@ -51,10 +51,10 @@ def test_command(
     ] = None,
     live: Annotated[
         bool,
-        flag(
+        typer.Option(
             "--live/--virtual",
-            "Run the scenarios live over a network, one after another, instead of in virtual "
-            "time.",
+            help="Run the scenarios live over a network, one after another, instead of in "
+            "virtual time.",
         ),
     ] = False,
     seeds: Annotated[
@@ -619,7 +619,6 @@ def bench_command(
 
     from .bench import plan_bench, prepare_bench_folder
     from .bench.bench_figures import write_bench
-    from .bench.bench_plan import find_stale
     from .run_commands import format_command
 
     check_workers(jobs, on)
@@ -644,7 +643,7 @@ def bench_command(
         return
 
     tuned_gains = {str(planned.tuned): planned.tuned for planned in plan.cells}
-    stale = find_stale(tuned_gains.values())
+    stale = [str(gains) for gains in tuned_gains.values() if gains.is_stale]
     if stale:
         terminal.print_note(
             f"tuned for another version of the law or the task, see --tune: {', '.join(stale)}"

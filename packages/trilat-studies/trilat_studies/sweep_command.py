@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from trilat_net.app import flag, options, show_progress, value
+from trilat_net.app import options, show_progress, value
 from trilat_net.errors import UsageError, count_nouns, format_wall_time, join_arguments
 from trilat_net.presentation import terminal_output as terminal
 
@@ -313,7 +313,9 @@ def sweep_command(
     cell: Annotated[int | None, value("--cell", "N")] = None,
     jobs: options.JobsOption = None,
     on: options.OnOption = None,
-    yes: Annotated[bool, flag("--yes", "Run the sweep even if it is very large.")] = False,
+    yes: Annotated[
+        bool, typer.Option("--yes", help="Run the sweep even if it is very large.")
+    ] = False,
     overrides: options.SetOption = None,
     mapped: Annotated[
         bool,

@@ -11,7 +11,7 @@ from trilat_studies.tuning import TuningResult
 from trilat_studies.tuning.candidate import CandidateClass, CandidateScore
 from trilat_studies.tuning.search_space import SEARCH_SPACES
 from trilat_studies.tuning.tuning_plan import CandidateSearch, Objective, find_pareto_front
-from trilat_studies.tuning.tuning_report import tabulate_front, tabulate_laws, write_tuning
+from trilat_studies.tuning.tuning_report import tabulate_front, write_tuning
 
 from trilat_net.scenario import load_scenario
 
@@ -216,7 +216,7 @@ def test_the_page_shows_procedure_search_and_commands(
 
 
 def test_the_table_of_laws_counts_every_run(tuning_result: TuningResult) -> None:
-    table = tabulate_laws(tuning_result)
+    table = next(tuning_result.blocks())
     places = [table.headers.index(outcome.word) for outcome in CandidateClass]
     for row in table.rows:
         assert sum(int(row[place]) for place in places) == int(row[1]) == 6

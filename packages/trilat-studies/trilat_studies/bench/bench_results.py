@@ -418,7 +418,7 @@ class BenchResults(Result):
         Args:
             command: The command that writes the page, which is shown at its top.
             pictures: Subject of each picture, by the name of its file in the folder of the
-            page.
+                page.
         """
         parts = [
             f"# The suite: {self.plan.study}",

@@ -114,7 +114,7 @@ class SweepResults(Result):
         """
         return msgspec.convert(row, CellResult)
 
-    def iterate_grid_points(self) -> "Iterator[GridPoint]":
+    def iterate_grid_points(self) -> "Iterator[_GridPoint]":
         """Yields the summary of each combination of swept parameters.
 
         `list_grid_points` returns the same summaries as a list.
@@ -132,7 +132,7 @@ class SweepResults(Result):
                 values = [row.get(key) for row in rows_within_limits]
                 means.append(MeanInterval.of_values(values))
             class_counts = [counts[verdict.value] for verdict in RUN_CLASSES]
-            yield GridPoint(
+            yield _GridPoint(
                 cell=cell,
                 law=law,
                 values=self.plan.cell(cell).values,
@@ -140,7 +140,7 @@ class SweepResults(Result):
                 means=tuple(means),
             )
 
-    def list_grid_points(self) -> "list[GridPoint]":
+    def list_grid_points(self) -> "list[_GridPoint]":
         """Summarises the simulations of a sweep that differ only in their random seeds.
 
         Returns:
@@ -207,7 +207,7 @@ class SweepResults(Result):
         for key in plan.list_totals():
             column_types |= {f"{key}_{field}": float for field in MeanInterval._fields}
 
-        def list_values(point: GridPoint) -> dict[str, Any]:
+        def list_values(point: _GridPoint) -> dict[str, Any]:
             """Returns the values of one line of the CSV table, by column, of a grid point."""
             decided = point.decided
             stable_share = point.stable / decided if decided else None
@@ -299,7 +299,7 @@ GRID_POINTS_FILE = "places.csv"
 """Name of the table of grid points in the folder of a sweep."""
 
 
-class GridPoint(NamedTuple):
+class _GridPoint(NamedTuple):
     """Summary of all runs with the same parameter values, which differ only in their seeds.
 
     Attributes:

@@ -25,7 +25,7 @@ from typing import Any, NamedTuple
 
 import msgspec
 
-from trilat_net.analysis import LogMetrics
+from trilat_net.analysis import SETTLED_ERROR_RAD, LogMetrics, RunTrace, TwinGrowth
 from trilat_net.errors import (
     CodeFailed,
     CodeWithheld,
@@ -389,7 +389,7 @@ class CellItem(NamedTuple):
         try:
             scenario = _build_scenario(self)
             if self.plan.judge == "linear":
-                outcome = sweep_cell.judge_linearly(scenario)
+                outcome = CellResult.judge_linearly(scenario)
             else:
                 outcome = sweep_cell.classify_cell(scenario.text, self.plan.longest_s)
         except CodeWithheld:
@@ -466,6 +466,36 @@ def _build_scenario(task: CellItem) -> Scenario:
     return scenario
 
 
+TWINS_OF_A_CELL = 4
+"""Number of twins of a run, which are repetitions with a small push.
+
+The pushes act on all joints at once, on single joints and, under the adaptive law, on the
+estimates.
+"""
+
+
+def _measure_exponent(scenario: Scenario) -> float | None:
+    """Measures the growth exponent of a run, the rate at which small disturbances grow.
+
+    A twin is a second execution of the run with a small push. The difference between the twin
+    and the run changes as exp(exponent t), where t is the time, see `analysis.twin_growth`.
+    Several twins are run. The result is the largest of their rates over the later part of the
+    run, the part over which runs are judged.
+
+    Args:
+        scenario: Scenario of the run.
+
+    Returns:
+        The exponent in 1/s, negative if disturbances decay. `None` if no push had an effect.
+    """
+    run = FusedRun(scenario, SETTLED_ERROR_RAD)
+    run.advance_to(scenario.duration_s)
+    end = RunTrace(run.buckets, run.tau_x, run.diverged_s).classify_end(scenario)
+    twins = TwinGrowth.of_scenario(scenario, end, run.ran_s, TWINS_OF_A_CELL)
+    rates_per_s = [push.rate_per_s for push in twins.pushes]
+    return max(filter(math.isfinite, rates_per_s), default=None)
+
+
 def _complete_run(task: CellItem, scenario: Scenario, outcome: CellResult) -> CellRun:
     """Measures the further metrics of a simulation, and returns all of its results.
 
@@ -476,7 +506,7 @@ def _complete_run(task: CellItem, scenario: Scenario, outcome: CellResult) -> Ce
     """
     plan = task.plan
     if plan.judge == "twins":
-        exponent_per_s = sweep_cell.measure_exponent(scenario)
+        exponent_per_s = _measure_exponent(scenario)
         outcome = msgspec.structs.replace(outcome, exponent_per_s=exponent_per_s)
 
     # Metrics that are not fields of the result require a second run, which records a log.

@@ -53,7 +53,6 @@ from .search_space import (
     SEARCH_SPACES,
     ModelInformation,
     SearchSpace,
-    select_search_spaces,
     weigh_joints,
 )
 
@@ -819,7 +818,7 @@ def plan_tuning(
     knowledge = ModelInformation.of_gravity(gravity_percent)
     base = TuningScenario.load(source, overrides)
     scenario = base.scenario
-    spaces = select_search_spaces([name_law_classes(law) for law in laws], scenario)
+    spaces = SearchSpace.select([name_law_classes(law) for law in laws], scenario)
     ticks = sum(map(scenario.ticks, scenario.names))
     if ticks > MAX_TICKS:
         problem = (

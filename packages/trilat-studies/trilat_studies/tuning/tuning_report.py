@@ -59,7 +59,7 @@ def compose_tuning(tuned: "TuningResult") -> Iterator[Block]:
     Args:
         tuned: Result of the comparison of control laws.
     """
-    yield tabulate_laws(tuned)
+    yield _tabulate_laws(tuned)
     yield from (f"  {line}" for line in _list_class_meanings())
     yield from (f"note: {line}" for line in list_energy_notes(tuned))
     alone = describe_runs_alone(tuned.alone, tuned.plan.runs)
@@ -98,7 +98,7 @@ def compose_tuning(tuned: "TuningResult") -> Iterator[Block]:
             yield f"  {tuned.candidate(search, last_point).command}"
 
 
-def tabulate_laws(tuned: "TuningResult") -> TextTable:
+def _tabulate_laws(tuned: "TuningResult") -> TextTable:
     """Returns a table that summarises the search of each law in a row.
 
     A row has the number of candidates (choices of gains), the number of candidates of each
@@ -340,7 +340,7 @@ def _build_tuning_page(tuned: "TuningResult") -> str:
     parts = [
         f"# {scenario.name}: laws compared fairly",
         _format_list(describe_procedure(tuned.plan)),
-        tabulate_laws(tuned).markdown(),
+        _tabulate_laws(tuned).markdown(),
         "Classes, the first that applies:",
         _format_list([*_list_class_meanings(), *list_energy_notes(tuned)]),
         "## Search ranges",
