@@ -270,7 +270,7 @@ def _run_tuning(
     from trilat_net.files import make_results_folder
     from trilat_net.work import count_workers
 
-    from .tuning.tuning_report import describe_procedure, write_tuning
+    from .tuning.tuning_report import TuningReport, describe_procedure
 
     workers = count_workers(jobs, on)
     name = plan.base.scenario.name
@@ -288,7 +288,7 @@ def _run_tuning(
 
     with terminal.progress_bar("searching") as progress:
         comparison = plan.run(jobs, progress, on)
-    paths = write_tuning(comparison, results_folder)
+    paths = TuningReport(comparison).write(results_folder)
     if not as_json:
         terminal.out.print()
     terminal.print_result(comparison, as_json=as_json)

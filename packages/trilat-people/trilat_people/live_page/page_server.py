@@ -63,19 +63,16 @@ from .page_orders import (
     MAX_MESSAGE_BYTES,
     AnswerPage,
     EndSession,
-    MarkMoment,
     MessageLimits,
     MoveHand,
     OrderDesk,
     PageHands,
     PageMessage,
-    ReleaseArms,
     Role,
     RoleLinks,
     Seen,
-    SetLink,
-    SetShares,
     ShowAges,
+    SiteOrder,
     StageMessage,
     StopArms,
     TakePart,
@@ -845,13 +842,8 @@ class PageServer:
         """
         view = self.view
 
-        if isinstance(message, SetLink | SetShares):
-            self._desk.queue_change(message, view.sites, view.links, page.role.noun)
-        elif isinstance(message, ReleaseArms):
-            self._desk.release(message, view.sites, page.role.noun)
-        elif isinstance(message, MarkMoment):
-            if view.scenario is not None:
-                self._desk.mark(view.scenario.names[0], message.text)
+        if isinstance(message, SiteOrder):
+            self._desk.accept(message, view.sites, view.links, page.role.noun)
         elif isinstance(message, ShowAges):
             self._shows_ages = message.shown
         elif isinstance(message, MoveHand):

@@ -601,11 +601,11 @@ class TuningResult(Result):
     def blocks(self) -> Iterator[Any]:
         """Yields the text that `trilat compare --tune` prints about the tuning, part by part.
 
-        See `compose_tuning`.
+        See `TuningReport.compose`.
         """
-        from .tuning_report import compose_tuning
+        from .tuning_report import TuningReport
 
-        return compose_tuning(self)
+        return TuningReport(self).compose()
 
     def headline(self) -> str:
         """Returns a sentence with the number of points on the Pareto front of each law.
