@@ -85,7 +85,7 @@ def _draw_map(
 
     from .sweep import read_results
     from .sweep.fixed_gains import FAIR_COMPARISON
-    from .sweep.map_page import write_map
+    from .sweep.map_page import MapReport
     from .sweep.stability_map import StabilityMap
 
     size = FigureSize.for_print(COLUMN_IN if width is None else width)
@@ -103,7 +103,7 @@ def _draw_map(
 
     terminal.print_texts(f"note: {remark}" for remark in stability_map.remarks)
     terminal.print_text("map: drawing ...")
-    paths = write_map(stability_map, folder, size.width_in)
+    paths = MapReport(stability_map).write(folder, size.width_in)
     terminal.print_texts(f"not swept: {text}" for text in stability_map.fixed)
     terminal.print_text(FAIR_COMPARISON)
     terminal.print_paths(paths)

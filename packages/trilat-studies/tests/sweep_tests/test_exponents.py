@@ -17,7 +17,7 @@ from study_builders import (
     run_plan,
 )
 from trilat_studies.sweep import prepare_sweep_folder
-from trilat_studies.sweep.map_page import build_map_page, draw_stability_map
+from trilat_studies.sweep.map_page import MapReport
 from trilat_studies.sweep.stability_map import MapPlane, StabilityMap
 from trilat_studies.sweep.sweep_plan import SweepPlan, plan_sweep
 from trilat_studies.sweep.sweep_results import SweepResults, read_results
@@ -76,7 +76,7 @@ def test_zero_line_is_the_linear_analysis_edge(chart: StabilityMap) -> None:
 
 def test_page_shows_exponents_zero_verdicts_and_theory(chart: StabilityMap) -> None:
     """The table of edges has the zero of the exponents beside the interval of the verdicts."""
-    _, (heads, *rows) = read_tables(build_map_page(chart, "map.png"))
+    _, (heads, *rows) = read_tables(MapReport(chart).build_page("map.png"))
     assert heads[1:4] == ("edge of d (N m s/rad)", "stable is", "edge of the verdicts")
     assert [row[0] for row in rows] == ["200", "250"]
     for row, n in zip(rows, range(2), strict=True):
@@ -88,7 +88,8 @@ def test_page_shows_exponents_zero_verdicts_and_theory(chart: StabilityMap) -> N
 
 def test_a_cell_without_growth_or_decay_is_white() -> None:
     """Four fifths of the exponents are paler than the ends of the bar."""
-    figure = draw_stability_map(make_exponent_plane(), ((),), FigureSize.for_print(3.5))
+    chart = StabilityMap(make_exponent_plane(), ((),), (), (), "map")
+    figure = MapReport(chart).draw(FigureSize.for_print(3.5))
     mesh: Any = next(
         collection
         for collection in figure.axes[0].collections
