@@ -1,7 +1,8 @@
 """Writes and reads results.csv, the table of a sweep with one row per run, row by row.
 
 A sweep may have millions of runs, whose rows need more memory than a machine has. Therefore,
-rows are written one by one, and a large table stays in its file while it is used.
+rows are written one by one, and a large table stays in its file while it is used. `ResultTable`
+builds the row of a finished run, with the command that repeats the run.
 
 Invariant:
     - Reading the CSV table restores all numbers bit for bit.

@@ -2,8 +2,8 @@
 
 For example, the text "link.delay_ms=0:400:50" makes the network delay an axis of the grid, with
 the values 0 to 400 ms. One combination of the values of all axes and of a control law is called
-a cell. Each cell is run once per random seed. This module parses the axes, laws and seeds,
-combines them with the scenario, and checks the result before anything runs.
+a cell. Each cell is run once per random seed. This module combines the axes, laws and seeds
+with the scenario, and checks the result before anything runs. `SweepAxis` parses an axis.
 
 Invariant:
     - A plan that cannot run is rejected before the first run.

@@ -1,8 +1,9 @@
 """Stores and summarises the results of a sweep over a grid of parameters.
 
 A sweep runs a scenario at every point of the grid. One point of the grid, called a cell, is run
-once per random seed. This module turns the finished runs into a CSV table with one row per run.
-It also combines the runs of a cell, prints a summary, and finds the command that repeats a run.
+once per random seed. This module reads the table of a finished sweep, which has one row per
+run. It combines the runs of a cell, composes a summary, and finds the command that repeats a
+run.
 
 Invariant:
     - The bytes of the result files depend only on the runs, and not on the time or the number
