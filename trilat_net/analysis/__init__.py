@@ -33,7 +33,6 @@ __all__ = [
     "EnergyBalance",
     "ObservedEnergy",
     "ObservedFinding",
-    "RecordWindow",
     "RunningEnergy",
     "certify_log",
     "premise_quantities",
@@ -71,7 +70,6 @@ __all__ = [
     "AlignedRecords",
     "BodyTurns",
     "Bools",
-    "EndEffectorRows",
     "JointError",
     "PlacedArm",
     "RunView",
@@ -99,19 +97,13 @@ __all__ = [
 if TYPE_CHECKING:
     from . import decision_facts, link_summary, run_remarks, site_signals
     from .aligned import AlignedRecords, Bools
-    from .arm_rows import (
-        EndEffectorRows,
-        PlacedArm,
-        build_arm_rows,
-        joint_positions_m,
-        upright_axes,
-    )
+    from .arm_rows import PlacedArm, build_arm_rows, joint_positions_m, upright_axes
     from .body_turns import BodyTurns
     from .certificate import premise_quantities, verdict_facts
     from .certificate.certificate_result import Certificate
     from .certificate.energy_balance import ZERO_ENERGY_J, EnergyBalance
     from .certificate.observed_energy import ObservedEnergy, ObservedFinding
-    from .certificate.running_energy import KEPT_S, RecordWindow, RunningEnergy
+    from .certificate.running_energy import KEPT_S, RunningEnergy
     from .certificate.stability_certificate import certify_log
     from .dominance_history import DominanceHistory, DominancePlan
     from .file_overview import FileOverview, info, summarise_run
@@ -164,15 +156,13 @@ else:
         __name__,
         {
             "aligned": "AlignedRecords Bools",
-            "arm_rows": (
-                "EndEffectorRows PlacedArm build_arm_rows joint_positions_m upright_axes"
-            ),
+            "arm_rows": "PlacedArm build_arm_rows joint_positions_m upright_axes",
             "body_turns": "BodyTurns",
             "certificate.certificate_result": "Certificate",
             "certificate.energy_balance": "EnergyBalance ZERO_ENERGY_J",
             "certificate.observed_energy": "ObservedEnergy ObservedFinding",
             "certificate.premise_quantities": "premise_quantities",
-            "certificate.running_energy": "KEPT_S RecordWindow RunningEnergy",
+            "certificate.running_energy": "KEPT_S RunningEnergy",
             "certificate.stability_certificate": "certify_log",
             "certificate.verdict_facts": "verdict_facts",
             "decision_facts": "decision_facts",
