@@ -30,12 +30,10 @@ from . import plot_signals, style
 from .appearance import DARK_SITE_COLOURS, list_site_colours
 from .figures import age_and_lateness, arm_poses
 from .page_data import (
-    ChainArm,
     Chart,
     DistributionChart,
     HistogramChart,
     PageData,
-    PlanarArm,
     TimeChart,
 )
 from .page_leaders import SlaveLead
@@ -719,7 +717,7 @@ class ChartBuilder:
                 periods=periods_us,
             )
 
-    def _build_arm(self, index: int, site: str) -> PlanarArm | ChainArm:
+    def _build_arm(self, index: int, site: str) -> PageData.PlanarArm | PageData.ChainArm:
         """Adds the motion of an arm, and of bodies that it touches, for the moving picture.
 
         The script of the page draws planar arms from their joint angles and link lengths. Other
@@ -742,7 +740,7 @@ class ChartBuilder:
         desired = plot_signals.reference_angles(records)
         bodies = self._trace_bodies(site, np.arange(len(records)))
         table = self._add_records(site, np.hstack([actual, desired, *bodies]))
-        return PlanarArm(
+        return PageData.PlanarArm(
             site=site,
             caption=_caption_site(self._log.scenario, site),
             colour=index,
@@ -751,7 +749,7 @@ class ChartBuilder:
             links_m=[self.units_per_m * length_m for length_m in arm.lengths_m],
         )
 
-    def _build_chain(self, index: int, site: str) -> ChainArm:
+    def _build_chain(self, index: int, site: str) -> PageData.ChainArm:
         """Adds the motion of a chain, an arm of any number of joints in space.
 
         The page cannot compute the forward kinematics of chains. Its table therefore contains
@@ -785,7 +783,7 @@ class ChartBuilder:
         bodies = self._trace_bodies(site, rows)
         values = np.hstack([points.reshape(len(rows), -1), *bodies])
         table = self._add_table(site, records.tick[rows], values)
-        return ChainArm(
+        return PageData.ChainArm(
             site=site,
             caption=_caption_site(self._log.scenario, site),
             colour=index,

@@ -175,49 +175,6 @@ class DistributionChart(
 Chart = TimeChart | HistogramChart | DistributionChart
 
 
-class PlanarArm(msgspec.Struct, frozen=True, kw_only=True, tag="planar", tag_field="kind"):
-    """Data with which a report draws an arm of two links that moves in a plane.
-
-    Attributes:
-        site: Name of the site, the process that runs the arm.
-        caption: Name and role of the site, such as "m1, master 1".
-        colour: Number that selects the colour of the arm.
-        table: Index of the table that the picture uses. It contains the actual and the desired
-            angles of both joints, in rad, and then the outlines of the bodies.
-        bodies: Number of bodies that the arm can touch.
-        links_m: Lengths of the links, in units of the picture.
-    """
-
-    site: str
-    caption: str
-    colour: int
-    table: int
-    bodies: int
-    links_m: list[float]
-
-
-class ChainArm(msgspec.Struct, frozen=True, kw_only=True, tag="chain", tag_field="kind"):
-    """Data with which a report draws an arm that moves in space, as a picture in a plane.
-
-    Attributes:
-        site: Name of the site, the process that runs the arm.
-        caption: Name and role of the site, such as "m1, master 1".
-        colour: Number that selects the colour of the arm.
-        table: Index of the table with the coordinates to draw. It contains the points of the
-            actual arm, of the arm in the desired pose, and of the shadow on the floor, and then
-            the outlines of the bodies.
-        bodies: Number of bodies that the arm can touch.
-        points: Number of points of an arm: the joints without the base, and the end effector.
-    """
-
-    site: str
-    caption: str
-    colour: int
-    table: int
-    bodies: int
-    points: int
-
-
 class PageData(msgspec.Struct, frozen=True, kw_only=True):
     """All data that the scripts of a report's web page draw.
 
@@ -233,6 +190,48 @@ class PageData(msgspec.Struct, frozen=True, kw_only=True):
         bounds_m: Left, right, bottom and top of the pictures of the arms, in the units of these
             pictures.
     """
+
+    class PlanarArm(msgspec.Struct, frozen=True, kw_only=True, tag="planar", tag_field="kind"):
+        """Data with which a report draws an arm of two links that moves in a plane.
+
+        Attributes:
+            site: Name of the site, the process that runs the arm.
+            caption: Name and role of the site, such as "m1, master 1".
+            colour: Number that selects the colour of the arm.
+            table: Index of the table that the picture uses. It contains the actual and the
+                desired angles of both joints, in rad, and then the outlines of the bodies.
+            bodies: Number of bodies that the arm can touch.
+            links_m: Lengths of the links, in units of the picture.
+        """
+
+        site: str
+        caption: str
+        colour: int
+        table: int
+        bodies: int
+        links_m: list[float]
+
+    class ChainArm(msgspec.Struct, frozen=True, kw_only=True, tag="chain", tag_field="kind"):
+        """Data with which a report draws an arm that moves in space, as a picture in a plane.
+
+        Attributes:
+            site: Name of the site, the process that runs the arm.
+            caption: Name and role of the site, such as "m1, master 1".
+            colour: Number that selects the colour of the arm.
+            table: Index of the table with the coordinates to draw. It contains the points of
+                the actual arm, of the arm in the desired pose, and of the shadow on the floor,
+                and then the outlines of the bodies.
+            bodies: Number of bodies that the arm can touch.
+            points: Number of points of an arm: the joints without the base, and the end
+                effector.
+        """
+
+        site: str
+        caption: str
+        colour: int
+        table: int
+        bodies: int
+        points: int
 
     class Table(msgspec.Struct, frozen=True):
         """Values of one arm over time, as the report's web page contains them.

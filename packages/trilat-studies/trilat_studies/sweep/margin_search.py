@@ -29,7 +29,7 @@ from trilat_net.own_code import list_imported_code
 from trilat_net.presentation import TextTable
 from trilat_net.results import Result
 from trilat_net.scenario import Scenario
-from trilat_net.work import Progress, Workers, ignore_progress, open_worker_pool
+from trilat_net.work import Progress, WorkerPool, Workers, ignore_progress
 
 from . import sweep_cell
 from .fixed_gains import FAIR_COMPARISON, describe_fixed_gains
@@ -342,7 +342,7 @@ def search_margins(
 
     # The workers need the files of control laws that users wrote.
     laws = list_imported_code([plan.base])
-    with open_worker_pool(jobs, on, most=len(searches), laws=laws) as pool:
+    with WorkerPool.open(jobs, on, most=len(searches), laws=laws) as pool:
         return pool.map(_search_margin_task, searches, progress)
 
 
