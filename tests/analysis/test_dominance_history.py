@@ -13,12 +13,10 @@ from trilat_net.analysis.dominance_history import (
     DominanceHistory,
     DominancePlan,
     compute_lyapunov_weights,
-    find_closed_groups,
     find_kd_scales,
     find_lost_peers,
-    left_perron_vector,
 )
-from trilat_net.core.links.dominance import apply_ramps
+from trilat_net.core.links.dominance import DominanceMatrix, apply_ramps
 from trilat_net.core.links.link import link_dtype
 from trilat_net.core.step.ticks import DominanceRamp
 from trilat_net.errors import LogError
@@ -108,7 +106,9 @@ def test_pi_is_the_eigenvector_that_numpy_finds(n: int, seed: int) -> None:
     alpha /= alpha.sum(axis=1, keepdims=True)
     values, vectors = np.linalg.eig(alpha.T)
     expected = np.real(vectors[:, np.argmax(np.real(values))])
-    assert left_perron_vector(alpha) == pytest.approx(expected / expected.sum(), abs=1e-9)
+    assert DominanceMatrix(alpha).find_pi() == pytest.approx(
+        expected / expected.sum(), abs=1e-9
+    )
 
 
 @given(st.lists(st.floats(0.01, 100.0), min_size=3, max_size=3))
@@ -143,7 +143,7 @@ def test_a_site_that_nobody_follows_has_no_weight() -> None:
 
 
 def test_two_groups_that_follow_nobody_outside_are_named() -> None:
-    assert find_closed_groups(PAIRS) == ((0, 1), (2, 3))
+    assert DominanceMatrix(PAIRS).find_closed_groups() == ((0, 1), (2, 3))
 
 
 @pytest.mark.parametrize("mem", [[], [0.5] * 11])

@@ -13,8 +13,6 @@ from tests.execution.builders import make_shipped_trajectories
 from tests.theory.energy import compute_balance
 from trilat_net.analysis.dominance_history import (
     compute_lyapunov_weights,
-    find_closed_groups,
-    left_perron_vector,
 )
 from trilat_net.core.arms.exogenous import (
     TorqueKind,
@@ -22,6 +20,7 @@ from trilat_net.core.arms.exogenous import (
     torque_on_arm,
     torque_source_rows,
 )
+from trilat_net.core.links.dominance import DominanceMatrix
 
 A12, A21, A31 = sp.symbols("alpha12 alpha21 alpha31", positive=True)
 ALPHA = sp.Matrix([[0, A12, 1 - A12], [A21, 0, 1 - A21], [A31, 1 - A31, 0]])  # Eq. (7)
@@ -98,7 +97,9 @@ def test_with_ones_v_can_rise() -> None:
 def test_weights_are_left_eigenvectors_for_all_n(size: int) -> None:
     """Errata 6, N sites."""
     alpha = draw_shares(np.random.default_rng(size), size)
-    assert left_perron_vector(alpha) == pytest.approx(find_perron_vector(alpha), rel=1e-9)
+    assert DominanceMatrix(alpha).find_pi() == pytest.approx(
+        find_perron_vector(alpha), rel=1e-9
+    )
     c = np.linspace(0.3, 10.0, size)
     beta = compute_lyapunov_weights(alpha, c[:, np.newaxis] * [3.0, 1.0]).beta
     assert beta * c / (beta @ c) == pytest.approx(find_perron_vector(alpha), rel=1e-9)
@@ -257,7 +258,7 @@ def test_two_closed_groups_have_several_betas() -> None:
     """Errata 11, N >= 4."""
     alpha = np.array([[0.0, 1, 0, 0], [1, 0, 0, 0], [0, 0, 0, 1], [0, 0, 1, 0]])
     assert np.linalg.matrix_rank(alpha - np.eye(4)) == 2
-    assert find_closed_groups(alpha) == ((0, 1), (2, 3))
+    assert DominanceMatrix(alpha).find_closed_groups() == ((0, 1), (2, 3))
 
 
 # --- 12: what is not an error but follows ---------------------------------------------------------------

@@ -87,9 +87,7 @@ __all__ = [
     # Links, leaders and events
     "DelayDistribution",
     "FileOverview",
-    "find_closed_groups",
     "info",
-    "left_perron_vector",
     "link_summary",
     "DominancePlan",
     "SharedSlave",
@@ -116,12 +114,7 @@ if TYPE_CHECKING:
     from .certificate.observed_energy import ObservedEnergy, ObservedFinding
     from .certificate.running_energy import KEPT_S, RecordWindow, RunningEnergy
     from .certificate.stability_certificate import certify_log
-    from .dominance_history import (
-        DominanceHistory,
-        DominancePlan,
-        find_closed_groups,
-        left_perron_vector,
-    )
+    from .dominance_history import DominanceHistory, DominancePlan
     from .file_overview import FileOverview, info, summarise_run
     from .judge import certify_run, judge_virtual_run
     from .link_summary import DelayDistribution, sample_ages_ns
@@ -184,9 +177,7 @@ else:
             "certificate.stability_certificate": "certify_log",
             "certificate.verdict_facts": "verdict_facts",
             "decision_facts": "decision_facts",
-            "dominance_history": (
-                "DominanceHistory DominancePlan find_closed_groups left_perron_vector"
-            ),
+            "dominance_history": "DominanceHistory DominancePlan",
             "file_overview": "FileOverview info summarise_run",
             "judge": "certify_run judge_virtual_run",
             "link_summary": "DelayDistribution link_summary sample_ages_ns",

@@ -23,7 +23,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core import Array, DominanceRamp, find_reach, perron_vector
+from ..core import Array, DominanceMatrix, DominanceRamp
 from ..log import Log
 from ..scenario import Scenario
 
@@ -317,56 +317,6 @@ class _LyapunovWeights(NamedTuple):
     scales: Array | None
 
 
-def find_closed_groups(alpha: Array) -> tuple[tuple[int, ...], ...]:
-    """Finds the groups of arms that follow each other, and no arm outside the group.
-
-    An arm may follow another arm directly or through further arms. If there are several groups,
-    the weights of the arms in the energy function V are not unique.
-
-    Args:
-        alpha: Dominance factors: entry (i, j) is the weight with which site i follows site j,
-            shape (N, N).
-
-    Returns:
-        Indices of the sites of each group.
-    """
-    reachable = find_reach(alpha)
-    groups = []
-    for site in range(len(alpha)):
-        is_mutual = reachable[site] & reachable[:, site]
-        group = tuple(np.flatnonzero(is_mutual).tolist())
-        # the first site of a group stands for the group
-        is_first = group[0] == site
-        is_closed = reachable[site].sum() == len(group)
-        if is_first and is_closed:
-            groups.append(group)
-    return tuple(groups)
-
-
-def left_perron_vector(alpha: Array) -> Array:
-    """Returns the left eigenvector pi of the dominance factors for the eigenvalue 1.
-
-    The vector satisfies pi >= 0 and pi' alpha = pi', and its sum is 1. A closed group is a
-    group of sites that follow no site outside the group. pi is 0 for sites outside closed
-    groups. With several closed groups pi is not unique: the sum of its entries in each group is
-    then chosen proportional to the number of sites in the group.
-
-    Args:
-        alpha: Matrix of the dominance factors, shape (N, N).
-
-    Returns:
-        The vector, shape (N,).
-    """
-    pi = np.zeros(len(alpha))
-    groups = find_closed_groups(alpha)
-    total = sum(map(len, groups))
-    for group in groups:
-        group_alpha = alpha[np.ix_(group, group)]
-        group_pi = perron_vector(group_alpha)
-        pi[list(group)] = group_pi * len(group) / total
-    return pi
-
-
 def find_kd_scales(Kd: Array) -> Array | None:
     """Finds the ratio of the damping gain Kd of each arm to the gain of the first arm.
 
@@ -413,13 +363,14 @@ def compute_lyapunov_weights(alpha: Array, Kd: Array) -> _LyapunovWeights:
             shape (N, N).
         Kd: Damping gains of the N sites along n axes, shape (N, n).
     """
-    pi = left_perron_vector(alpha)
+    dominance = DominanceMatrix(alpha)
+    pi = dominance.find_pi()
     scales = find_kd_scales(Kd)
     beta = pi if scales is None else pi / scales
     sites = len(beta)
     factor = sites / beta.sum()
     return _LyapunovWeights(
         beta=beta * factor,
-        groups=find_closed_groups(alpha),
+        groups=dominance.find_closed_groups(),
         scales=scales,
     )

@@ -26,13 +26,13 @@ from typing import NamedTuple
 
 import numpy as np
 
+from ...core import DominanceMatrix
 from ...log import Coverage, Log, judge_integrity
 from ...net import HALTED_MODES
 from ..aligned import Bools
 from ..dominance_history import (
     PeerLoss,
     compute_lyapunov_weights,
-    find_closed_groups,
     find_kd_scales,
 )
 from ..following import TaskFollowing
@@ -177,7 +177,8 @@ def gather_facts(log: Log) -> _RunFacts:
         return _RunFacts(log, constants, unknown=RecordGap.NO_PERIOD)
 
     # the first dominance matrix with several closed groups, for which beta is not unique
-    closed_groups = map(find_closed_groups, find_dominance_matrices(energies))
+    matrices = map(DominanceMatrix, find_dominance_matrices(energies))
+    closed_groups = (matrix.find_closed_groups() for matrix in matrices)
     ambiguous_groups = next((groups for groups in closed_groups if len(groups) > 1), ())
     group_names = tuple(
         tuple(log.sites[index] for index in group) for group in ambiguous_groups

@@ -49,11 +49,9 @@ from trilat_net.analysis import (
     SourceRows,
     Stability,
     build_arm_rows,
-    find_closed_groups,
     find_hanging_sites,
-    left_perron_vector,
 )
-from trilat_net.core import Array
+from trilat_net.core import Array, DominanceMatrix
 from trilat_net.errors import CodeFailed, ScenarioError
 from trilat_net.laws import LawSettings, TuningRun
 from trilat_net.log import Log
@@ -100,7 +98,7 @@ def check_comparable(scenario: Scenario) -> None:
         )
 
     # Sites that follow only each other never move towards the other sites.
-    groups = find_closed_groups(scenario.alpha)
+    groups = DominanceMatrix(scenario.alpha).find_closed_groups()
     if len(groups) > 1:
         group_names = [", ".join(scenario.names[site] for site in group) for group in groups]
         raise ScenarioError(
@@ -170,7 +168,7 @@ def compute_consensus_pose(scenario: Scenario, t_s: Array) -> Array:
     Returns:
         The pose at the K times, shape (K, n), in rad, for n joints.
     """
-    beta = left_perron_vector(scenario.alpha)
+    beta = DominanceMatrix(scenario.alpha).find_pi()
     weights = dict(zip(scenario.names, beta, strict=True))
     weighted_starts = []
     for name, spec in scenario.sites.items():
