@@ -33,7 +33,6 @@ __all__ = [
     "EnergyBalance",
     "ObservedEnergy",
     "ObservedFinding",
-    "RecordWindow",
     "RunningEnergy",
     "certify_log",
     "premise_quantities",
@@ -71,7 +70,6 @@ __all__ = [
     "AlignedRecords",
     "BodyTurns",
     "Bools",
-    "EndEffectorRows",
     "JointError",
     "PlacedArm",
     "RunView",
@@ -92,7 +90,6 @@ __all__ = [
     "DominancePlan",
     "SharedSlave",
     "Timeline",
-    "sample_ages_ns",
     "summarise_run",
     "DominanceHistory",
 ]
@@ -100,24 +97,18 @@ __all__ = [
 if TYPE_CHECKING:
     from . import decision_facts, link_summary, run_remarks, site_signals
     from .aligned import AlignedRecords, Bools
-    from .arm_rows import (
-        EndEffectorRows,
-        PlacedArm,
-        build_arm_rows,
-        joint_positions_m,
-        upright_axes,
-    )
+    from .arm_rows import PlacedArm, build_arm_rows, joint_positions_m, upright_axes
     from .body_turns import BodyTurns
     from .certificate import premise_quantities, verdict_facts
     from .certificate.certificate_result import Certificate
     from .certificate.energy_balance import ZERO_ENERGY_J, EnergyBalance
     from .certificate.observed_energy import ObservedEnergy, ObservedFinding
-    from .certificate.running_energy import KEPT_S, RecordWindow, RunningEnergy
+    from .certificate.running_energy import KEPT_S, RunningEnergy
     from .certificate.stability_certificate import certify_log
     from .dominance_history import DominanceHistory, DominancePlan
     from .file_overview import FileOverview, info, summarise_run
     from .judge import certify_run, judge_virtual_run
-    from .link_summary import DelayDistribution, sample_ages_ns
+    from .link_summary import DelayDistribution
     from .metrics.log_metrics import LogMetrics
     from .metrics.measures import Metric, Quantity
     from .metrics.motion_metrics import measure_undelayed_error
@@ -165,22 +156,20 @@ else:
         __name__,
         {
             "aligned": "AlignedRecords Bools",
-            "arm_rows": (
-                "EndEffectorRows PlacedArm build_arm_rows joint_positions_m upright_axes"
-            ),
+            "arm_rows": "PlacedArm build_arm_rows joint_positions_m upright_axes",
             "body_turns": "BodyTurns",
             "certificate.certificate_result": "Certificate",
             "certificate.energy_balance": "EnergyBalance ZERO_ENERGY_J",
             "certificate.observed_energy": "ObservedEnergy ObservedFinding",
             "certificate.premise_quantities": "premise_quantities",
-            "certificate.running_energy": "KEPT_S RecordWindow RunningEnergy",
+            "certificate.running_energy": "KEPT_S RunningEnergy",
             "certificate.stability_certificate": "certify_log",
             "certificate.verdict_facts": "verdict_facts",
             "decision_facts": "decision_facts",
             "dominance_history": "DominanceHistory DominancePlan",
             "file_overview": "FileOverview info summarise_run",
             "judge": "certify_run judge_virtual_run",
-            "link_summary": "DelayDistribution link_summary sample_ages_ns",
+            "link_summary": "DelayDistribution link_summary",
             "metrics.log_metrics": "LogMetrics",
             "metrics.measures": "Metric Quantity",
             "metrics.motion_metrics": "measure_undelayed_error",

@@ -284,6 +284,11 @@ class EndEffectorRows(NamedTuple):
     speed: Array
     J: Array
 
+    @property
+    def last(self) -> "EndEffectorRows":
+        """Position, velocity and Jacobian in the last of the poses, as arrays with K = 1."""
+        return EndEffectorRows(self.position[-1:], self.speed[-1:], self.J[-1:])
+
     def find_force(self, torque: Array, least: float = 1e-15) -> Array:
         """Finds the force at the end effector that best explains a joint torque.
 

@@ -29,7 +29,7 @@ from typing import Any
 
 from ..errors import UsageError
 from ..files import refuse_existing, write_whole
-from ..log import VIZ_ROOT, open_log
+from ..log import open_log
 from ..log.ros2 import (
     FLOAT64_ARRAY,
     NUMBERS_BY_MODE_WORD,
@@ -38,8 +38,7 @@ from ..log.ros2 import (
     STRING,
     WORLD,
     Ros2Channels,
-    list_log_topics,
-    read_ros2_channels,
+    Ros2Topics,
 )
 from .rerun_viewer import CurvePlot, PlotLayout
 
@@ -79,7 +78,7 @@ def write_foxglove_layout(log: Path, *, force: bool = False) -> Path:
     """
     path = log.with_suffix(_LAYOUT_SUFFIX)
     refuse_existing(path, force=force)
-    channels = read_ros2_channels(log)
+    channels = Ros2Topics.of_file(log)
     if not PlotLayout.of_channels(channels).pages:
         raise UsageError(
             f"{log}: there is nothing to plot, because the file is not finished or was written "
@@ -88,9 +87,8 @@ def write_foxglove_layout(log: Path, *, force: bool = False) -> Path:
         )
 
     sources = {"ROS 2": channels}
-    is_log = any(topic.startswith(VIZ_ROOT) for topic in channels)
-    if is_log:
-        sources = {"Log": channels, "ROS 2": list_log_topics(open_log(log))}
+    if channels.are_of_log:
+        sources = {"Log": channels, "ROS 2": Ros2Topics.of_log(open_log(log))}
     layout = _build_layout(sources)
     write_whole(path, json.dumps(layout, indent=1) + "\n", force=force)
     return path

@@ -28,7 +28,6 @@ import numpy as np
 from trilat_net.analysis import (
     AlignedRecords,
     BodyTurns,
-    EndEffectorRows,
     TorqueSplit,
     VirtualWall,
     build_arm_rows,
@@ -334,18 +333,11 @@ class _ArmFrames:
         if not self._spec.arm.known:
             return []
 
-        motion = split.end_effector
-        last_motion = EndEffectorRows(
-            position=motion.position[-1:],
-            speed=motion.speed[-1:],
-            J=motion.J[-1:],
-        )
-
         last_q = records.q[-1:]
 
         gravity_torque = self._rows.gravity_torque(last_q)
         law_torque = records.tau[-1:] - gravity_torque
-        forces = last_motion.find_force(law_torque, _MIN_SINGULAR_SHARE)
+        forces = split.end_effector.last.find_force(law_torque, _MIN_SINGULAR_SHARE)
         last_force = forces[0]
         return _round(last_force, 3)
 
@@ -441,6 +433,15 @@ class SessionFrames:
             "shares": shares,
             "columns": columns,
         }
+
+    def list_events(self, first: int, most: int) -> list[Json]:
+        """Returns events of the session, such as a lost connection, for the list on a page.
+
+        Args:
+            first: Number of the first event.
+            most: Largest number of events.
+        """
+        return [_render_event(event) for event in self._view.events.since(first, most)]
 
     def _describe_waiting(self, scenario: Scenario | None) -> Json:
         """Describes for a web page the processes for which a session that has not begun waits.
@@ -837,7 +838,7 @@ def _describe_alarm(alarm: LifeAlarm) -> Json:
     }
 
 
-def render_event(event: Event) -> Json:
+def _render_event(event: Event) -> Json:
     """Formats an event of the session, such as a lost connection, for the list on a page.
 
     Args:

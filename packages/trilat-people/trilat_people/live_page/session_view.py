@@ -26,7 +26,7 @@ from typing import Generic, TypeVar
 import msgspec
 
 from recorder import AWAY_NS, GapRepair, InboundQueue
-from trilat_net.analysis import KEPT_S, RecordWindow, RunningEnergy
+from trilat_net.analysis import KEPT_S, RunningEnergy
 from trilat_net.core import TAKEN, LifeAlarm
 from trilat_net.errors import ScenarioError, WireError
 from trilat_net.net import (
@@ -119,7 +119,7 @@ class SiteView:
         scenario: Scenario of the session.
         name: Name of the site.
         boot: Random number that identifies this start of the site.
-        window: Latest records of the site.
+        energy: Energy of the session, which has the latest records of the site.
 
     Attributes:
         glides: True if the site stops smoothly when it loses its peers (the rule `glide`). Only
@@ -149,7 +149,7 @@ class SiteView:
         scenario: Scenario,
         name: str,
         boot: int,
-        window: RecordWindow,
+        energy: RunningEnergy,
     ) -> None:
         settings = scenario.sites[name]
         loss_rule = settings.on_stale
@@ -159,7 +159,7 @@ class SiteView:
         if loss_rule.rule.degrades:
             self.layout = scenario.layout(name)
         self.hand = settings.find_live_hand(is_open=True)
-        self.window = window
+        self.window = energy.windows[name]
         self.holder = ""
         self.stopped_by = ""
         self.bodies: dict[int, list[float]] = {}
@@ -493,7 +493,7 @@ class SessionView:
                 scenario=scenario,
                 name=name,
                 boot=self.members[name].boot,
-                window=self.energy.windows[name],
+                energy=self.energy,
             )
 
     def _receive(self, key: str, block: bytes, mono_ns: int) -> None:
