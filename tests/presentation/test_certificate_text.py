@@ -32,7 +32,7 @@ from trilat_net.presentation.certificate_text import (
     list_energies,
 )
 from trilat_net.presentation.figures.certificate_energy import draw_functional
-from trilat_net.presentation.page_summary import describe_basis
+from trilat_net.presentation.page_summary import render_verdict
 from trilat_net.scenario import load_scenario
 
 LOGS = {
@@ -192,10 +192,9 @@ def test_settled_runs_state_their_speed(behaviour: EndBehaviour) -> None:
     assert certificate.stability is Stability.SETTLED
     text = " ".join(line.text for line in describe_in_words(certificate))
     assert "no joint was faster than 0.0043 rad/s at the end" in text
-    assert "no joint was faster than 0.0043 rad/s" in describe_basis(certificate)
-    assert (
-        "came to rest" not in f"{certificate.headline()} {text} {describe_basis(certificate)}"
-    )
+    verdict = render_verdict(make_short_log("paper"), certificate, [])
+    assert "no joint was faster than 0.0043 rad/s" in verdict
+    assert "came to rest" not in f"{certificate.headline()} {text} {verdict}"
 
 
 def test_divergence_is_stated_once_with_its_joint() -> None:

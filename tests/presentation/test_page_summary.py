@@ -4,6 +4,7 @@ import re
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import cache
+from html import unescape
 from pathlib import Path
 
 import numpy as np
@@ -31,13 +32,13 @@ from trilat_net.log.log_reader import Log, open_log
 from trilat_net.presentation.certificate_text import describe_certificate
 from trilat_net.presentation.conclusion import _tabulate_sites, conclude
 from trilat_net.presentation.page_summary import (
-    describe_basis,
     find_error_peak,
     render_checks,
     render_key_numbers,
     render_verdict,
 )
 from trilat_net.presentation.result_text import compose
+from trilat_net.presentation.style import typeset
 
 STABLE_ROOTS = LoopRoots("stable", -0.5, True)
 PASSED = Finding("records", "8/8 in the file; judged all 8 ticks")
@@ -109,8 +110,8 @@ def test_small_oscillation_is_not_called_settled() -> None:
 def test_an_open_run_names_its_first_reason() -> None:
     certificate = make_certificate(EndBehaviour.HARDLY, 0.2, roots=None)
     assert certificate.stability is Stability.OPEN
-    text = describe_basis(certificate)
-    assert certificate.reasons[0] in text
+    text = unescape(verdict_text(certificate))
+    assert typeset(certificate.reasons[0]) in text
     assert ("more reason" in text) == (len(certificate.reasons) > 1)
 
 

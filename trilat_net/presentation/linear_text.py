@@ -36,13 +36,13 @@ def compose_linear(analysis: LinearAnalysis) -> Iterator[Block]:
     Args:
         analysis: The analysis.
     """
-    yield from describe_equilibrium(analysis)
-    yield from describe_effective_delays(analysis)
+    yield from _describe_equilibrium(analysis)
+    yield from _describe_effective_delays(analysis)
     yield ""
-    yield tabulate_roots(analysis)
-    yield describe_zero_roots(analysis)
+    yield _tabulate_roots(analysis)
+    yield _describe_zero_roots(analysis)
 
-    verdict, _, explanation = describe_linear_verdict(analysis).partition(": ")
+    verdict, _, explanation = _describe_linear_verdict(analysis).partition(": ")
     yield MarkedText(f"[{_COLOURS[verdict]}]{verdict}[/]:", explanation)
 
     margin = analysis.margin.description
@@ -73,7 +73,7 @@ def _describe_scans(analysis: LinearAnalysis) -> Iterator[str]:
         yield f"{scan.key} from {scan.low:g} to {scan.high:g}: {result}"
 
 
-def describe_equilibrium(analysis: LinearAnalysis) -> Iterator[str]:
+def _describe_equilibrium(analysis: LinearAnalysis) -> Iterator[str]:
     """Yields lines that describe the equilibrium pose at which the arms were linearised.
 
     The lines state how the equilibrium was computed, its residual, and the pose of each arm. If
@@ -108,7 +108,7 @@ def _list_numbers(values: Array) -> str:
     return ", ".join(f"{value:.4f}" for value in values)
 
 
-def describe_effective_delays(analysis: LinearAnalysis) -> Iterator[str]:
+def _describe_effective_delays(analysis: LinearAnalysis) -> Iterator[str]:
     """Yields lines for the user about the delays with which arms follow each other.
 
     There is a line for each link (one-way connection between two arms), or a single line if all
@@ -132,7 +132,7 @@ def describe_effective_delays(analysis: LinearAnalysis) -> Iterator[str]:
         yield f"{quantity} on {names[j]}->{names[i]}: {1e3 * age_s[i, j]:.4g} ms"
 
 
-def tabulate_roots(analysis: LinearAnalysis) -> TextTable:
+def _tabulate_roots(analysis: LinearAnalysis) -> TextTable:
     """Returns a table of the rightmost characteristic roots, which determine stability.
 
     A motion with the root s changes as exp(s t), and grows if the real part of s is positive.
@@ -200,7 +200,7 @@ def describe_moving_states(states: Sequence[str]) -> str:
     return "; ".join(phrases)
 
 
-def describe_zero_roots(analysis: LinearAnalysis) -> str:
+def _describe_zero_roots(analysis: LinearAnalysis) -> str:
     """Returns a sentence about the roots that are zero by the structure of the system.
 
     For example, if all arms were moved to another common pose, no torque would bring them back.
@@ -223,7 +223,7 @@ def describe_zero_roots(analysis: LinearAnalysis) -> str:
     )
 
 
-def describe_linear_verdict(analysis: LinearAnalysis) -> str:
+def _describe_linear_verdict(analysis: LinearAnalysis) -> str:
     """Returns a sentence that says whether small motions of the coupled arms decay.
 
     The sentence states the growth rate and the frequency of the slowest decaying, or fastest

@@ -25,7 +25,6 @@ from ..scenario import (
 )
 from .html_templates import render_macro
 from .page_html import (
-    render_code,
     render_details,
     render_facts,
     render_folds,
@@ -56,13 +55,13 @@ def render_origin(log: Log, facts: JsonObject, licence: str) -> Markup:
     folds = [
         render_details("What this scenario is about", _render_description(scenario)),
         render_details("What is assumed", _render_assumptions(scenario)),
-        render_details(f"The resolved scenario, {hint}", render_code(scenario.text)),
+        render_details(f"The resolved scenario, {hint}", _render_code(scenario.text)),
         render_details("The recording", render_facts(recording)),
         render_details("Versions of the software", render_facts(_list_versions(log))),
-        render_details("Licence of the plotting library", render_code(licence)),
+        render_details("Licence of the plotting library", _render_code(licence)),
     ]
 
-    body = render_code(_list_commands(log, name)) + render_folds(folds)
+    body = _render_code(_list_commands(log, name)) + render_folds(folds)
     intro = "These commands check the log, simulate its run again, and run its scenario."
 
     law_files = _list_law_files(scenario)
@@ -242,3 +241,14 @@ def _list_versions(log: Log) -> list[tuple[str, str]]:
         if key.startswith(prefix):
             entries.append((key.removeprefix(prefix), version))
     return entries
+
+
+def _render_code(text: str) -> Markup:
+    """Renders commands or the content of a file as HTML in a fixed-width type.
+
+    Line breaks are kept.
+
+    Args:
+        text: The commands or the content, as plain text.
+    """
+    return render_macro("parts.html", "code", text=text)

@@ -122,7 +122,7 @@ def render_verdict(log: Log, certificate: Certificate, findings: Sequence[Findin
         "verdict",
         css_class=css_class,
         word=word.capitalize(),
-        basis=typeset(describe_basis(certificate)),
+        basis=typeset(_describe_basis(certificate)),
         explanation=" ".join(sentences),
         remarks=" ".join(remarks),
     )
@@ -141,7 +141,7 @@ def _start_sentence(text: str) -> str:
     return text if is_name and first_word != "a" else f"{text[:1].upper()}{text[1:]}"
 
 
-def describe_basis(certificate: Certificate) -> str:
+def _describe_basis(certificate: Certificate) -> str:
     """Returns a sentence on the meaning and the basis of a judgement about stability.
 
     A simulation and a live session, or a proof and an observation, support a judgement to

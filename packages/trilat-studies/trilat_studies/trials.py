@@ -45,7 +45,7 @@ from trilat_net.net import SystemClock
 from trilat_net.presentation import Block, MarkedText, TextTable
 from trilat_net.results import Result
 from trilat_net.scenario import ExperimentText, Scenario, load_scenario
-from trilat_net.work import MAX_LOSSES, MeanInterval, WorkerPool, Workers, open_worker_pool
+from trilat_net.work import MAX_LOSSES, MeanInterval, WorkerPool, Workers
 
 from .measure_run import ExpectationResult, RunMetrics
 from .run_commands import format_command, list_assignments, set_options
@@ -675,7 +675,7 @@ def run_trials(
     start_ns = clock.monotonic_ns()
     laws = list(dict.fromkeys(code for trial in batch for code in trial.scenario.imported_code))
     results: dict[int, TrialResult] = {}
-    with open_worker_pool(jobs, on, most=len(batch), laws=laws) as pool:
+    with WorkerPool.open(jobs, on, most=len(batch), laws=laws) as pool:
         for index, result in _iterate_results(pool, batch):
             # The result names the trial of the batch, and not the copy that a worker received.
             results[index] = result._replace(trial=batch[index])

@@ -41,7 +41,7 @@ from trilat_net.analysis.certificate.verdict_facts import StabilityFinding
 from trilat_net.analysis.dominance_history import DominancePlan
 from trilat_net.analysis.metrics.log_metrics import LogMetrics
 from trilat_net.core import DominanceRamp
-from trilat_net.presentation.premise_text import explain_no_functional
+from trilat_net.presentation.verdict_text import explain_no_functional
 from trilat_net.scenario import load_scenario, parse_scenario
 
 CAUGHT = 1e-3

@@ -40,7 +40,7 @@ from trilat_net.analysis.torque_sources import WallEnergy
 from trilat_net.analysis.twins import envelope_trend
 from trilat_net.core.step.vectors import Array
 from trilat_net.log.log_reader import Log
-from trilat_net.presentation import decision_text, end_text, premise_text, verdict_text
+from trilat_net.presentation import decision_text, end_text, verdict_text
 from trilat_net.presentation.verdict_text import REQUIREMENTS
 from trilat_net.scenario import load_scenario, parse_scenario
 
@@ -127,7 +127,7 @@ def strings_in(value: object) -> Iterator[str]:
 
 
 def test_each_kind_of_quantities_has_its_sentence() -> None:
-    assert set(premise_text.DESCRIBERS) == set(get_args(PremiseQuantities))
+    assert set(verdict_text.PREMISE_DESCRIBERS) == set(get_args(PremiseQuantities))
 
 
 def list_premise_names() -> set[str]:
@@ -188,7 +188,7 @@ def test_judging_modules_have_no_sentence(module: ModuleType) -> None:
 
 def test_sentences_are_recognised() -> None:
     """The name of a source of energy is a key of the JSON output."""
-    assert len(list_clauses(premise_text)) > 20
+    assert len(list_clauses(verdict_text)) > 20
     assert list_clauses(energy_balance) == {"what beta does not cancel"}
 
 

@@ -178,7 +178,7 @@ def project_arm_m(arm: ArmModel, points: Array, *, onto_floor: bool = False) -> 
     return np.stack([across, up], axis=-1)
 
 
-def choose_instants_s(log: Log, count: int = INSTANTS) -> list[float]:
+def _choose_instants_s(log: Log, count: int = INSTANTS) -> list[float]:
     """Chooses the times at which to draw the arms, including the first and the last time.
 
     Equal steps of time would mostly show arms at rest. Therefore the times are equally spaced
@@ -302,7 +302,7 @@ def _draw_arms(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
         form: Width, type sizes and resolution of the figure.
     """
     instants = _NARROW_INSTANTS if form.narrow else INSTANTS
-    times_s = choose_instants_s(log, instants)
+    times_s = _choose_instants_s(log, instants)
     poses = {}
     for site in log.sites:
         poses[site] = [find_pose(log, site, t_s) for t_s in times_s]
@@ -383,7 +383,7 @@ def render_arms_svg(log: Log, bounds_m: PictureBox, factor: float) -> Markup:
     left_m, right_m, bottom_m, top_m = bounds_m
     bounds = (factor * left_m, factor * right_m, factor * bottom_m, factor * top_m)
 
-    times_s = choose_instants_s(log)
+    times_s = _choose_instants_s(log)
     rows = []
     for index, site in enumerate(log.sites):
         if not len(log[site]):

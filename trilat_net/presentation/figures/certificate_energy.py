@@ -27,7 +27,7 @@ from ...core import Array
 from ...log import Log
 from .. import style
 from ..appearance import REPORT_SIZE, FigureSize
-from ..premise_text import explain_no_functional
+from ..verdict_text import explain_no_functional
 from .figure_entry import draws, unless
 
 _PART_LABELS = {

@@ -53,10 +53,9 @@ from trilat_net.work import (
     Progress,
     RunJournal,
     StudyFolder,
+    WorkerPool,
     Workers,
-    build_resume_hint,
     ignore_progress,
-    open_worker_pool,
 )
 
 from ..measure_run import RecordBatch, WholeRun, describe_program
@@ -846,7 +845,7 @@ def prepare_bench_folder(plan: BenchPlan, path: Path | None = None) -> BenchFold
         make_results_folder(path, "", force=None)
         write_whole(origin_file, origin)
 
-    remedy = build_resume_hint("bench", "--study", plan.study, "--out", str(path))
+    remedy = RunJournal.build_resume_hint("bench", "--study", plan.study, "--out", str(path))
     journal_file = path / JOURNAL_NAME
     return StudyFolder(
         path=path,
@@ -986,7 +985,7 @@ def _run_pending(
         return
     in_lanes = any(item.is_side_by_side for item in pending)
     hint = "; finished runs are kept: the same command continues"
-    with open_worker_pool(jobs, on, most=len(pending), hint=hint) as pool:
+    with WorkerPool.open(jobs, on, most=len(pending), hint=hint) as pool:
         journal.run_pending(
             pool,
             BenchRunItem.run,

@@ -28,7 +28,7 @@ from trilat_net.files import write_whole
 from trilat_net.presentation import TextTable
 from trilat_net.results import Result
 from trilat_net.scenario import Scenario
-from trilat_net.work import Progress, Workers, ignore_progress, open_worker_pool
+from trilat_net.work import Progress, WorkerPool, Workers, ignore_progress
 
 from ..run_commands import format_override_value
 from . import sweep_cell
@@ -428,7 +428,7 @@ class SweepMargins(Result):
 
         # The workers need the files of control laws that users wrote.
         laws = plan.base.imported_code
-        with open_worker_pool(jobs, on, most=len(searches), laws=laws) as pool:
+        with WorkerPool.open(jobs, on, most=len(searches), laws=laws) as pool:
             found = pool.map(_search_margin_task, searches, progress)
         return cls(plan, within, found)
 

@@ -43,7 +43,7 @@ from trilat_net.scenario import (
     SiteSpec,
     is_number,
 )
-from trilat_net.work import Progress, Workers, ignore_progress, open_worker_pool
+from trilat_net.work import Progress, WorkerPool, Workers, ignore_progress
 
 from ..run_commands import format_override_value
 from .fixed_gains import describe_fixed_gains
@@ -1367,7 +1367,7 @@ class StabilityMap(NamedTuple):
         # The cells of a sweep that is judged linearly have the growth rates already.
         if linearly and not plane.is_linear:
             tasks = [(load, x_value, y) for load in loaders for x_value in fine.values]
-            with open_worker_pool(jobs, on, most=len(tasks)) as pool:
+            with WorkerPool.open(jobs, on, most=len(tasks)) as pool:
                 columns = iter(pool.map(_analyse_column, tasks, progress))
             # The results come in the order of the tasks, panel by panel and column by column.
             for lines in panel_lines:

@@ -45,9 +45,7 @@ from trilat_net.work import (
     StudyFolder,
     WorkerPool,
     Workers,
-    build_resume_hint,
     ignore_progress,
-    open_worker_pool,
 )
 from trilat_net.workers import count_cores
 
@@ -97,7 +95,7 @@ def _build_folder(path: Path, plan: SweepPlan, facts: Mapping[str, Any]) -> Swee
         facts: The plan as plain values, with the arithmetic and the versions of the program.
     """
     plan_digest = hashlib.sha256(_encode_plan(facts).encode()).hexdigest()
-    remedy = build_resume_hint("sweep", "--resume", str(path))
+    remedy = RunJournal.build_resume_hint("sweep", "--resume", str(path))
 
     def open_journal() -> RunJournal[CellRun]:
         return RunJournal(path / JOURNAL_FILE, plan_digest, CellRun, remedy)
@@ -610,7 +608,7 @@ def run_sweep(
         left = plan.cells * len(plan.seeds) - len(journal.done)
         laws = plan.base.imported_code
         workers = on if left else None  # no cluster is needed if nothing is left to run
-        with open_worker_pool(jobs, workers, most=left, laws=laws, hint=_RESUME_HINT) as pool:
+        with WorkerPool.open(jobs, workers, most=left, laws=laws, hint=_RESUME_HINT) as pool:
             count = pool.workers
             _SweepWork(plan, journal, pool, progress, tally).execute()
         wall_s = (clock.monotonic_ns() - started_ns) * 1e-9
