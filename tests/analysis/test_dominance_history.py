@@ -11,12 +11,10 @@ import trilat_net
 from tests.log.builders import edit_log_bytes, make_log_bytes, open_bytes
 from trilat_net.analysis.dominance_history import (
     DominanceHistory,
+    DominanceMatrix,
     DominancePlan,
-    compute_lyapunov_weights,
-    find_closed_groups,
+    PeerLoss,
     find_kd_scales,
-    find_lost_peers,
-    left_perron_vector,
 )
 from trilat_net.core.links.dominance import apply_ramps
 from trilat_net.core.links.link import link_dtype
@@ -108,14 +106,16 @@ def test_pi_is_the_eigenvector_that_numpy_finds(n: int, seed: int) -> None:
     alpha /= alpha.sum(axis=1, keepdims=True)
     values, vectors = np.linalg.eig(alpha.T)
     expected = np.real(vectors[:, np.argmax(np.real(values))])
-    assert left_perron_vector(alpha) == pytest.approx(expected / expected.sum(), abs=1e-9)
+    assert DominanceMatrix(alpha).compute_perron_vector() == pytest.approx(
+        expected / expected.sum(), abs=1e-9
+    )
 
 
 @given(st.lists(st.floats(0.01, 100.0), min_size=3, max_size=3))
 def test_scaled_kd_cancels_forwarded_motion(scales: list[float]) -> None:
     """sum_i beta_i ( |x_i|^2_Kd_i - sum_j alpha_ij |x_j|^2_Kd_i ) = 0 for all x, Eq. (20)."""
     Kd = np.outer(scales, [3.0, 0.4])
-    weights = compute_lyapunov_weights(THREE, Kd)
+    weights = DominanceMatrix(THREE).compute_lyapunov_weights(Kd)
     norms = np.random.default_rng(1).random((3, 2))
     passed = [Kd[i] @ (norms[i] - THREE[i] @ norms) for i in range(3)]
     assert weights.beta @ passed == pytest.approx(
@@ -125,9 +125,9 @@ def test_scaled_kd_cancels_forwarded_motion(scales: list[float]) -> None:
 
 
 def test_equal_shares_and_kd_give_the_papers_ones() -> None:
-    assert compute_lyapunov_weights(THREE, np.full((3, 2), 3.0)).beta == pytest.approx(
-        np.ones(3)
-    )
+    assert DominanceMatrix(THREE).compute_lyapunov_weights(
+        np.full((3, 2), 3.0)
+    ).beta == pytest.approx(np.ones(3))
 
 
 def test_kd_of_different_shapes_have_no_scalar() -> None:
@@ -137,13 +137,13 @@ def test_kd_of_different_shapes_have_no_scalar() -> None:
 
 
 def test_a_site_that_nobody_follows_has_no_weight() -> None:
-    weights = compute_lyapunov_weights(EXPERT, np.ones((3, 2)))
+    weights = DominanceMatrix(EXPERT).compute_lyapunov_weights(np.ones((3, 2)))
     assert weights.groups == ((0, 2),)
     assert weights.beta == pytest.approx([1.5, 0.0, 1.5])
 
 
 def test_two_groups_that_follow_nobody_outside_are_named() -> None:
-    assert find_closed_groups(PAIRS) == ((0, 1), (2, 3))
+    assert DominanceMatrix(PAIRS).find_closed_groups() == ((0, 1), (2, 3))
 
 
 @pytest.mark.parametrize("mem", [[], [0.5] * 11])
@@ -153,7 +153,6 @@ def test_a_record_without_lost_peers_is_reported(mem: list[float]) -> None:
     broken = edit_log_bytes(
         data, record=lambda r: {**r, "mem": mem} if (r["site"], r["tick"]) == ("s", 40) else r
     )
-    times_s = np.array([0.05])
-    assert not find_lost_peers(open_bytes(data), "s", times_s).any()
+    assert PeerLoss.list_of_log(open_bytes(data)) == []
     with pytest.raises(LogError, match="a record of s does not have 12 numbers in `mem`"):
-        find_lost_peers(open_bytes(broken), "s", times_s)
+        PeerLoss.list_of_log(open_bytes(broken))

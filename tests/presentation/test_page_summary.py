@@ -17,8 +17,7 @@ from tests.log.builders import (
     rewrite_log,
     write_log,
 )
-from trilat_net.analysis.certificate.certificate_result import Certificate
-from trilat_net.analysis.certificate.stability_certificate import certify_log
+from trilat_net.analysis.certificate.stability_certificate import Certificate
 from trilat_net.analysis.decision_facts import LoopRoots
 from trilat_net.analysis.file_overview import summarise_run
 from trilat_net.analysis.judge import certify_run
@@ -175,7 +174,7 @@ def test_key_numbers_have_place_and_time() -> None:
 def test_all_texts_have_the_same_last_error(name: str) -> None:
     """The page, the table of `report` and `certify` name one number and its joint."""
     log = make_short_log(name)
-    certificate = certify_log(log)
+    certificate = Certificate.of_log(log)
     error = JointError.find_last_of_all(log)
     assert error is not None
     facts = summarise_run(log)

@@ -12,9 +12,7 @@ from scipy.optimize import linprog
 from tests.execution.builders import make_shipped_trajectories
 from tests.theory.energy import compute_balance
 from trilat_net.analysis.dominance_history import (
-    compute_lyapunov_weights,
-    find_closed_groups,
-    left_perron_vector,
+    DominanceMatrix,
 )
 from trilat_net.core.arms.exogenous import (
     TorqueKind,
@@ -98,9 +96,11 @@ def test_with_ones_v_can_rise() -> None:
 def test_weights_are_left_eigenvectors_for_all_n(size: int) -> None:
     """Errata 6, N sites."""
     alpha = draw_shares(np.random.default_rng(size), size)
-    assert left_perron_vector(alpha) == pytest.approx(find_perron_vector(alpha), rel=1e-9)
+    assert DominanceMatrix(alpha).compute_perron_vector() == pytest.approx(
+        find_perron_vector(alpha), rel=1e-9
+    )
     c = np.linspace(0.3, 10.0, size)
-    beta = compute_lyapunov_weights(alpha, c[:, np.newaxis] * [3.0, 1.0]).beta
+    beta = DominanceMatrix(alpha).compute_lyapunov_weights(c[:, np.newaxis] * [3.0, 1.0]).beta
     assert beta * c / (beta @ c) == pytest.approx(find_perron_vector(alpha), rel=1e-9)
 
 
@@ -257,7 +257,7 @@ def test_two_closed_groups_have_several_betas() -> None:
     """Errata 11, N >= 4."""
     alpha = np.array([[0.0, 1, 0, 0], [1, 0, 0, 0], [0, 0, 0, 1], [0, 0, 1, 0]])
     assert np.linalg.matrix_rank(alpha - np.eye(4)) == 2
-    assert find_closed_groups(alpha) == ((0, 1), (2, 3))
+    assert DominanceMatrix(alpha).find_closed_groups() == ((0, 1), (2, 3))
 
 
 # --- 12: what is not an error but follows ---------------------------------------------------------------

@@ -23,7 +23,6 @@ __all__ = [
     "Stability",
     "certify_run",
     "decision_facts",
-    "find_hanging_sites",
     "judge_virtual_run",
     "run_remarks",
     # The certificate
@@ -33,9 +32,7 @@ __all__ = [
     "EnergyBalance",
     "ObservedEnergy",
     "ObservedFinding",
-    "RecordWindow",
     "RunningEnergy",
-    "certify_log",
     "premise_quantities",
     "verdict_facts",
     # Twins
@@ -65,33 +62,25 @@ __all__ = [
     "analyse_linear_loop",
     "find_root_crossings",
     "find_run_roots",
-    "read_hands",
     # Signals of a run
     "SETTLED_ERROR_RAD",
     "AlignedRecords",
-    "BodyTurns",
     "Bools",
-    "EndEffectorRows",
     "JointError",
-    "PlacedArm",
     "RunView",
     "TorqueSplit",
     "build_arm_rows",
     "SourceRows",
-    "joint_positions_m",
     "largest_magnitude",
     "VirtualWall",
     "settling_time_of_all_s",
     "site_signals",
-    "upright_axes",
     # Links, leaders and events
     "DelayDistribution",
     "FileOverview",
-    "find_closed_groups",
     "info",
-    "left_perron_vector",
     "link_summary",
-    "DominancePlan",
+    "DominanceMatrix",
     "SharedSlave",
     "Timeline",
     "sample_ages_ns",
@@ -103,25 +92,14 @@ if TYPE_CHECKING:
     from . import decision_facts, link_summary, run_remarks, site_signals
     from .aligned import AlignedRecords, Bools
     from .arm_rows import (
-        EndEffectorRows,
-        PlacedArm,
         build_arm_rows,
-        joint_positions_m,
-        upright_axes,
     )
-    from .body_turns import BodyTurns
     from .certificate import premise_quantities, verdict_facts
-    from .certificate.certificate_result import Certificate
     from .certificate.energy_balance import ZERO_ENERGY_J, EnergyBalance
     from .certificate.observed_energy import ObservedEnergy, ObservedFinding
-    from .certificate.running_energy import KEPT_S, RecordWindow, RunningEnergy
-    from .certificate.stability_certificate import certify_log
-    from .dominance_history import (
-        DominanceHistory,
-        DominancePlan,
-        find_closed_groups,
-        left_perron_vector,
-    )
+    from .certificate.running_energy import KEPT_S, RunningEnergy
+    from .certificate.stability_certificate import Certificate
+    from .dominance_history import DominanceHistory, DominanceMatrix
     from .file_overview import FileOverview, info, summarise_run
     from .judge import certify_run, judge_virtual_run
     from .link_summary import DelayDistribution, sample_ages_ns
@@ -136,7 +114,6 @@ if TYPE_CHECKING:
         RunEnd,
         RunTrace,
         Stability,
-        find_hanging_sites,
     )
     from .run_view import RunView
     from .shared_slave import SharedSlave
@@ -148,7 +125,6 @@ if TYPE_CHECKING:
     )
     from .theory.characteristic_roots import Complex
     from .theory.delay_margin import MAX_COMMON_DELAY_S
-    from .theory.hand_files import read_hands
     from .theory.linear_analysis import LinearAnalysis, analyse_linear_loop
     from .theory.linear_edge import GrowthColumn, find_root_crossings
     from .theory.loop_roots import find_run_roots
@@ -172,21 +148,15 @@ else:
         __name__,
         {
             "aligned": "AlignedRecords Bools",
-            "arm_rows": (
-                "EndEffectorRows PlacedArm build_arm_rows joint_positions_m upright_axes"
-            ),
-            "body_turns": "BodyTurns",
-            "certificate.certificate_result": "Certificate",
+            "arm_rows": "build_arm_rows",
             "certificate.energy_balance": "EnergyBalance ZERO_ENERGY_J",
             "certificate.observed_energy": "ObservedEnergy ObservedFinding",
             "certificate.premise_quantities": "premise_quantities",
-            "certificate.running_energy": "KEPT_S RecordWindow RunningEnergy",
-            "certificate.stability_certificate": "certify_log",
+            "certificate.running_energy": "KEPT_S RunningEnergy",
+            "certificate.stability_certificate": "Certificate",
             "certificate.verdict_facts": "verdict_facts",
             "decision_facts": "decision_facts",
-            "dominance_history": (
-                "DominanceHistory DominancePlan find_closed_groups left_perron_vector"
-            ),
+            "dominance_history": "DominanceHistory DominanceMatrix",
             "file_overview": "FileOverview info summarise_run",
             "judge": "certify_run judge_virtual_run",
             "link_summary": "DelayDistribution link_summary sample_ages_ns",
@@ -194,8 +164,7 @@ else:
             "metrics.measures": "Metric Quantity",
             "metrics.motion_metrics": "measure_undelayed_error",
             "run_end": (
-                "EndBehaviour FORCE_NM NO_BUCKETS RunEnd RunTrace Stability THROWN_RAD "
-                "find_hanging_sites"
+                "EndBehaviour FORCE_NM NO_BUCKETS RunEnd RunTrace Stability THROWN_RAD"
             ),
             "run_remarks": "run_remarks",
             "run_view": "RunView",
@@ -206,7 +175,6 @@ else:
             ),
             "theory.characteristic_roots": "Complex",
             "theory.delay_margin": "MAX_COMMON_DELAY_S",
-            "theory.hand_files": "read_hands",
             "theory.linear_analysis": "LinearAnalysis analyse_linear_loop",
             "theory.linear_edge": "GrowthColumn find_root_crossings",
             "theory.loop_roots": "find_run_roots",

@@ -37,7 +37,7 @@ from ..core import (
     forward_kinematics,
 )
 from ..records import JOINTS
-from ..scenario import ArmModel, Scenario
+from ..scenario import Scenario
 
 HANGING_RAD = 0.3
 """Largest angle between a hanging link and the downward vertical, in rad."""
@@ -284,6 +284,11 @@ class EndEffectorRows(NamedTuple):
     speed: Array
     J: Array
 
+    @property
+    def last(self) -> "EndEffectorRows":
+        """The last of the K poses alone."""
+        return EndEffectorRows(self.position[-1:], self.speed[-1:], self.J[-1:])
+
     def find_force(self, torque: Array, least: float = 1e-15) -> Array:
         """Finds the force at the end effector that best explains a joint torque.
 
@@ -505,6 +510,43 @@ class PlanarArmRows(NamedTuple):
             speed=speed.T,
             J=J.transpose(2, 0, 1),
         )
+
+    def joint_positions_m(self, q: Array) -> Array:
+        """Returns the positions of the base, the joints and the end effector, for drawing.
+
+        Lines between successive points are the links of the arm.
+
+        Args:
+            q: Joint angles in K poses, shape (K, 2), in rad.
+
+        Returns:
+            Positions of these three points in m, shape (K, 3, 2).
+        """
+        points_per_pose = 1 + JOINTS
+        points = np.zeros((len(q), points_per_pose, 2))
+        for pose, angles in zip(points, q, strict=True):
+            pose[1:] = forward_kinematics(self.lengths_m, angles)
+        return points
+
+    @property
+    def upright_axes(self) -> None:
+        """Always `None`, because the planar arm is drawn in its own plane.
+
+        `ChainArmRows.upright_axes` contains the axes of a frame that stands upright.
+        """
+        return
+
+    @property
+    def least_inertia_kg_m2(self) -> float:
+        """A lower bound on the eigenvalues of the inertia matrix M(q) for all poses q.
+
+        The least eigenvalue occurs at cos q2 = 1 or -1.
+        """
+        poses = np.array([[0.0, 0.0], [0.0, np.pi]])
+        extreme_poses = PlacedArm(0.0, self.lengths_m, poses)
+        inertia_matrices = extreme_poses.inertia_matrix(self.theta).T
+        eigenvalues = np.linalg.eigvalsh(inertia_matrices)
+        return float(eigenvalues.min())
 
     def hanging_angle(self, q: Array) -> float:
         """Returns the largest angle between a link and the direction straight down, in rad.
@@ -789,6 +831,53 @@ class ChainArmRows(NamedTuple):
         rate: Array = turning + moving
         return rate.transpose(0, 2, 1)
 
+    def joint_positions_m(self, q: Array) -> Array:
+        """Returns the positions of the base, the joints and the end effector, for drawing.
+
+        Lines between successive points are the links of the arm.
+
+        Args:
+            q: Joint angles in K poses, shape (K, n), in rad.
+
+        Returns:
+            Positions of these L points in m, shape (K, L, 3).
+        """
+        return self._dynamics.place_points(q)
+
+    @property
+    def upright_axes(self) -> Array:
+        """The axes of a frame that stands upright, for drawings of the arm.
+
+        A URDF file may mount the base of a chain in any orientation. The direction of gravity
+        shows which way is up. Without gravity, the z axis of the base counts as up.
+
+        The rows are the unit vectors forward, sideways and up, in the frame of the base, shape
+        (3, 3). The product of points, shape (..., 3), and the transpose are the upright
+        coordinates.
+        """
+        gravity = np.array(self.chain.gravity_m_s2)
+        size = float(np.linalg.norm(gravity))
+        up = np.array([0.0, 0.0, 1.0])
+        if size:
+            up = -gravity / size
+        # the first axis that is not nearly vertical: x, unless gravity acts along x
+        is_vertical = np.abs(up) > 0.9
+        axis_index = int(np.argmin(is_vertical))
+        axis = np.eye(3)[axis_index]
+        vertical_part = (axis @ up) * up
+        forward = axis - vertical_part
+        forward /= np.linalg.norm(forward)
+        sideways = np.cross(up, forward)
+        return np.array([forward, sideways, up])
+
+    @property
+    def least_inertia_kg_m2(self) -> float:
+        """A lower bound on the eigenvalues of the inertia matrix M(q) for all poses q.
+
+        The bound is the least inertia of a drive, which moves with its joint.
+        """
+        return min(joint.armature_kg_m2 for joint in self.chain.joints)
+
     def hanging_angle(self, q: Array) -> float:
         """Returns an angle, in rad, that says how far the chain is from hanging straight down.
 
@@ -868,55 +957,6 @@ def build_arm_rows(scenario: Scenario, site: str) -> ArmRows:
         task = chain.task._replace(posture=spec.q0_rad)
         chain = chain._replace(task=task)
     return ChainArmRows(model.theta, chain)
-
-
-def joint_positions_m(arm: ArmModel, q: Array) -> Array:
-    """Returns the positions of the base, the joints and the end effector, for drawing an arm.
-
-    Lines between successive points are the links of the arm.
-
-    Args:
-        arm: The arm.
-        q: Joint angles in K poses, shape (K, n), in rad.
-
-    Returns:
-        Positions of these L points in m, shape (K, L, 2) for the planar arm, or (K, L, 3) for
-        chains.
-    """
-    if arm.chain is not None:
-        return ChainDynamics(arm.chain, arm.theta).place_points(q)
-    points_per_pose = 1 + JOINTS
-    points = np.zeros((len(q), points_per_pose, 2))
-    for pose, angles in zip(points, q, strict=True):
-        pose[1:] = forward_kinematics(arm.lengths_m, angles)
-    return points
-
-
-def upright_axes(chain: ChainSetup) -> Array:
-    """Returns the axes of a frame that stands upright, for drawings of the arm.
-
-    A URDF file may mount the base of a chain in any orientation. The direction of gravity shows
-    which way is up. Without gravity, the z axis of the base counts as up.
-
-    Returns:
-        Unit vectors forward, sideways and up as rows, in the frame of the base, shape (3, 3).
-            The product of points, shape (..., 3), and the transpose are the upright
-            coordinates.
-    """
-    gravity = np.array(chain.gravity_m_s2)
-    size = float(np.linalg.norm(gravity))
-    up = np.array([0.0, 0.0, 1.0])
-    if size:
-        up = -gravity / size
-    # the first axis that is not nearly vertical: x, unless gravity acts along x
-    is_vertical = np.abs(up) > 0.9
-    axis_index = int(np.argmin(is_vertical))
-    axis = np.eye(3)[axis_index]
-    vertical_part = (axis @ up) * up
-    forward = axis - vertical_part
-    forward /= np.linalg.norm(forward)
-    sideways = np.cross(up, forward)
-    return np.array([forward, sideways, up])
 
 
 DEPENDENT_SHARE = 1e-9

@@ -61,6 +61,17 @@ class DominanceHistory(NamedTuple):
         return not has_steps and not has_ramps
 
     @classmethod
+    def of_scenario(cls, scenario: Scenario, site: str, t_s: Array) -> "DominanceHistory":
+        """Returns the dominance factors that the scenario plans for a site.
+
+        Args:
+            scenario: The description of the experiment.
+            site: Name of the site.
+            t_s: Ascending times, one tick period apart, shape (K,), in s.
+        """
+        return DominancePlan.of_scenario(scenario, site).evaluate(t_s)
+
+    @classmethod
     def of_log(cls, log: Log, site: str, t_s: Array) -> "DominanceHistory":
         """Returns the dominance factors of a site at successive ticks.
 
@@ -77,7 +88,7 @@ class DominanceHistory(NamedTuple):
             LogError: A record names a change that is not valid.
         """
         history = DominancePlan.of_log(log, site).evaluate(t_s)
-        is_present = ~find_lost_peers(log, site, t_s)
+        is_present = ~_find_lost_peers(log, site, t_s)
         if is_present.all():
             return history
 
@@ -95,6 +106,23 @@ class DominanceHistory(NamedTuple):
             rate=numerator / total**2,
             before=before / total_before,
         )
+
+    @classmethod
+    def list_ramp_spans_s(cls, log: Log, site: str) -> list[tuple[float, float]]:
+        """Lists the start and the end of each ramp of a site's dominance factors, in s.
+
+        The slopes of the factors change only at these times, as long as no peer is lost. The
+        start and the end of a sudden change are equal.
+
+        Args:
+            log: The log of the run.
+            site: Name of the site.
+
+        Raises:
+            LogError: A recorded change is not valid.
+        """
+        ramps = DominancePlan.of_log(log, site).ramps
+        return [(ramp.start_ns * 1e-9, ramp.end_ns * 1e-9) for ramp in ramps]
 
 
 class DominancePlan(NamedTuple):
@@ -208,7 +236,7 @@ class DominancePlan(NamedTuple):
         return DominanceHistory(alpha, rate, at_period_ends)
 
 
-def find_lost_peers(log: Log, site: str, t_s: Array) -> NDArray[np.bool_]:
+def _find_lost_peers(log: Log, site: str, t_s: Array) -> NDArray[np.bool_]:
     """Finds the times at which an arm continued without another arm whose messages had stopped.
 
     An arm counts as lost if no message from it arrived for some time, see `core.lost_peers`.
@@ -273,7 +301,7 @@ class PeerLoss(NamedTuple):
         losses = []
         for site in log.sites:
             site_log = log[site]
-            is_lost = find_lost_peers(log, site, site_log.t_s)
+            is_lost = _find_lost_peers(log, site, site_log.t_s)
             lost = is_lost.astype(int)
             times_s = site_log.t_s
             if len(site_log):
@@ -317,56 +345,6 @@ class _LyapunovWeights(NamedTuple):
     scales: Array | None
 
 
-def find_closed_groups(alpha: Array) -> tuple[tuple[int, ...], ...]:
-    """Finds the groups of arms that follow each other, and no arm outside the group.
-
-    An arm may follow another arm directly or through further arms. If there are several groups,
-    the weights of the arms in the energy function V are not unique.
-
-    Args:
-        alpha: Dominance factors: entry (i, j) is the weight with which site i follows site j,
-            shape (N, N).
-
-    Returns:
-        Indices of the sites of each group.
-    """
-    reachable = find_reach(alpha)
-    groups = []
-    for site in range(len(alpha)):
-        is_mutual = reachable[site] & reachable[:, site]
-        group = tuple(np.flatnonzero(is_mutual).tolist())
-        # the first site of a group stands for the group
-        is_first = group[0] == site
-        is_closed = reachable[site].sum() == len(group)
-        if is_first and is_closed:
-            groups.append(group)
-    return tuple(groups)
-
-
-def left_perron_vector(alpha: Array) -> Array:
-    """Returns the left eigenvector pi of the dominance factors for the eigenvalue 1.
-
-    The vector satisfies pi >= 0 and pi' alpha = pi', and its sum is 1. A closed group is a
-    group of sites that follow no site outside the group. pi is 0 for sites outside closed
-    groups. With several closed groups pi is not unique: the sum of its entries in each group is
-    then chosen proportional to the number of sites in the group.
-
-    Args:
-        alpha: Matrix of the dominance factors, shape (N, N).
-
-    Returns:
-        The vector, shape (N,).
-    """
-    pi = np.zeros(len(alpha))
-    groups = find_closed_groups(alpha)
-    total = sum(map(len, groups))
-    for group in groups:
-        group_alpha = alpha[np.ix_(group, group)]
-        group_pi = perron_vector(group_alpha)
-        pi[list(group)] = group_pi * len(group) / total
-    return pi
-
-
 def find_kd_scales(Kd: Array) -> Array | None:
     """Finds the ratio of the damping gain Kd of each arm to the gain of the first arm.
 
@@ -399,27 +377,76 @@ def find_kd_scales(Kd: Array) -> Array | None:
     return scales
 
 
-def compute_lyapunov_weights(alpha: Array, Kd: Array) -> _LyapunovWeights:
-    """Computes the weight of each site in the energy function of the stability proof.
+class DominanceMatrix(NamedTuple):
+    """Weights (dominance factors) with which all N arms follow each other at one time.
 
-    A site is the process that runs one arm. The weight of site i is beta_i = pi_i / c_i, where
-    pi is the left eigenvector of `alpha` for the eigenvalue 1, and c_i is the factor between
-    the damping gain of site i and that of the first site. The weights are scaled so that their
-    sum is N. If the gains are not multiples of each other, c_i = 1 is used, and the energy may
-    rise.
-
-    Args:
-        alpha: Dominance factors: entry (i, j) is the weight with which site i follows site j,
-            shape (N, N).
-        Kd: Damping gains of the N sites along n axes, shape (N, n).
+    Attributes:
+        alpha: The factors: entry (i, j) is the weight with which site i follows site j, shape
+            (N, N).
     """
-    pi = left_perron_vector(alpha)
-    scales = find_kd_scales(Kd)
-    beta = pi if scales is None else pi / scales
-    sites = len(beta)
-    factor = sites / beta.sum()
-    return _LyapunovWeights(
-        beta=beta * factor,
-        groups=find_closed_groups(alpha),
-        scales=scales,
-    )
+
+    alpha: Array
+
+    def find_closed_groups(self) -> tuple[tuple[int, ...], ...]:
+        """Finds the groups of arms that follow each other, and no arm outside the group.
+
+        An arm may follow another arm directly or through further arms. If there are several
+        groups, the weights of the arms in the energy function V are not unique.
+
+        Returns:
+            Indices of the sites of each group.
+        """
+        reachable = find_reach(self.alpha)
+        groups = []
+        for site in range(len(self.alpha)):
+            is_mutual = reachable[site] & reachable[:, site]
+            group = tuple(np.flatnonzero(is_mutual).tolist())
+            # the first site of a group stands for the group
+            is_first = group[0] == site
+            is_closed = reachable[site].sum() == len(group)
+            if is_first and is_closed:
+                groups.append(group)
+        return tuple(groups)
+
+    def compute_perron_vector(self) -> Array:
+        """Returns the left eigenvector pi of the dominance factors for the eigenvalue 1.
+
+        The vector satisfies pi >= 0 and pi' alpha = pi', and its sum is 1. A closed group is a
+        group of sites that follow no site outside the group. pi is 0 for sites outside closed
+        groups. With several closed groups pi is not unique: the sum of its entries in each
+        group is then chosen proportional to the number of sites in the group.
+
+        Returns:
+            The vector, shape (N,).
+        """
+        pi = np.zeros(len(self.alpha))
+        groups = self.find_closed_groups()
+        total = sum(map(len, groups))
+        for group in groups:
+            group_alpha = self.alpha[np.ix_(group, group)]
+            group_pi = perron_vector(group_alpha)
+            pi[list(group)] = group_pi * len(group) / total
+        return pi
+
+    def compute_lyapunov_weights(self, Kd: Array) -> _LyapunovWeights:
+        """Computes the weight of each site in the energy function of the stability proof.
+
+        A site is the process that runs one arm. The weight of site i is beta_i = pi_i / c_i,
+        where pi is the left eigenvector of `alpha` for the eigenvalue 1, and c_i is the factor
+        between the damping gain of site i and that of the first site. The weights are scaled so
+        that their sum is N. If the gains are not multiples of each other, c_i = 1 is used, and
+        the energy may rise.
+
+        Args:
+            Kd: Damping gains of the N sites along n axes, shape (N, n).
+        """
+        pi = self.compute_perron_vector()
+        scales = find_kd_scales(Kd)
+        beta = pi if scales is None else pi / scales
+        sites = len(beta)
+        factor = sites / beta.sum()
+        return _LyapunovWeights(
+            beta=beta * factor,
+            groups=self.find_closed_groups(),
+            scales=scales,
+        )

@@ -21,10 +21,9 @@ from ..execution import FusedRun, simulate_columns, simulate_scenario
 from ..log import MIN_COVERAGE, Log
 from ..scenario import Scenario, describe_law_conditions, list_law_situations
 from .blas_threads import limit_blas_threads
-from .certificate.certificate_result import Certificate
 from .certificate.observed_energy import find_energy_laws
 from .certificate.premise_quantities import MissingFunctional
-from .certificate.stability_certificate import certify_log
+from .certificate.stability_certificate import Certificate
 from .decision_facts import LoopRoots, RunFindings, StabilityDecision
 from .delay_period import find_final_link
 from .run_end import RunEnd, RunTrace, Stability
@@ -70,9 +69,9 @@ def certify_run(
 ) -> Certificate:
     """Certifies whether a recorded run was stable, with all available checks.
 
-    In addition to the checks of `certify_log`, the run is repeated with small pushes, which
-    shows whether disturbances grow. The characteristic roots of the coupled arms are computed
-    at the end pose.
+    In addition to the checks of `Certificate.of_log`, the run is repeated with small pushes,
+    which shows whether disturbances grow. The characteristic roots of the coupled arms are
+    computed at the end pose.
 
     Args:
         log: The log of the run.
@@ -85,7 +84,7 @@ def certify_run(
     Raises:
         LogError: A record cannot be read, or contains a change that is not valid.
     """
-    certificate = certify_log(log, min_coverage=min_coverage, own_laws=own_laws)
+    certificate = Certificate.of_log(log, min_coverage=min_coverage, own_laws=own_laws)
 
     growth = None
     if twins != 0:
@@ -178,7 +177,7 @@ def judge_virtual_run(
             log: Log = simulate_scenario(executed_scenario)
         else:
             log = simulate_columns(executed_scenario)
-        certificate_of_log = certify_log(log, own_laws=True)
+        certificate_of_log = Certificate.of_log(log, own_laws=True)
         certificate = replace(
             certificate_of_log,
             roots=findings.roots,

@@ -266,6 +266,29 @@ class RunEnd(NamedTuple):
         site_logs = [log[site] for site in log.sites]
         return end._replace(frequency_hz=_find_frequency_hz(site_logs))
 
+    @staticmethod
+    def find_hanging_sites(scenario: Scenario, ends: Mapping[str, Array]) -> list[str]:
+        """Finds the sites whose arms fell: they hang down at the end, but did not at the start.
+
+        An arm whose controller does not hold it comes to rest as well, but must not count as
+        stable.
+
+        Args:
+            scenario: The description of the experiment, with the start poses.
+            ends: Last joint angles of the sites to be judged, by name, shape (n,) each, in rad.
+
+        Returns:
+            Names of these sites. Empty if no arm fell.
+        """
+        hanging = []
+        for site, q in ends.items():
+            arm = build_arm_rows(scenario, site)
+            start = np.array(scenario.sites[site].q0_rad)
+            hangs = arm.hanging_angle(q) < HANGING_RAD
+            if hangs and arm.hanging_angle(start) >= HANGING_RAD:
+                hanging.append(site)
+        return hanging
+
 
 class RunTrace(NamedTuple):
     """The reduced data from which the end of a run is judged, per site in scenario order.
@@ -954,7 +977,7 @@ def _find_odd_pose(scenario: Scenario, sites: Sequence[Array]) -> Iterable[EndDo
     starts = [np.array(spec.q0_rad) for spec in scenario.sites.values()]
     ends = [site[-1, 2, : len(start)] for site, start in zip(sites, starts, strict=True)]
     end_by_site = dict(zip(scenario.names, ends, strict=True))
-    hanging = find_hanging_sites(scenario, end_by_site)
+    hanging = RunEnd.find_hanging_sites(scenario, end_by_site)
     if hanging:
         yield EndDoubt("arms fell", tuple(hanging))
         return
@@ -971,29 +994,6 @@ def _find_odd_pose(scenario: Scenario, sites: Sequence[Array]) -> Iterable[EndDo
     if distances[worst] > THROWN_RAD and not (scenario.external or has_operator):
         thrown = scenario.names[worst]
         yield EndDoubt("arm thrown", (thrown,), distance_rad=distances[worst])
-
-
-def find_hanging_sites(scenario: Scenario, ends: Mapping[str, Array]) -> list[str]:
-    """Finds the sites whose arms fell: they hang down at the end, but did not at the start.
-
-    An arm whose controller does not hold it comes to rest as well, but must not count as
-    stable.
-
-    Args:
-        scenario: The description of the experiment, with the start poses.
-        ends: Last joint angles of the sites to be judged, by name, shape (n,) each, in rad.
-
-    Returns:
-        Names of these sites. Empty if no arm fell.
-    """
-    hanging = []
-    for site, q in ends.items():
-        arm = build_arm_rows(scenario, site)
-        start = np.array(scenario.sites[site].q0_rad)
-        hangs = arm.hanging_angle(q) < HANGING_RAD
-        if hangs and arm.hanging_angle(start) >= HANGING_RAD:
-            hanging.append(site)
-    return hanging
 
 
 def _find_last_operator_action(scenario: Scenario, span_s: float) -> float:

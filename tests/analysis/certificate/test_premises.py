@@ -18,8 +18,8 @@ from tests.analysis.builders import EXPERT, make_run
 from tests.scenario.builders import make_overrides, rough_arm_text
 from trilat_net.analysis import decision_facts, run_end, run_remarks, stability_decision
 from trilat_net.analysis.certificate import (
-    certificate_result,
     energy_balance,
+    functional_judgements,
     observed_energy,
     premise_quantities,
     stability_certificate,
@@ -166,9 +166,9 @@ def list_clauses(module: ModuleType) -> set[str]:
 @pytest.mark.parametrize(
     "module",
     [
-        certificate_result,
         decision_facts,
         envelope_trend,
+        functional_judgements,
         observed_energy,
         premise_quantities,
         premises_module,

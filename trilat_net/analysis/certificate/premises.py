@@ -30,9 +30,8 @@ from ...log import Coverage, Log, judge_integrity
 from ...net import HALTED_MODES
 from ..aligned import Bools
 from ..dominance_history import (
+    DominanceMatrix,
     PeerLoss,
-    compute_lyapunov_weights,
-    find_closed_groups,
     find_kd_scales,
 )
 from ..following import TaskFollowing
@@ -177,7 +176,8 @@ def gather_facts(log: Log) -> _RunFacts:
         return _RunFacts(log, constants, unknown=RecordGap.NO_PERIOD)
 
     # the first dominance matrix with several closed groups, for which beta is not unique
-    closed_groups = map(find_closed_groups, find_dominance_matrices(energies))
+    matrices = map(DominanceMatrix, find_dominance_matrices(energies))
+    closed_groups = (matrix.find_closed_groups() for matrix in matrices)
     ambiguous_groups = next((groups for groups in closed_groups if len(groups) > 1), ())
     group_names = tuple(
         tuple(log.sites[index] for index in group) for group in ambiguous_groups
@@ -307,7 +307,7 @@ def _check_dominance(run: FunctionalFacts) -> Premise:
         return Premise("shares", False, quantities)
 
     Kd = np.array([energy.motion.constants.weighing_Kd for energy in energies.values()])
-    weights = compute_lyapunov_weights(run.log.scenario.alpha, Kd)
+    weights = DominanceMatrix(run.log.scenario.alpha).compute_lyapunov_weights(Kd)
     groups = tuple(tuple(names[n] for n in group) for group in weights.groups)
     if len(groups) > 1:
         return Premise("shares", False, DominanceQuantities(groups=groups))

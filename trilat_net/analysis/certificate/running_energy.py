@@ -28,7 +28,7 @@ from ..aligned import (
     AlignedRecords,
     PeerTrajectory,
 )
-from ..dominance_history import DominanceHistory, DominancePlan, find_closed_groups
+from ..dominance_history import DominanceHistory, DominanceMatrix, DominancePlan
 from .energy_balance import (
     EnergyBalance,
     SiteEnergy,
@@ -354,7 +354,7 @@ class RunningEnergy:
 
         energies = self._derive_energies(tick_spans)
         for alpha in find_dominance_matrices(energies):
-            groups = find_closed_groups(alpha)
+            groups = DominanceMatrix(alpha).find_closed_groups()
             if len(groups) > 1:
                 sites = list(energies)
                 self.closed_groups = [[sites[n] for n in group] for group in groups[:2]]

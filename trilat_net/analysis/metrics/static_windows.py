@@ -31,7 +31,7 @@ from ...log import Ints
 from ...scenario import Scenario
 from ..aligned import Bools
 from ..arm_rows import build_arm_rows
-from ..dominance_history import find_closed_groups, left_perron_vector
+from ..dominance_history import DominanceMatrix
 from ..row_reductions import any_in_rows, max_rows
 from ..run_end import STATIC_SPEED_RAD_S
 from ..run_view import RunView, SiteRun
@@ -563,7 +563,8 @@ def _compute_torque_weights(scenario: Scenario, alpha: Array) -> Array | str:
     Returns:
         The weights, shape (N, n), or the reason why they are unknown.
     """
-    if len(find_closed_groups(alpha)) > 1:
+    dominance = DominanceMatrix(alpha)
+    if len(dominance.find_closed_groups()) > 1:
         return "two groups of sites do not follow each other: it is not unique who feels whom"
     stiffness = []
     for site in scenario.names:
@@ -571,7 +572,7 @@ def _compute_torque_weights(scenario: Scenario, alpha: Array) -> Array | str:
         if why:
             return f"{site}: {why}"
         stiffness.append(K)
-    pi = left_perron_vector(alpha)
+    pi = dominance.compute_perron_vector()
     return pi[:, np.newaxis] / np.array(stiffness)
 
 

@@ -37,7 +37,7 @@ from ...results import finite_or_none
 from ...scenario import TASK_AXES, Scenario
 from ..arm_rows import build_arm_rows
 from ..blas_threads import limit_blas_threads
-from ..dominance_history import compute_lyapunov_weights
+from ..dominance_history import DominanceMatrix
 from . import frequency_search, port_response
 from .characteristic_roots import Complex, Spectrum
 from .linear_loop import LinearLoop, gather_site_arguments
@@ -160,7 +160,7 @@ def compute_proof_weights(conditions: OperatingConditions) -> Array:
         followed = [axis - 1 for axis in _list_followed_axes(site)]
         all_gains = np.broadcast_to(site.gains.Kd, site_Kd.shape)
         site_Kd[followed] = all_gains[followed]
-    return compute_lyapunov_weights(conditions.alpha, Kd).beta
+    return DominanceMatrix(conditions.alpha).compute_lyapunov_weights(Kd).beta
 
 
 class TwoPort(NamedTuple):

@@ -5,7 +5,7 @@ from trilat_people.live_page.session_view import SessionView, SiteView
 from recorder.site_reception import AWAY_NS
 from tests.net.local_bus import LocalNetwork
 from tests.net.manual_clock import ManualClock
-from trilat_net.analysis.certificate.running_energy import RecordWindow
+from trilat_net.analysis.certificate.running_energy import RunningEnergy
 from trilat_net.core.step.ticks import NS_PER_S
 from trilat_net.net import topics
 from trilat_net.net.bus import Bus
@@ -26,9 +26,9 @@ class WatchedSession:
         scenario = load_scenario("two_sites")
         self.view = SessionView(self._network.join(), self.clock, "t")
         self.view.scenario = scenario
+        energy = RunningEnergy(scenario)
         for name in scenario.names:
-            window = RecordWindow(scenario, name)
-            self.view.sites[name] = SiteView(self.view.bus, "t", scenario, name, BOOT, window)
+            self.view.sites[name] = SiteView(self.view.bus, "t", scenario, name, BOOT, energy)
             self.publish_event(name, "setup", n=0)
 
     def publish_event(self, name: str, kind: str, *, n: int) -> None:

@@ -24,7 +24,6 @@ from msgspec.structs import replace
 
 from trilat_net.analysis import (
     AlignedRecords,
-    EndEffectorRows,
     TorqueSplit,
     build_arm_rows,
     sample_ages_ns,
@@ -280,18 +279,9 @@ class ExperimentTrial:
         Returns:
             The magnitudes, shape (K,).
         """
-        forces = self._place_end_effector(q).find_force(tau_x)
+        forces = self._rows.place_end_effector(q, 0.0 * q).find_force(tau_x)
         magnitude_n: Array = np.linalg.norm(forces, axis=1)
         return magnitude_n
-
-    def _place_end_effector(self, q: Array) -> EndEffectorRows:
-        """Computes the positions and Jacobians of the slave's end effector from K records.
-
-        Args:
-            q: Joint positions, shape (K, n), in rad or m. The joints count as being at rest.
-        """
-        speed = 0.0 * q
-        return self._rows.place_end_effector(q, speed)
 
     def make_goal(self) -> TrialGoal:
         """Creates the goal of the trial, which computes the target and decides on the end.
@@ -418,7 +408,8 @@ class ExperimentTrial:
         is_between = has_started & (records.t_s <= end_s)
         indices = np.flatnonzero(is_between)[::RECORD_STEP]
 
-        end_effector = self._place_end_effector(records.q[indices])
+        q = records.q[indices]
+        end_effector = self._rows.place_end_effector(q, 0.0 * q)
         positions_m = end_effector.position
         rate_hz = records.rate_hz / RECORD_STEP
         velocities_m_s = np.gradient(positions_m, 1.0 / rate_hz, axis=0)

@@ -26,7 +26,7 @@ from typing import Generic, TypeVar
 import msgspec
 
 from recorder import AWAY_NS, GapRepair, InboundQueue, SiteReception
-from trilat_net.analysis import KEPT_S, RecordWindow, RunningEnergy
+from trilat_net.analysis import KEPT_S, RunningEnergy
 from trilat_net.core import TAKEN, LifeAlarm
 from trilat_net.errors import ScenarioError, WireError
 from trilat_net.net import (
@@ -149,7 +149,7 @@ class SiteView:
         scenario: Scenario,
         name: str,
         boot: int,
-        window: RecordWindow,
+        energy: RunningEnergy,
     ) -> None:
         settings = scenario.sites[name]
         loss_rule = settings.on_stale
@@ -160,7 +160,7 @@ class SiteView:
             self.layout = scenario.layout(name)
         self.hand = settings.find_live_hand(is_open=True)
         self.reception = SiteReception(scenario, name, boot)
-        self.window = window
+        self.window = energy.windows[name]
         self.holder = ""
         self.stopped_by = ""
         self.bodies: dict[int, list[float]] = {}
@@ -493,7 +493,7 @@ class SessionView:
                 scenario=scenario,
                 name=name,
                 boot=self.members[name].boot,
-                window=self.energy.windows[name],
+                energy=self.energy,
             )
 
     def _receive(self, key: str, block: bytes, mono_ns: int) -> None:

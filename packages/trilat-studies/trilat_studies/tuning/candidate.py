@@ -43,15 +43,13 @@ import numpy as np
 
 from trilat_net.analysis import (
     SETTLED_ERROR_RAD,
-    DominancePlan,
+    DominanceHistory,
+    DominanceMatrix,
     EndBehaviour,
     RunEnd,
     SourceRows,
     Stability,
     build_arm_rows,
-    find_closed_groups,
-    find_hanging_sites,
-    left_perron_vector,
 )
 from trilat_net.core import Array
 from trilat_net.errors import CodeFailed, ScenarioError
@@ -100,7 +98,7 @@ def check_comparable(scenario: Scenario) -> None:
         )
 
     # Sites that follow only each other never move towards the other sites.
-    groups = find_closed_groups(scenario.alpha)
+    groups = DominanceMatrix(scenario.alpha).find_closed_groups()
     if len(groups) > 1:
         group_names = [", ".join(scenario.names[site] for site in group) for group in groups]
         raise ScenarioError(
@@ -170,7 +168,7 @@ def compute_consensus_pose(scenario: Scenario, t_s: Array) -> Array:
     Returns:
         The pose at the K times, shape (K, n), in rad, for n joints.
     """
-    beta = left_perron_vector(scenario.alpha)
+    beta = DominanceMatrix(scenario.alpha).compute_perron_vector()
     weights = dict(zip(scenario.names, beta, strict=True))
     weighted_starts = []
     for name, spec in scenario.sites.items():
@@ -370,7 +368,7 @@ def check_final_posture(log: Log) -> list[str]:
     for site, site_log in site_logs.items():
         in_last_second = site_log.t_s > site_log.t_s[-1] - END_WINDOW_S
         end_poses_rad[site] = site_log.q[in_last_second].mean(axis=0)
-    hanging = find_hanging_sites(log.scenario, end_poses_rad)
+    hanging = RunEnd.find_hanging_sites(log.scenario, end_poses_rad)
     if hanging:
         verb = "hangs" if len(hanging) == 1 else "hang"
         warnings.append(
@@ -648,7 +646,7 @@ def _compute_promised_motion(
     alpha = np.zeros((len(t_s), len(laws), len(laws)))
     for site, name in enumerate(scenario.names):
         peers = [scenario.names.index(peer) for peer in scenario.peers(name)]
-        alpha[:, site, peers] = DominancePlan.of_scenario(scenario, name).evaluate(t_s).alpha
+        alpha[:, site, peers] = DominanceHistory.of_scenario(scenario, name, t_s).alpha
     run = TuningRun(laws=laws, t_s=t_s, q=q, outside_nm=-tau_x, alpha=alpha)
     return laws[0].target_motion(run)
 
