@@ -314,7 +314,7 @@ class Recorder:
             if ending_since_ns is None and self._is_ending():
                 ending_since_ns = now_ns
                 self._say(
-                    "recorder: asks for the records that are missing, until none comes for "
+                    "recorder: requesting the missing records until no more arrive for "
                     f"{_END_S} s; Ctrl-C a second time ends it at once"
                 )
             if ending_since_ns is not None:

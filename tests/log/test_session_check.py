@@ -232,12 +232,13 @@ SAID: dict[str, tuple[Callable[[], bytes], set[str], str]] = {
 
 @pytest.mark.parametrize("kind", SAID)
 def test_session_errors_fail_their_check(kind: str, tmp_path: Path) -> None:
-    data, checks, text = SAID[kind]
-    result = check_bytes(tmp_path, data())
+    make_content, checks, text = SAID[kind]
+    content = make_content()
+    result = check_bytes(tmp_path, content)
     assert list_failed_checks(result) == checks, result.findings
     chunks = {
         frame.offset
-        for frame in RecordScanner(io.BytesIO(data())).frames()
+        for frame in RecordScanner(io.BytesIO(content)).frames()
         if frame.opcode == Opcode.CHUNK
     }
     locations = [location for finding in result.findings for location in finding.places]

@@ -512,7 +512,7 @@ def test_added_members_meet_the_others(tmp_path: Path) -> None:
     assert done.code == 0, done
     for path in (
         "keys/s: keys for s",
-        "m1/members.json: list of members for m1",
+        "keys/m1/members.json: list of members for m1",
         "keys/m2/members.json",
     ):
         assert path in done.out

@@ -91,6 +91,12 @@ def parametrize_cases(file: str, kind: type[Case]) -> pytest.MarkDecorator:
     return pytest.mark.parametrize("case", cases, ids=[case.name for case in cases])
 
 
+def names_file(message: str, path: Path) -> bool:
+    """Returns True if a message begins with a path, as "PATH: ..." or as subject of a sentence."""
+    rest = message.removeprefix(str(path))
+    return rest != message and rest.startswith((": ", " is not ", " cannot be read: "))
+
+
 def _list_inputs(case: Case) -> dict[str, Any]:
     """Returns the fields of a case that describe its input."""
     return {

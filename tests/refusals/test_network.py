@@ -6,7 +6,7 @@ from typing import Any
 import msgspec
 import pytest
 
-from tests.refusals.corpus import Case, parametrize_cases
+from tests.refusals.corpus import Case, names_file, parametrize_cases
 from trilat_net.errors import UsageError
 from trilat_net.net.connection import Connection
 from trilat_net.net.zenoh_bus import read_zenoh_file
@@ -53,6 +53,6 @@ def test_wrong_zenoh_files_are_refused(case: ZenohCase, tmp_path: Path) -> None:
     with pytest.raises(UsageError) as caught:
         read_zenoh_file(file)
     message = str(caught.value)
-    assert message.startswith((f"{file}: ", f"{file} "))
+    assert names_file(message, file)
     assert "/root/" not in message
     case.check_message(message, caught.value.exit_code)

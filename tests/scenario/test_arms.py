@@ -421,6 +421,6 @@ def test_changed_parameters_of_simulated_arms_act(assign: bool) -> None:
     if assign:
         arm.theta = 2.0 * arm.theta
     else:
-        arm.theta *= 2.0
+        arm.theta[:] *= 2.0
     heavy_effect = arm.accelerate([1.0, -0.5]) - arm.accelerate([0.0, 0.0])
     np.testing.assert_allclose(heavy_effect, 0.5 * effect, rtol=1e-12)

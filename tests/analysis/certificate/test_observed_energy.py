@@ -115,11 +115,9 @@ def test_books_detect_a_law_sending_too_much() -> None:
     assert energies.residual_j > 1e-4
 
 
-def test_code_from_outside_runs_only_on_request() -> None:
-    log = simulate_clamped_pair()
-    assert ObservedEnergy.of_log(log) is None
+def test_a_silent_law_leaves_the_books_open() -> None:
     silent = {"sites.s.control.law": "tests.line_law:Silent", "duration_s": 0.1}
-    mixed = simulate_scenario(load_scenario(log.scenario, silent))
+    mixed = simulate_scenario(load_scenario(simulate_clamped_pair().scenario, silent))
     assert ObservedEnergy.of_log(mixed, own_laws=True).text.endswith(
         "the law of s declares no energies"
     )

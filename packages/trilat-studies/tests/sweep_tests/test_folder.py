@@ -110,7 +110,7 @@ def test_a_folder_with_other_contents_is_left_alone(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("content", "phrase"),
     [
-        (None, "contains no sweep"),
+        (None, "contains no sweep: plan.json is missing"),
         ("{", "is not JSON"),
         ("[]", "is not the plan"),
         ("{}", "is not the plan"),
