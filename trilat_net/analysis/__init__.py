@@ -37,18 +37,16 @@ __all__ = [
     "verdict_facts",
     # Twins
     "MOST_LOG",
+    "EnvelopeFit",
     "EnvelopeTrend",
     "PushGrowth",
     "PushedTwins",
     "TwinGrowth",
-    "fit_envelopes",
-    "measure_amplitude",
     "twin",
     # Metrics
     "LogMetrics",
     "Metric",
     "Quantity",
-    "measure_undelayed_error",
     # The linearised loop
     "MAX_COMMON_DELAY_S",
     "QUOTED_AT_HZ",
@@ -58,7 +56,6 @@ __all__ = [
     "RestingLoop",
     "Passivity",
     "PortAnalysis",
-    "TwoPort",
     "analyse_linear_loop",
     "find_root_crossings",
     "find_run_roots",
@@ -67,7 +64,6 @@ __all__ = [
     "AlignedRecords",
     "Bools",
     "JointError",
-    "RunView",
     "TorqueSplit",
     "build_arm_rows",
     "SourceRows",
@@ -91,9 +87,7 @@ __all__ = [
 if TYPE_CHECKING:
     from . import decision_facts, link_summary, run_remarks, site_signals
     from .aligned import AlignedRecords, Bools
-    from .arm_rows import (
-        build_arm_rows,
-    )
+    from .arm_rows import build_arm_rows
     from .certificate import premise_quantities, verdict_facts
     from .certificate.energy_balance import ZERO_ENERGY_J, EnergyBalance
     from .certificate.observed_energy import ObservedEnergy, ObservedFinding
@@ -105,7 +99,6 @@ if TYPE_CHECKING:
     from .link_summary import DelayDistribution, sample_ages_ns
     from .metrics.log_metrics import LogMetrics
     from .metrics.measures import Metric, Quantity
-    from .metrics.motion_metrics import measure_undelayed_error
     from .run_end import (
         FORCE_NM,
         NO_BUCKETS,
@@ -115,7 +108,6 @@ if TYPE_CHECKING:
         RunTrace,
         Stability,
     )
-    from .run_view import RunView
     from .shared_slave import SharedSlave
     from .site_signals import (
         SETTLED_ERROR_RAD,
@@ -128,19 +120,18 @@ if TYPE_CHECKING:
     from .theory.linear_analysis import LinearAnalysis, analyse_linear_loop
     from .theory.linear_edge import GrowthColumn, find_root_crossings
     from .theory.loop_roots import find_run_roots
-    from .theory.port_analysis import PortAnalysis, TwoPort
+    from .theory.port_analysis import PortAnalysis
     from .theory.port_passivity import Passivity
     from .theory.port_response import QUOTED_AT_HZ
     from .theory.resting_loop import RestingLoop
     from .timeline import Timeline
     from .torque_sources import SourceRows, TorqueSplit, VirtualWall
-    from .twins.envelope_trend import EnvelopeTrend, fit_envelopes
+    from .twins.envelope_trend import EnvelopeFit, EnvelopeTrend
     from .twins.twin_growth import (
         MOST_LOG,
         PushedTwins,
         PushGrowth,
         TwinGrowth,
-        measure_amplitude,
         twin,
     )
 else:
@@ -162,12 +153,8 @@ else:
             "link_summary": "DelayDistribution link_summary sample_ages_ns",
             "metrics.log_metrics": "LogMetrics",
             "metrics.measures": "Metric Quantity",
-            "metrics.motion_metrics": "measure_undelayed_error",
-            "run_end": (
-                "EndBehaviour FORCE_NM NO_BUCKETS RunEnd RunTrace Stability THROWN_RAD"
-            ),
+            "run_end": "EndBehaviour FORCE_NM NO_BUCKETS RunEnd RunTrace Stability THROWN_RAD",
             "run_remarks": "run_remarks",
-            "run_view": "RunView",
             "shared_slave": "SharedSlave",
             "site_signals": (
                 "JointError SETTLED_ERROR_RAD largest_magnitude settling_time_of_all_s "
@@ -178,15 +165,13 @@ else:
             "theory.linear_analysis": "LinearAnalysis analyse_linear_loop",
             "theory.linear_edge": "GrowthColumn find_root_crossings",
             "theory.loop_roots": "find_run_roots",
-            "theory.port_analysis": "PortAnalysis TwoPort",
+            "theory.port_analysis": "PortAnalysis",
             "theory.port_passivity": "Passivity",
             "theory.port_response": "QUOTED_AT_HZ",
             "theory.resting_loop": "RestingLoop",
             "timeline": "Timeline",
             "torque_sources": "SourceRows TorqueSplit VirtualWall",
-            "twins.envelope_trend": "EnvelopeTrend fit_envelopes",
-            "twins.twin_growth": (
-                "MOST_LOG PushGrowth PushedTwins TwinGrowth measure_amplitude twin"
-            ),
+            "twins.envelope_trend": "EnvelopeFit EnvelopeTrend",
+            "twins.twin_growth": ("MOST_LOG PushGrowth PushedTwins TwinGrowth twin"),
         },
     )

@@ -26,7 +26,7 @@ from .certificate.premise_quantities import MissingFunctional
 from .certificate.stability_certificate import Certificate
 from .decision_facts import LoopRoots, RunFindings, StabilityDecision
 from .delay_period import find_final_link
-from .run_end import RunEnd, RunTrace, Stability
+from .run_end import RunEnd, Stability
 from .run_remarks import RunCircumstances
 from .stability_decision import decide_stability, is_decided_by_roots
 from .theory.loop_roots import find_log_roots, find_run_roots, resolve_final_scenario
@@ -153,8 +153,7 @@ def judge_virtual_run(
     if run.diverged_s is None:
         executed_scenario = msgspec.structs.replace(scenario, duration_s=run.ran_s)
     if end is None:
-        trace = RunTrace(run.buckets, run.tau_x, run.diverged_s)
-        end = trace.classify_end(executed_scenario)
+        end = RunEnd.of_run(run, executed_scenario)
     findings = RunFindings(
         end=end,
         roots=find_run_roots(executed_scenario, run),

@@ -32,9 +32,8 @@ from trilat_net.analysis.certificate.premise_quantities import (
     PremiseQuantities,
 )
 from trilat_net.analysis.certificate.premises import (
-    check_premises,
+    RunFacts,
     find_absent_spans,
-    gather_facts,
 )
 from trilat_net.analysis.torque_sources import WallEnergy
 from trilat_net.analysis.twins import envelope_trend
@@ -256,7 +255,7 @@ def simulate_windup(**changes: object) -> Log:
 
 def find_wall_premise(log: Log) -> Premise | None:
     """Returns the premise about sampled walls, or None if a log has no such wall."""
-    premises = check_premises(gather_facts(log))
+    premises = RunFacts.of_log(log).check_premises()
     return next((premise for premise in premises if premise.name == "walls"), None)
 
 
@@ -426,10 +425,10 @@ def test_a_stretch_has_only_its_own_delays() -> None:
     change = {"at_s": 1.0, "link": "m1->s", "to": {"delay_ms": 60.0}}
     log = make_run("free", {**SHORT, "timeline": [change]}).log
     absent = AbsentSpan("m2", 0.5, 0.6)
-    facts = gather_facts(log)
+    facts = RunFacts.of_log(log)
     assert facts.functional is not None
     with_absence = facts.functional._replace(absent=[absent])
-    checked = check_premises(facts._replace(functional=with_absence))
+    checked = facts._replace(functional=with_absence).check_premises()
     presence = next(premise for premise in checked if premise.name == "presence")
     assert presence.holds is False
     earlier, later = presence.quantities.stretches  # type: ignore[union-attr]
@@ -440,5 +439,5 @@ def test_a_stretch_has_only_its_own_delays() -> None:
 def test_stops_out_of_reach_satisfy_their_premise() -> None:
     """The elbow is far from its stop during the first tenth of a second."""
     log = trilat_net.simulate(parse_scenario(rough_arm_text(), overrides={"duration_s": 0.1}))
-    checked = {premise.name: premise for premise in check_premises(gather_facts(log))}
+    checked = {premise.name: premise for premise in RunFacts.of_log(log).check_premises()}
     assert checked["stops"].holds is True

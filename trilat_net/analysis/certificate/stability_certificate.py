@@ -39,7 +39,7 @@ from .energy_balance import EnergyBalance, SiteEnergy
 from .functional_judgements import JUDGEMENTS
 from .observed_energy import ObservedEnergy, ObservedFinding
 from .premise_quantities import Premise
-from .premises import check_premises, collect_evidence, gather_facts
+from .premises import RunFacts
 from .verdict_facts import (
     Evidence,
     FunctionalRise,
@@ -124,9 +124,9 @@ class Certificate(Result):
         Raises:
             LogError: A record cannot be read, or contains a change that is not valid.
         """
-        run = gather_facts(log)
+        run = RunFacts.of_log(log)
         facts = run.functional
-        premises = check_premises(run)
+        premises = run.check_premises()
 
         if facts is not None:
             verdicts = (judge(facts, premises) for judge in JUDGEMENTS)
@@ -141,7 +141,7 @@ class Certificate(Result):
             premises=premises,
             verdict=verdict,
             end=RunEnd.of_log(log),
-            evidence=collect_evidence(run, min_coverage),
+            evidence=run.collect_evidence(min_coverage),
             observed=ObservedEnergy.of_log(log, own_laws=own_laws),
         )
         if facts is None:

@@ -39,13 +39,13 @@ from .characteristic_roots import CharacteristicRoot, Spectrum
 from .delay_margin import DelayMargin
 from .equilibrium import add_limit_notes, find_equilibrium
 from .floquet import SamplesInUse, compute_sampled_spectrum
-from .hand_files import read_hands
 from .linear_edge import EdgeScan, iterate_linear_edges, parse_edge_range
 from .linear_loop import LinearLoop, compute_shared_poses
 from .loop_roots import find_log_loop, find_run_loop, resolve_final_scenario
 from .numeric_law import NumericLaw
 from .operating_point import Equilibrium, OperatingConditions
 from .port_analysis import PortAnalysis
+from .port_passivity import HandMatrices
 
 DEFAULT_ROOTS = 6
 """Number of roots that are computed unless another number is requested."""
@@ -357,7 +357,7 @@ def analyse_linear_loop(
         ScenarioError: The scenario is not valid, or cannot be linearised.
         UsageError: Another argument is not valid.
     """
-    hands = read_hands(operators)
+    hands = [HandMatrices.read(Path(file)) for file in operators]
     ranges = [parse_edge_range(text) for text in over]
     if not 1 <= roots <= MAX_ROOTS:
         raise UsageError(f"--roots must be from 1 to {MAX_ROOTS}, not {roots}")

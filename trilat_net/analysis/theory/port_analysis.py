@@ -251,6 +251,23 @@ class PortAnalysis(NamedTuple):
         """
         return "xd" if self.axes else "qd"
 
+    def group_failing_two_ports(self, *, by_joint: bool) -> list[list[TwoPort]]:
+        """Groups the two-ports for which Llewellyn's criterion fails.
+
+        The two-ports of a group have the same sites, and the same third site clamped, or no
+        clamped site.
+
+        Args:
+            by_joint: True to separate the joints too.
+        """
+        groups: dict[tuple[object, ...], list[TwoPort]] = {}
+        for two_port in self.two_ports:
+            if two_port.minima.below:
+                joint = two_port.joint if by_joint else ""
+                key = (two_port.sites, two_port.clamped, joint)
+                groups.setdefault(key, []).append(two_port)
+        return list(groups.values())
+
     def name_port(self, number: int) -> str:
         """Returns a name for the user of the joint or axis at which an operator pushes an arm.
 
@@ -323,7 +340,7 @@ class PortAnalysis(NamedTuple):
         other_site = of or scenario.slave
 
         sites = port_response.list_port_sites(loop)
-        delay_s = port_response.find_longest_delay_s(loop)
+        delay_s = loop.longest_delay_s
         grid = frequency_search.build_frequency_grid(low, high, delay_s)
         Y = port_response.build_admittance(loop)
         w_rad_s = frequency_search.refine_frequencies(Y, grid)

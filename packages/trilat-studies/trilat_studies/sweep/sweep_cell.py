@@ -26,7 +26,6 @@ from trilat_net.analysis import (
     EndBehaviour,
     GrowthColumn,
     RunEnd,
-    RunTrace,
     Stability,
     TwinGrowth,
     find_run_roots,
@@ -304,8 +303,7 @@ class _CellInProgress:
         A lasting motion under a user's law may be a decay that is too slow to show. The roots
         of the loop, which take longer than the measurement, are computed in this case only.
         """
-        run_trace = RunTrace(self.run.buckets, self.run.tau_x, self.run.diverged_s)
-        run_end = run_trace.classify_end(self._scenario)
+        run_end = RunEnd.of_run(self.run, self._scenario)
         self._outcome = _build_result(self.run, run_end, self._totals, self._extended)
         self._is_finished = self._outcome.is_conclusive
         has_own_law = any(isinstance(law, ImportedLaw) for law in self._scenario.controls)
@@ -426,7 +424,7 @@ def measure_exponent(scenario: Scenario) -> float | None:
     """
     run = FusedRun(scenario, SETTLED_ERROR_RAD)
     run.advance_to(scenario.duration_s)
-    end = RunTrace(run.buckets, run.tau_x, run.diverged_s).classify_end(scenario)
+    end = RunEnd.of_run(run, scenario)
     twins = TwinGrowth.of_scenario(scenario, end, run.ran_s, TWINS_OF_A_CELL)
     rates_per_s = [push.rate_per_s for push in twins.pushes]
     return max(filter(math.isfinite, rates_per_s), default=None)
