@@ -57,7 +57,6 @@ __all__ = [
     "Passivity",
     "PortAnalysis",
     "analyse_linear_loop",
-    "find_root_crossings",
     "find_run_roots",
     # Signals of a run
     "SETTLED_ERROR_RAD",
@@ -79,7 +78,6 @@ __all__ = [
     "DominanceMatrix",
     "SharedSlave",
     "Timeline",
-    "sample_ages_ns",
     "summarise_run",
     "DominanceHistory",
 ]
@@ -96,7 +94,7 @@ if TYPE_CHECKING:
     from .dominance_history import DominanceHistory, DominanceMatrix
     from .file_overview import FileOverview, info, summarise_run
     from .judge import certify_run, judge_virtual_run
-    from .link_summary import DelayDistribution, sample_ages_ns
+    from .link_summary import DelayDistribution
     from .metrics.log_metrics import LogMetrics
     from .metrics.measures import Metric, Quantity
     from .run_end import (
@@ -118,7 +116,7 @@ if TYPE_CHECKING:
     from .theory.characteristic_roots import Complex
     from .theory.delay_margin import MAX_COMMON_DELAY_S
     from .theory.linear_analysis import LinearAnalysis, analyse_linear_loop
-    from .theory.linear_edge import GrowthColumn, find_root_crossings
+    from .theory.linear_edge import GrowthColumn
     from .theory.loop_roots import find_run_roots
     from .theory.port_analysis import PortAnalysis
     from .theory.port_passivity import Passivity
@@ -150,7 +148,7 @@ else:
             "dominance_history": "DominanceHistory DominanceMatrix",
             "file_overview": "FileOverview info summarise_run",
             "judge": "certify_run judge_virtual_run",
-            "link_summary": "DelayDistribution link_summary sample_ages_ns",
+            "link_summary": "DelayDistribution link_summary",
             "metrics.log_metrics": "LogMetrics",
             "metrics.measures": "Metric Quantity",
             "run_end": "EndBehaviour FORCE_NM NO_BUCKETS RunEnd RunTrace Stability THROWN_RAD",
@@ -163,7 +161,7 @@ else:
             "theory.characteristic_roots": "Complex",
             "theory.delay_margin": "MAX_COMMON_DELAY_S",
             "theory.linear_analysis": "LinearAnalysis analyse_linear_loop",
-            "theory.linear_edge": "GrowthColumn find_root_crossings",
+            "theory.linear_edge": "GrowthColumn",
             "theory.loop_roots": "find_run_roots",
             "theory.port_analysis": "PortAnalysis",
             "theory.port_passivity": "Passivity",

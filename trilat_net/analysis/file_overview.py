@@ -42,9 +42,9 @@ from ..scenario import END_WINDOW_S, list_arm_notes
 from .link_summary import (
     ONE_WAY_SCHEMA_VERSION,
     ClockSummary,
+    DelayDistribution,
     LinkSummary,
     ValueStatistics,
-    sample_ages_ns,
 )
 from .site_signals import (
     SETTLED_ERROR_RAD,
@@ -499,7 +499,9 @@ def _describe_link_health(log: Log, peer: str, site: str) -> JsonObject:
         counts = {name: getattr(last_stats, name).get(peer) for name in counts}
     return {
         "stated": log.scenario.links[f"{peer}->{site}"].describe(),
-        "age_ms": _compute_percentiles(sample_ages_ns(log, peer, site), unit=1e6),
+        "age_ms": _compute_percentiles(
+            DelayDistribution.measure_ages_ns(log, peer, site), unit=1e6
+        ),
         "one_way_ms": _compute_percentiles(one_way_us, unit=1e3),
         "clock_offset_us": None if clock_summary is None else clock_summary.offset_us,
         "clock_bound_us": None if clock_summary is None else clock_summary.bound_us,

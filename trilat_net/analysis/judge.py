@@ -21,7 +21,7 @@ from ..execution import FusedRun, simulate_columns, simulate_scenario
 from ..log import MIN_COVERAGE, Log
 from ..scenario import Scenario, describe_law_conditions, list_law_situations
 from .blas_threads import limit_blas_threads
-from .certificate.observed_energy import find_energy_laws
+from .certificate.observed_energy import ObservedEnergy
 from .certificate.premise_quantities import MissingFunctional
 from .certificate.stability_certificate import Certificate
 from .decision_facts import LoopRoots, RunFindings, StabilityDecision
@@ -172,7 +172,7 @@ def judge_virtual_run(
     )
     if is_weak and ticks <= MAX_RECORDED_TICKS and _has_energies(executed_scenario):
         # Only a written log contains the memories from which laws compute declared energies.
-        if find_energy_laws(executed_scenario, own_laws=True):
+        if ObservedEnergy.find_laws(executed_scenario, own_laws=True):
             log: Log = simulate_scenario(executed_scenario)
         else:
             log = simulate_columns(executed_scenario)
@@ -192,4 +192,4 @@ def judge_virtual_run(
 def _has_energies(scenario: Scenario) -> bool:
     """Returns True if a run has the energy function V, or energies that its laws declare."""
     has_functional = not MissingFunctional.list_of_scenario(scenario)
-    return has_functional or bool(find_energy_laws(scenario, own_laws=True))
+    return has_functional or bool(ObservedEnergy.find_laws(scenario, own_laws=True))

@@ -33,7 +33,6 @@ from trilat_net.analysis.certificate.premise_quantities import (
 )
 from trilat_net.analysis.certificate.premises import (
     RunFacts,
-    find_absent_spans,
 )
 from trilat_net.analysis.torque_sources import WallEnergy
 from trilat_net.analysis.twins import envelope_trend
@@ -398,7 +397,7 @@ def test_two_overlapping_absences_are_both_found() -> None:
         events=[SimpleNamespace(about="b", kind="left")],
         scenario=SimpleNamespace(duration_s=5.0),
     )
-    spans = find_absent_spans(log)  # type: ignore[arg-type]
+    spans = AbsentSpan.list_of_log(log)  # type: ignore[arg-type]
     assert spans == [AbsentSpan("a", 1.0, 2.0), AbsentSpan("b", 3.0, 5.0)]
 
 
@@ -416,7 +415,7 @@ def test_sites_may_end_a_tenth_apart() -> None:
             events=[SimpleNamespace(about="b", kind="left")],
             scenario=SimpleNamespace(duration_s=5.0),
         )
-        spans[ticks] = find_absent_spans(log)  # type: ignore[arg-type]
+        spans[ticks] = AbsentSpan.list_of_log(log)  # type: ignore[arg-type]
     assert spans == {48: [AbsentSpan("b", 4.8, 5.0)], 49: [], 50: []}
 
 

@@ -47,6 +47,7 @@ from .energy_balance import (
 )
 from .energy_terms import SiteConstants
 from .premise_quantities import (
+    LEAST_ABSENCE_S,
     AbsentSpan,
     AgeRange,
     AxisQuantities,
@@ -88,11 +89,6 @@ MIN_FREE_S = 1.0
 """Shortest motion without operators at the end of a run to which the theorem applies, in s."""
 MIN_FREE_AGES = 5.0
 """Shortest such motion as a multiple of the largest age of a sample in use."""
-LEAST_ABSENCE_S = 0.1
-"""Shortest absence of a site that counts, in s.
-
-The records of sites that are present also end at times that differ by up to this much.
-"""
 LEAST_SPEED_M_S = 1e-9
 """Smallest speed of an end effector that counts as motion along an axis, in m/s.
 
@@ -171,7 +167,7 @@ class RunFacts(NamedTuple):
         if not energies:
             return cls(log, constants, unknown=RecordGap.NO_COMMON_TIME)
         balance = EnergyBalance.of_energies(energies)
-        absent = find_absent_spans(log)
+        absent = AbsentSpan.list_of_log(log)
         if not balance.judged.any():
             return cls(log, constants, unknown=RecordGap.NO_PERIOD)
 
@@ -571,34 +567,6 @@ def _check_records(run: FunctionalFacts) -> Premise:
         is_whole=bool(run.balance.judged.all()),
     )
     return Premise("records", None if run.unjudged else True, quantities)
-
-
-def find_absent_spans(log: Log) -> list[AbsentSpan]:
-    """Finds the spans of time during which sites were absent from the session.
-
-    A site is absent while it has left and not yet joined again, and also from its last record
-    to the end of the run if the session reported that it left or was lost.
-
-    Args:
-        log: The log of the run.
-
-    Returns:
-        The spans, sorted by their start. Empty if no site was absent.
-    """
-    run_end_s = Timeline(log).end_s
-    absent = []
-    for site in log.sites:
-        site_log = log[site]
-        for first_tick, last_tick in log.absences.get(site, ()):
-            absence_start_s = first_tick / site_log.rate_hz
-            absence_end_s = (last_tick + 1) / site_log.rate_hz
-            absent.append(AbsentSpan(site, absence_start_s, absence_end_s))
-        last_s = (site_log.last_tick + 1) / site_log.rate_hz
-        kinds = {event.kind for event in log.events if event.about == site}
-        has_left = bool(kinds & {"left", "lost"})
-        if last_s < run_end_s - LEAST_ABSENCE_S and has_left:
-            absent.append(AbsentSpan(site, last_s, run_end_s))
-    return sorted(absent, key=lambda span: span[1:])
 
 
 def _check_presence(run: FunctionalFacts) -> Premise | None:

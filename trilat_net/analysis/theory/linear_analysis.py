@@ -41,7 +41,7 @@ from .equilibrium import add_limit_notes, find_equilibrium
 from .floquet import SamplesInUse, compute_sampled_spectrum
 from .linear_edge import EdgeScan, iterate_linear_edges, parse_edge_range
 from .linear_loop import LinearLoop, compute_shared_poses
-from .loop_roots import find_log_loop, find_run_loop, resolve_final_scenario
+from .loop_roots import EndLoop, resolve_final_scenario
 from .numeric_law import NumericLaw
 from .operating_point import Equilibrium, OperatingConditions
 from .port_analysis import PortAnalysis
@@ -307,11 +307,11 @@ def _find_end_loop(scenario: Scenario, log: Log | None) -> _AnalysedLoop:
     try:
         if log is not None:
             scenario = resolve_final_scenario(log)
-            end = find_log_loop(log, own_laws=True)
+            end = EndLoop.of_log(log, own_laws=True)
         else:
             run = FusedRun(scenario)
             run.advance_to(scenario.duration_s)
-            end = find_run_loop(scenario, run)
+            end = EndLoop.of_run(scenario, run)
     except ScenarioError:
         return _AnalysedLoop(scenario, conditions, find_equilibrium(scenario))
 

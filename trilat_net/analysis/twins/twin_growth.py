@@ -44,7 +44,7 @@ from ...hooks import find_hook
 from ...log import Log, open_log
 from ...results import Result, finite_or_none
 from ...scenario import Scenario
-from ..delay_period import find_burst_interval_s, find_final_delay_period, find_final_link
+from ..delay_period import DelayPeriod, find_burst_interval_s, find_final_link
 from ..run_end import RunEnd, find_coupled_sites
 from ..torque_sources import VirtualWall
 from .envelope_trend import EnvelopeFit, EnvelopeTrend
@@ -483,7 +483,7 @@ def _find_varying_period_s(scenario: Scenario) -> float | None:
     links = [find_final_link(scenario, name) for name in scenario.links]
     if all(link.to_core_model().kind == DelayKind.CONSTANT for link in links):
         return None
-    return find_final_delay_period(scenario).true_s
+    return DelayPeriod.of_scenario(scenario).true_s
 
 
 def _fit_to_period(counts_from_s: float, end_s: float, period_s: float | None) -> float:

@@ -24,9 +24,9 @@ from msgspec.structs import replace
 
 from trilat_net.analysis import (
     AlignedRecords,
+    DelayDistribution,
     TorqueSplit,
     build_arm_rows,
-    sample_ages_ns,
 )
 from trilat_net.core import Array
 from trilat_net.errors import LogError
@@ -384,7 +384,7 @@ class ExperimentTrial:
         if len(forces) > 1:
             measures |= self._measure_pair(aligned, forces, outcome.ended_s)
 
-        age_ms = sample_ages_ns(log, self.slave, users[0]) / 1e6
+        age_ms = DelayDistribution.measure_ages_ns(log, self.slave, users[0]) / 1e6
         mean_age_ms = 0.0
         if len(age_ms):
             mean_age_ms = float(age_ms.mean())
