@@ -35,7 +35,7 @@ from trilat_net.analysis import LogMetrics
 from trilat_net.presentation.page import write_report
 from trilat_net.analysis.certificate.stability_certificate import Certificate
 from trilat_net import open_log, verify
-from trilat_net.execution.virtual_comparison import simulate_without_operators
+from trilat_net.execution.virtual import SimulatedLog
 lap("start")
 log = open_log(sys.argv[1])
 lap("opening")
@@ -45,7 +45,7 @@ Certificate.of_log(log)
 lap("certificate")
 write_report(log, Path(sys.argv[2]), certificate=Certificate.of_log(log))
 lap("report")
-simulate_without_operators(log)
+SimulatedLog.without_operators(log)
 lap("twin")
 verify(log)
 lap("verify")

@@ -8,7 +8,7 @@ from trilat_studies.sweep.sweep_plan import plan_sweep
 
 import trilat_net as tn
 from trilat_net.analysis import SETTLED_ERROR_RAD, RunTrace, judge_virtual_run
-from trilat_net.core.lanes.run_groups import group_runs
+from trilat_net.core.lanes.run_groups import RunGroup
 from trilat_net.execution.fused import FusedRun
 
 CELLS = 64
@@ -36,7 +36,7 @@ def run() -> list[str]:
 
         begun = time.process_time()
         runs = [FusedRun(scenario, SETTLED_ERROR_RAD) for scenario in scenarios]
-        for group in group_runs(runs):
+        for group in RunGroup.divide(runs):
             group.advance_to(DURATION_S)
         times_s.setdefault("simulation", []).append(time.process_time() - begun)
         begun = time.process_time()

@@ -14,20 +14,19 @@ __all__ = [
     "GapRepair",
     "InboundQueue",
     "ReadScenario",
-    "SiteReception",
     "record_session",
 ]
 
 if TYPE_CHECKING:
     from .backfill import GapRepair
     from .record_process import ReadScenario, record_session
-    from .site_reception import AWAY_NS, InboundQueue, SiteReception
+    from .site_reception import AWAY_NS, InboundQueue
 else:
     __getattr__ = import_on_use(
         __name__,
         {
             "backfill": "GapRepair",
             "record_process": "ReadScenario record_session",
-            "site_reception": "AWAY_NS InboundQueue SiteReception",
+            "site_reception": "AWAY_NS InboundQueue",
         },
     )

@@ -18,7 +18,7 @@ from collections.abc import Iterator
 from typing import NamedTuple
 
 from trilat_net.errors import WireError
-from trilat_net.log import SITE_CHANNELS, Account
+from trilat_net.log import SITE_CHANNELS, Account, SessionScenario
 from trilat_net.net import (
     BACKFILL_MESSAGES,
     Backfill,
@@ -76,27 +76,41 @@ class GapRepair:
     """Requests messages that were lost on the network again from the site that sent them.
 
     A site is the process that controls one arm. It keeps its recent messages in a buffer.
-    Without repair, the log would have gaps.
+    Without repair, the log would have gaps. An object serves one start of the site.
 
     Args:
         bus: Network connection of the recorder.
         session: Name of the session.
-        reception: Received messages of the site. It knows which numbers are missing.
+        scenario: Scenario of the session.
+        site: Name of the site.
+        boot: Random number that identifies the start of the site. None if the site has not
+            appeared yet.
         dropped: Numbers of dropped messages by reason. Invalid replies are added.
         now_ns: Present time on the monotonic clock, in ns.
+        before: Repair of the previous start of the site. None for the first start.
+
+    Attributes:
+        reception: Received messages of the site. It knows which numbers are missing.
     """
 
     def __init__(
         self,
         bus: Bus,
         session: str,
-        reception: SiteReception,
+        scenario: SessionScenario,
+        site: str,
+        boot: int | None,
         dropped: Counter[str],
+        *,
         now_ns: int = 0,
+        before: "GapRepair | None" = None,
     ) -> None:
+        previous = None if before is None else before.reception
+        self.reception: SiteReception = SiteReception(scenario, site, boot, previous)
         self._bus = bus
-        self._key = topics.key(session, reception.name, topics.PAST)
-        self._reception = reception
+        self._session = session
+        self._scenario = scenario
+        self._key = topics.key(session, site, topics.PAST)
         self._dropped = dropped
         # The channels take turns. The channel of the last request is at the end.
         self._turns = list(SITE_CHANNELS)
@@ -136,6 +150,22 @@ class GapRepair:
         """
         return self._progress_ns
 
+    def follow_start(self, boot: int) -> "GapRepair":
+        """Returns the repair of the next start of the site, which continues the counts.
+
+        Args:
+            boot: Random number that identifies the next start.
+        """
+        return GapRepair(
+            bus=self._bus,
+            session=self._session,
+            scenario=self._scenario,
+            site=self.reception.name,
+            boot=boot,
+            dropped=self._dropped,
+            before=self,
+        )
+
     def probe(self) -> None:
         """Makes `poll` request the newest messages of every channel of the site.
 
@@ -169,14 +199,14 @@ class GapRepair:
             if self._open is None:
                 self._send_request(now_ns)
 
-        if self._reception.final_ticks is not None:
+        if self.reception.final_ticks is not None:
             if self._ended_ns is None:
                 self._ended_ns = now_ns
             # After the end of the site, messages are requested from its buffer until no more
             # arrive.
             waited_since_ns = max(self._ended_ns, self._progress_ns)
             if now_ns - waited_since_ns > GIVE_UP_NS:
-                self._reception.give_up()
+                self.reception.give_up()
 
     def _probe_if_silent(self, now_ns: int) -> None:
         """Requests the newest messages of a running site whose messages have stopped arriving.
@@ -188,10 +218,10 @@ class GapRepair:
         Args:
             now_ns: Present time on the monotonic clock, in ns.
         """
-        last_received_ns = self._reception.last_received_ns or 0
+        last_received_ns = self.reception.last_received_ns or 0
         silence_ns = now_ns - max(last_received_ns, self._probed_ns)
-        longest_silence_ns = max(SILENT_NS, 3 * self._reception.period_ns)
-        is_running = self._reception.final_ticks is None
+        longest_silence_ns = max(SILENT_NS, 3 * self.reception.period_ns)
+        is_running = self.reception.final_ticks is None
         if is_running and silence_ns > longest_silence_ns:
             self._probed_ns = now_ns
             self.probe()
@@ -242,7 +272,7 @@ class GapRepair:
             no message is missing and no probe is scheduled.
         """
         for channel in self._turns:
-            account = self._reception.accounts[channel]
+            account = self.reception.accounts[channel]
             next_gap = account.find_requestable_gap(self._next_numbers[channel])
             first_gap = account.find_requestable_gap() if next_gap is None else None
             requested_range = next_gap or first_gap
@@ -348,7 +378,7 @@ class GapRepair:
                 messages than those that were requested.
         """
         backfill = decode(payload, Backfill)
-        self._reception.check_sender(backfill)
+        self.reception.check_sender(backfill)
         published = backfill.made
         highest_first = max(published, request.first)
         is_other_channel = backfill.channel != request.channel
@@ -375,9 +405,9 @@ class GapRepair:
             now_ns: Present time on the monotonic clock, in ns.
         """
         channel = backfill.channel
-        account = self._reception.accounts[channel]
+        account = self.reception.accounts[channel]
         self._probes.discard(channel)
-        self._reception.add_expected(channel, backfill.made)
+        self.reception.add_expected(channel, backfill.made)
         if backfill.first > request.first:
             # The site no longer has the messages before the first one of the reply.
             account.abandon_below(backfill.first)
@@ -387,7 +417,7 @@ class GapRepair:
             if not payload:
                 continue  # the site skipped this tick, as a record states
             try:
-                message = self._reception.read(channel, payload)
+                message = self.reception.read(channel, payload)
                 if message.number != number:
                     raise WireError(
                         "out of range",
@@ -397,7 +427,7 @@ class GapRepair:
             except WireError as error:
                 self._dropped[error.reason] += 1
                 continue
-            if self._reception.refill(channel, message):
+            if self.reception.refill(channel, message):
                 is_useful = True
                 yield channel, message, payload
 
@@ -426,5 +456,5 @@ class GapRepair:
         self._vain_requests[channel] += 1
         if self._vain_requests[channel] >= MAX_VAIN_REQUESTS:
             self._vain_requests[channel] = 0
-            account = self._reception.accounts[channel]
+            account = self.reception.accounts[channel]
             account.abandon_below(account.last + 1)

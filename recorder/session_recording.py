@@ -90,7 +90,6 @@ class Recording:
         self.dropped: Counter[str] = Counter()
         self._writer = writer
         self._scenario = scenario
-        self._bus = bus
         # A boot is the random number that identifies one start of a site's process.
         # Boot of the start that is being recorded, by site.
         self._recorded_boots = dict(epoch.boots)
@@ -103,20 +102,19 @@ class Recording:
         self._vanished_starts: set[tuple[str, str]] = set()
         # Time at which every site should have left, on the monotonic clock.
         self._end_ns = epoch.mono_ns + round(scenario.duration_s * 1e9) + LAST_NS
-        self._sites = {
-            name: SiteReception(scenario, name, epoch.boots.get(name))
-            for name in scenario.names
-        }
         self._repairs = {
             name: GapRepair(
                 bus=bus,
                 session=session,
-                reception=site,
+                scenario=scenario,
+                site=name,
+                boot=epoch.boots.get(name),
                 dropped=self.dropped,
                 now_ns=epoch.mono_ns,
             )
-            for name, site in self._sites.items()
+            for name in scenario.names
         }
+        self._sites = {name: repair.reception for name, repair in self._repairs.items()}
         # Site and channel of each key.
         self._channels = {
             topics.key(session, name, channel): (site, channel)
@@ -306,9 +304,9 @@ class Recording:
             # The reception of the new start continues the counts of the previous one.
             del self._next_boots[name]
             self._recorded_boots[name] = boot
-            site = SiteReception(self._scenario, name, boot, previous)
-            repair = GapRepair(self._bus, self.session, site, self.dropped)
+            repair = self._repairs[name].follow_start(boot)
             repair.probe()
+            site = repair.reception
             self._sites[name] = site
             self._repairs[name] = repair
             for channel in site.accounts:

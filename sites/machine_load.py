@@ -25,6 +25,21 @@ _IDLE_COLUMNS = slice(3, 5)  # idle, and waiting for a disk
 _TIME_COLUMNS = slice(0, 8)  # without guests, whose time the column "user" includes
 
 
+def check_machine_load(clock: Clock) -> str:
+    """Returns a warning if other programs keep this machine busy.
+
+    A control loop on a busy machine starts its periods late, which makes its arm move
+    differently.
+
+    Args:
+        clock: Clock of this process.
+
+    Returns:
+        The warning, with a remedy. Empty if the machine is not busy.
+    """
+    return _describe_load(_measure_busy_share(clock))
+
+
 class _ProcessorTimes(NamedTuple):
     """Idle and total time of all processors since the start of the machine.
 
@@ -53,7 +68,7 @@ class _ProcessorTimes(NamedTuple):
         return cls(sum(columns[_IDLE_COLUMNS]), sum(columns[_TIME_COLUMNS]))
 
 
-def measure_busy_share(clock: Clock) -> float | None:
+def _measure_busy_share(clock: Clock) -> float | None:
     """Measures the fraction of time in which the processors of this machine are busy.
 
     It is for example 0.25 if one of four processors is always busy. On a busy machine, control
@@ -76,7 +91,7 @@ def measure_busy_share(clock: Clock) -> float | None:
     return None
 
 
-def describe_load(busy_share: float | None) -> str:
+def _describe_load(busy_share: float | None) -> str:
     """Returns a warning with a remedy if other programs keep the machine busy.
 
     On a busy machine, control loops may begin their periods too late.
@@ -99,18 +114,3 @@ def describe_load(busy_share: float | None) -> str:
         "so ticks may be late and the recorder may miss records: "
         "end those programs, or lower the rate, as in --set rate_hz=200"
     )
-
-
-def check_machine_load(clock: Clock) -> str:
-    """Returns a warning if other programs keep this machine busy.
-
-    A control loop on a busy machine starts its periods late, which makes its arm move
-    differently.
-
-    Args:
-        clock: Clock of this process.
-
-    Returns:
-        The warning, with a remedy. Empty if the machine is not busy.
-    """
-    return describe_load(measure_busy_share(clock))

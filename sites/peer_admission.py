@@ -18,7 +18,6 @@ from trilat_net.net import Epoch, Event, EventPublisher, SiteTiming
 from trilat_net.records import NS_PER_S
 
 from .site_loop import PeerInbox
-from .site_news import publish_clocks
 from .site_parts import SiteParts
 
 
@@ -124,7 +123,7 @@ class PeerAdmission:
 
         self._publish_last_heard(index, event, t_ns)
         notices = self._timing.admit(index, join_ns, event.epoch_mono_ns, bound_ns)
-        publish_clocks(self._publisher, notices, t_ns)
+        self._publisher.publish_clocks(notices, t_ns)
         self._inbox.admit(index, event.boot, event.ticks)
         parts.say(f"{event.member} joins at t = {join_ns * 1e-9:.3f} s")
 

@@ -19,7 +19,6 @@ from trilat_net.net import (
     ChangeRequest,
     Epoch,
     EventPublisher,
-    LinkTimingMonitor,
     PeerClock,
     Pinger,
     SiteTiming,
@@ -31,9 +30,9 @@ from trilat_net.records import Arrival, TickRecord
 
 from . import realtime
 from .peer_admission import PeerAdmission
-from .site_end import RunOutcome
+from .site_end import SiteEnd
 from .site_loop import PeerInbox, run_loop
-from .site_news import SiteNews, publish_clocks
+from .site_news import SiteNews
 from .site_parts import SiteParts
 
 _NO_BOOT = -1
@@ -58,7 +57,6 @@ class RunningSite:
         epoch: The agreed epoch, and the members of the session.
 
     Attributes:
-        publisher: Publishes the events of the site.
         publish_sample: Function that publishes a sample, the state that peers receive.
         publish_link: Function that publishes statistics of the loop and its links.
         report_tick: Function that publishes what has changed in a tick.
@@ -73,7 +71,7 @@ class RunningSite:
         epoch: Epoch,
     ) -> None:
         site = parts.site
-        self.publisher = publisher
+        self._publisher = publisher
         self._parts = parts
         self._epoch = epoch
         self._failure: RunFailed | None = None
@@ -113,15 +111,6 @@ class RunningSite:
             epoch_unix_ns=epoch.unix_ns,
             boots=epoch.boots,
         )
-
-    @property
-    def link_monitors(self) -> Sequence[LinkTimingMonitor]:
-        """Monitors that measure the delays and losses of the messages from each peer.
-
-        A peer is another site, a process that controls one arm. The monitors have the order of
-        the peers.
-        """
-        return self._timing.monitors
 
     def _make_timing(self, pinger: Pinger) -> SiteTiming:
         """Returns the schedule of the site's ticks, and the timing of its links.
@@ -166,14 +155,14 @@ class RunningSite:
             turn_ns=find_turn_ns(turn, len(self._local_sites), highest_rate_hz),
         )
 
-    def run(self) -> RunOutcome:
+    def run(self) -> SiteEnd:
         """Runs the control loop of the site until the last tick, or until the run ends early.
 
         A tick is one period of the control loop. The run may end early because of a failure, a
         signal, or a request of another member.
 
         Returns:
-            The record of the last tick, and the failure that ended the run, if there was one.
+            The object that publishes how the run ended, and leaves the session.
         """
         parts = self._parts
         # Samples may wait for the next block only if all peers share this machine.
@@ -207,7 +196,13 @@ class RunningSite:
 
         if self._output is not None:
             self._news.publish_skipped(self._output)
-        return RunOutcome(self._output, self._failure)
+        return SiteEnd(
+            parts=parts,
+            publisher=self._publisher,
+            link_monitors=self._timing.monitors,
+            output=self._output,
+            failure=self._failure,
+        )
 
     def _publish_setup(self) -> None:
         """Publishes the real-time settings and the clock offsets, and prints them for the user.
@@ -221,7 +216,7 @@ class RunningSite:
         obtained = realtime.prepare(parts.options.cpu, len(self._local_sites))
         obtained["turn"] = f"{self._timing.turn_ns // 1000} us after the grid"
         settings = [f"{key}: {value}" for key, value in obtained.items()]
-        self.publisher.publish(
+        self._publisher.publish(
             "setup",
             ", ".join([*settings, *user_lines]),
             epoch_mono_ns=self._epoch.mono_ns,
@@ -233,7 +228,7 @@ class RunningSite:
         if first_tick:
             t_ns = tick_ns(first_tick, parts.site.rate_hz)
             begins = f"joins the running session at t = {t_ns * 1e-9:.3f} s"
-            self.publisher.publish(
+            self._publisher.publish(
                 "join",
                 f"{parts.name} {begins}",
                 t_ns=t_ns,
@@ -241,12 +236,12 @@ class RunningSite:
                 ticks=first_tick,
             )
         parts.say(f"{begins}; {obtained['scheduling']}, memory {obtained['memory']}")
-        publish_clocks(self.publisher, self._timing.list_initial_notices(), 0)
+        self._publisher.publish_clocks(self._timing.list_initial_notices(), 0)
 
         if parts.arm is not None:
             warning = parts.arm.bind(parts.scenario.sites[parts.name].q0_rad)
             if warning:
-                self.publisher.publish("arm", f"{parts.name}: {warning}")
+                self._publisher.publish("arm", f"{parts.name}: {warning}")
                 user_lines = [*user_lines, warning]
         for line in user_lines:
             parts.say(line)
@@ -325,11 +320,11 @@ class RunningSite:
         # Start of the session as the present schedule implies it, for sites that join late. It
         # changes slowly, because the schedule follows the clock of the leader.
         grid_ns = self._timing.schedule.due_ns(next_tick) - next_nominal_ns
-        self.publisher.update(ticks=next_tick, grid_ns=grid_ns)
-        self.publisher.answer_queries()
+        self._publisher.update(ticks=next_tick, grid_ns=grid_ns)
+        self._publisher.answer_queries()
 
         notices = self._timing.update_clocks(next_tick, parts.clock.monotonic_ns())
-        publish_clocks(self.publisher, notices, output.t_ns)
+        self._publisher.publish_clocks(notices, output.t_ns)
         self._admission.watch_members(output.t_ns)
         self._admission.rejoin(output.t_ns)
         self._news.publish_news(output)

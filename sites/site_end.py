@@ -12,7 +12,6 @@ Invariant:
 
 import signal
 from collections.abc import Sequence
-from typing import NamedTuple
 
 from trilat_net.core import describe_mode
 from trilat_net.errors import PeerLeft, RunFailed, count_nouns
@@ -35,37 +34,6 @@ _QUERIED_NS = NS_PER_S
 """A recorder counts as present for this time after its last query, even without a token."""
 _POLL_NS = 5_000_000
 """Longest pause between two polls while the site waits for the recorders, in ns."""
-
-
-class RunOutcome(NamedTuple):
-    """How the control loop of a site ended: normally, or with an error.
-
-    A site is a process that controls one arm. Its last event and its exit code follow from the
-    outcome.
-
-    Attributes:
-        output: Record of the last tick. None if no tick was executed.
-        failure: Error that ended the run. None if there was none.
-    """
-
-    output: TickRecord | None
-    failure: RunFailed | None = None
-
-    @property
-    def ticks(self) -> int:
-        """Number of control periods (ticks) up to the last executed one.
-
-        The number is 0 if no tick was executed.
-        """
-        return 0 if self.output is None else self.output.tick + 1
-
-    @property
-    def t_ns(self) -> int:
-        """Nominal time of the last control period (tick), in ns since the start of the session.
-
-        The time is -1 if no tick was executed.
-        """
-        return -1 if self.output is None else self.output.t_ns
 
 
 def _summarise_loop(ticks: int, parts: SiteParts) -> str:
@@ -108,7 +76,8 @@ class SiteEnd:
         publisher: Publishes the events of the site.
         link_monitors: Timing monitors of the links, which know whether the peers (the other
             sites) have received the last samples of this site.
-        outcome: Result of the control loop.
+        output: Record of the last tick. None if no tick was executed.
+        failure: Error that ended the run. None if there was none.
     """
 
     def __init__(
@@ -116,12 +85,17 @@ class SiteEnd:
         parts: SiteParts,
         publisher: EventPublisher,
         link_monitors: Sequence[LinkTimingMonitor],
-        outcome: RunOutcome,
+        output: TickRecord | None,
+        failure: RunFailed | None,
     ) -> None:
         self._parts = parts
         self._publisher = publisher
         self._link_monitors = link_monitors
-        self._outcome = outcome
+        self._output = output
+        self._failure = failure
+        # Number of ticks up to the last executed one, and its nominal time since the epoch.
+        self._ticks = 0 if output is None else output.tick + 1
+        self._t_ns = -1 if output is None else output.t_ns
 
     def leave_session(self) -> int:
         """Publishes how the run ended, waits for the recorders, and tells the user the result.
@@ -144,15 +118,15 @@ class SiteEnd:
 
         # The exit code is read before the wait: a later signal only ends the wait.
         code = interrupt.exit_code if interrupt.is_requested() else 0
-        monitor.watch(self._publisher, self._outcome.t_ns)
+        monitor.watch(self._publisher, self._t_ns)
         if topics.RECORDER in monitor.boots or monitor.recorders:
             self._await_recorders()
 
-        ticks = count_nouns(self._outcome.ticks, "tick")
-        parts.say(_summarise_loop(self._outcome.ticks, parts))
+        ticks = count_nouns(self._ticks, "tick")
+        parts.say(_summarise_loop(self._ticks, parts))
 
-        if self._outcome.failure is not None:
-            raise self._outcome.failure
+        if self._failure is not None:
+            raise self._failure
         if monitor.ended_by:
             raise RunFailed(f"{parts.name} ended because {monitor.ended_by}")
         if not code and self._departures:
@@ -171,14 +145,13 @@ class SiteEnd:
         ended early.
         """
         parts = self._parts
-        output = self._outcome.output
+        output = self._output
         failure_kind = "failed"
         if output is not None and output.mode is Mode.DIVERGED:
             failure_kind = "diverged"
-            failure = RunFailed(describe_mode(parts.name, output, glides=False))
-            self._outcome = self._outcome._replace(failure=failure)
-        if self._outcome.failure is not None:
-            self._publish_end_event(failure_kind, str(self._outcome.failure))
+            self._failure = RunFailed(describe_mode(parts.name, output, glides=False))
+        if self._failure is not None:
+            self._publish_end_event(failure_kind, str(self._failure))
 
         for code in parts.watchdog.codes:
             hiccups = code.describe_hiccups()
@@ -192,7 +165,7 @@ class SiteEnd:
         ]
         if unreached_peers:
             cause += f"; {', '.join(unreached_peers)} did not confirm its last samples"
-        text = f"{parts.name} made {count_nouns(self._outcome.ticks, 'tick')}{cause}"
+        text = f"{parts.name} made {count_nouns(self._ticks, 'tick')}{cause}"
         self._publish_end_event("end", text, about=about)
 
     @property
@@ -218,15 +191,15 @@ class SiteEnd:
         parts = self._parts
         monitor = parts.monitor
 
-        if self._outcome.failure is not None:  # of this site
-            return parts.name, f": {self._outcome.failure}"
+        if self._failure is not None:  # of this site
+            return parts.name, f": {self._failure}"
         if monitor.ended_by:  # another member ended it, or has replaced this site
             return monitor.ended_member, f": {monitor.ended_by}"
         if parts.changes.stopped:  # users requested that all sites end at the same tick
             return "", ", up to the requested end"
 
         scenario_ticks = parts.scenario.ticks(parts.name)
-        if self._outcome.ticks == scenario_ticks:
+        if self._ticks == scenario_ticks:
             return "", ""
 
         if parts.interrupt.is_requested():
@@ -248,9 +221,7 @@ class SiteEnd:
             text: Sentence for people.
             about: Name of the site that the event is about. Empty for this site.
         """
-        self._publisher.publish(
-            kind, text, t_ns=self._outcome.t_ns, ticks=self._outcome.ticks, about=about
-        )
+        self._publisher.publish(kind, text, t_ns=self._t_ns, ticks=self._ticks, about=about)
 
     def _await_recorders(self) -> None:
         """Waits until every recorder has stored the messages of this site and has left.
@@ -274,7 +245,7 @@ class SiteEnd:
                 queried_ns = clock.monotonic_ns()
                 give_up_ns = max(give_up_ns, queried_ns + LINGER_NS)
             self._publisher.answer_queries()
-            monitor.watch(self._publisher, self._outcome.t_ns)
+            monitor.watch(self._publisher, self._t_ns)
 
             since_query_ns = clock.monotonic_ns() - queried_ns
             is_gone = not monitor.recorders and since_query_ns > _QUERIED_NS
@@ -282,7 +253,7 @@ class SiteEnd:
             # stays unchanged.
             if is_gone and monitor.stored:
                 give_up_ns = min(give_up_ns, clock.monotonic_ns() + LEAVE_TIMEOUT_NS)
-            if monitor.read_stored(self._outcome.ticks) and monitor.all_stored:
+            if monitor.read_stored(self._ticks) and monitor.all_stored:
                 give_up_ns = clock.monotonic_ns() + int(parts.options.stay_s * 1e9)
 
             waited_ns = clock.monotonic_ns() - begun_ns

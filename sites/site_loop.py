@@ -28,11 +28,9 @@ from typing import Any, Protocol
 from trilat_net.core import (
     AHEAD_LIMIT_NS,
     MAX_ARRIVALS,
-    DelayKind,
     HandInForce,
     LinkSetup,
     Site,
-    SiteSetup,
     first_tick_at,
 )
 from trilat_net.errors import WireError
@@ -46,24 +44,8 @@ from trilat_net.net import (
     encode,
     encode_sample,
     encode_state,
-    make_reader,
 )
 from trilat_net.records import NS_PER_S, Arrival, Mode, TickRecord
-from trilat_net.scenario import Scenario
-
-
-def make_sample_readers(setup: SiteSetup) -> list[Callable[[bytes], PeerSample | WireError]]:
-    """Returns, for each peer of a site, a function that decodes the samples of that peer.
-
-    The decoders run in network threads, where an exception would be lost. Therefore a decoder
-    returns the error instead of raising it.
-
-    Args:
-        setup: Settings of the site. The decoders have the order of its links.
-    """
-    layouts = [setup.layout._replace(sent=link.channel.record_size) for link in setup.links]
-    return [make_reader(PeerSample, layout) for layout in layouts]
-
 
 _GLIDE_AHEAD_LIMIT_NS = NS_PER_S
 """Largest time by which a sample may lie in the future under the rule `glide`, in ns.
@@ -294,41 +276,6 @@ _BLOCKS_PER_S = 100
 """Number of blocks per second: recorders receive the records of 10 ms in one block."""
 _WAKES_PER_S = 200
 """Peers on one machine receive the samples of 5 ms together, unless they need them sooner."""
-_MIN_HELD_DELAY_US = 100_000
-"""Smallest delay of a link whose samples may be sent late without an effect, in us."""
-
-
-def may_hold_samples(scenario: Scenario, name: str) -> bool:
-    """Returns True if a site may send the samples of several ticks together, and thus late.
-
-    A sample is the state that a site sends to its peers in each tick, a period of its control
-    loop. The receiver of a link delays each sample as the scenario prescribes, counted from the
-    tick of the sample and not from its arrival. If every link from the site prescribes at least
-    `_MIN_HELD_DELAY_US`, no peer uses a sample before that time. Sending it a few milliseconds
-    late then has no effect on the run.
-
-    The result holds for the delays of the scenario. If the user shortens a delay during the
-    run, the site stops holding samples, see `PeerAdmission.watch_members`.
-
-    Args:
-        scenario: The scenario, which describes the arms, their links and the run.
-        name: Name of the site.
-    """
-    for receiver in scenario.names:
-        for link in scenario.setup(receiver).links:
-            sender = link.peer
-            if sender != name:
-                continue
-            # The models replace each other in the course of the run.
-            for model in link.models:
-                is_constant = model.kind == DelayKind.CONSTANT
-                # A random delay may be as short as 0.
-                smallest_network_us = model.location if is_constant else 0.0
-                # The play-out buffer holds each sample until it has at least a given age.
-                smallest_delay_us = max(model.playout_us, smallest_network_us)
-                if smallest_delay_us < _MIN_HELD_DELAY_US:
-                    return False
-    return True
 
 
 class StateBlock:

@@ -8,7 +8,7 @@ Invariant:
     - An event or alarm that would repeat in every tick is issued at most once a second.
 """
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 
 import msgspec
 import numpy as np
@@ -22,7 +22,7 @@ from trilat_net.core import (
 )
 from trilat_net.errors import count_nouns
 from trilat_net.log import compute_task_errors
-from trilat_net.net import MODE_WORDS, ClockNotice, EventPublisher
+from trilat_net.net import MODE_WORDS, EventPublisher
 from trilat_net.recorded_change import count_skipped_ticks
 from trilat_net.records import NS_PER_S, Mode, TickRecord
 from trilat_net.scenario import Change
@@ -31,22 +31,6 @@ from .site_parts import SiteParts
 
 _STATUS_PERIOD_S = 5
 """Time between two status lines for the user, in s."""
-
-
-def publish_clocks(
-    publisher: EventPublisher, notices: Iterable[ClockNotice], t_ns: int
-) -> None:
-    """Publishes events about the offsets and faults of the peers' clocks.
-
-    Recorders store these events, so that a reader of the log knows how well the clocks agreed.
-
-    Args:
-        publisher: Publishes the events of the site.
-        notices: Fields of the events.
-        t_ns: Time of the events, in ns since the epoch (the common start of the session).
-    """
-    for notice in notices:
-        publisher.publish(**notice, t_ns=t_ns)
 
 
 class SiteNews:

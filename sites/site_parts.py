@@ -17,6 +17,7 @@ from typing import Any
 
 from trilat_net.core import (
     CoreChange,
+    DelayKind,
     PlantState,
     Site,
     SiteSetup,
@@ -24,7 +25,7 @@ from trilat_net.core import (
     first_tick_at,
     tick_ns,
 )
-from trilat_net.errors import LawFailed
+from trilat_net.errors import LawFailed, WireError
 from trilat_net.net import (
     Bus,
     Clock,
@@ -33,11 +34,13 @@ from trilat_net.net import (
     OffsetEstimator,
     OffsetLimit,
     PeerSample,
+    StampedInbox,
     SystemClock,
     decode,
     encode_sample,
     encode_state,
     join_states,
+    make_sample_reader,
     new_boot,
     topics,
 )
@@ -53,7 +56,7 @@ from .external_arm import MEASUREMENTS_KEPT, DeadManSwitch, ExternalArm
 from .hand_server import MESSAGES_KEPT, HandServer, RemoteHand
 from .peer_monitor import PeerMonitor
 from .retransmit_buffer import RetransmitBuffer
-from .site_loop import StateBlock, make_sample_readers, may_hold_samples
+from .site_loop import StateBlock
 
 
 @dataclass(frozen=True, slots=True)
@@ -148,11 +151,12 @@ class SiteParts:
         self.watchdog, self.step = _watch_law(scenario, self.site, clock)
 
         # Queues of the samples from the peers.
-        readers = make_sample_readers(self.setup)
-        self.rings = [
-            bus.stamped_inbox(self._key(topics.SAMPLE, link.peer), clock.monotonic_ns, reader)
-            for link, reader in zip(self.setup.links, readers, strict=True)
-        ]
+        self.rings: list[StampedInbox[PeerSample | WireError]] = []
+        for link in self.setup.links:
+            sample_layout = self.setup.layout._replace(sent=link.channel.record_size)
+            read = make_sample_reader(sample_layout)
+            key = self._key(topics.SAMPLE, link.peer)
+            self.rings.append(bus.stamped_inbox(key, clock.monotonic_ns, read))
 
         # The arm, its simulation by the user, and its operator.
         self.arm: ExternalArm | None = None
@@ -222,7 +226,7 @@ class SiteParts:
             turn=scenario.names.index(self.name),  # sites send in different ticks
             single=sends_every_tick,
         )
-        peers_can_wait = may_hold_samples(scenario, self.name)
+        peers_can_wait = _may_hold_samples(scenario, self.name)
         self.states.holds_samples = peers_can_wait and not sends_every_tick
 
     def _watch_code(self, name: str, rate_hz: int) -> Callable[..., Any]:
@@ -379,6 +383,43 @@ class SiteParts:
             site=self.name, order=order, from_ns=tick_ns(tick, self.site.rate_hz), ticks=skipped
         )
         return self.scenario.to_core_change(change)
+
+
+_MIN_HELD_DELAY_US = 100_000
+"""Smallest delay of a link whose samples may be sent late without an effect, in us."""
+
+
+def _may_hold_samples(scenario: Scenario, name: str) -> bool:
+    """Returns True if a site may send the samples of several ticks together, and thus late.
+
+    A sample is the state that a site sends to its peers in each tick, a period of its control
+    loop. The receiver of a link delays each sample as the scenario prescribes, counted from the
+    tick of the sample and not from its arrival. If every link from the site prescribes at least
+    `_MIN_HELD_DELAY_US`, no peer uses a sample before that time. Sending it a few milliseconds
+    late then has no effect on the run.
+
+    The result holds for the delays of the scenario. If the user shortens a delay during the
+    run, the site stops holding samples, see `PeerAdmission.watch_members`.
+
+    Args:
+        scenario: The scenario, which describes the arms, their links and the run.
+        name: Name of the site.
+    """
+    for receiver in scenario.names:
+        for link in scenario.setup(receiver).links:
+            sender = link.peer
+            if sender != name:
+                continue
+            # The models replace each other in the course of the run.
+            for model in link.models:
+                is_constant = model.kind == DelayKind.CONSTANT
+                # A random delay may be as short as 0.
+                smallest_network_us = model.location if is_constant else 0.0
+                # The play-out buffer holds each sample until it has at least a given age.
+                smallest_delay_us = max(model.playout_us, smallest_network_us)
+                if smallest_delay_us < _MIN_HELD_DELAY_US:
+                    return False
+    return True
 
 
 WARM_UP_TICKS = 200

@@ -12,18 +12,19 @@ Invariant:
     - The arm is braked until the epoch.
 """
 
+import queue
+import threading
 from collections.abc import Callable
-from contextlib import closing
+from contextlib import closing, suppress
 
-from sites.line_printer import LinePrinter
 from trilat_net.core import compute_fingerprint
 from trilat_net.errors import SessionError
 from trilat_net.net import (
     EventPublisher,
     LateSites,
     SessionJoin,
+    SystemClock,
     describe_member,
-    make_system_clock,
     share_threads,
     topics,
 )
@@ -34,7 +35,6 @@ from trilat_net.signals import Interrupt
 from .external_arm import ExternalArm
 from .hand_server import RemoteHand
 from .running_site import RunningSite
-from .site_end import SiteEnd
 from .site_parts import SiteOptions, SiteParts
 
 POLL_NS = 5_000_000
@@ -77,7 +77,7 @@ def run_site(
     share_threads()
 
     with Interrupt() as interrupt:
-        clock = make_system_clock(options.clock_offset_s, options.clock_drift_ppm)
+        clock = SystemClock.with_error(options.clock_offset_s, options.clock_drift_ppm)
 
         bus = options.connection.open_bus(
             clock=clock,
@@ -88,7 +88,7 @@ def run_site(
         if bus is None:
             return interrupt.exit_code
 
-        with closing(bus), LinePrinter(say) as printer:
+        with closing(bus), _LinePrinter(say) as printer:
             with interrupt.raising():  # compilation may take minutes
                 parts = SiteParts(
                     scenario=scenario,
@@ -104,6 +104,53 @@ def run_site(
                 endpoints = ", ".join(map(str, options.connection.listen))
                 parts.say(f"others connect to {endpoints}")
             return join_and_run(parts)
+
+
+class _LinePrinter:
+    """Prints lines in a separate thread, so that a control loop never waits for the terminal.
+
+    A terminal may block a program that prints, for example while its user has paused the
+    output. The printer is used as a context manager. Up to 256 lines wait to be printed, and
+    further lines are lost.
+
+    Args:
+        print_line: Function that prints a line.
+    """
+
+    def __init__(self, print_line: Callable[[str], None]) -> None:
+        self._print_line = print_line
+        self._lines: queue.Queue[str | None] = queue.Queue(256)
+        self._thread = threading.Thread(target=self._print_lines, daemon=True)
+
+    def __enter__(self) -> "_LinePrinter":
+        self._thread.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        with suppress(queue.Full):
+            self._lines.put(None, timeout=1.0)
+        self._thread.join(1.0)
+
+    def put(self, text: str) -> None:
+        """Queues a line that another thread prints, without waiting for the terminal.
+
+        A control loop must not wait for a slow terminal. The line is lost if too many lines
+        wait already.
+
+        Args:
+            text: The line.
+        """
+        with suppress(queue.Full):
+            self._lines.put_nowait(text)
+
+    def _print_lines(self) -> None:
+        """Prints the queued lines in the printer's thread, until the queue returns None.
+
+        Errors of the output, for example a closed pipe, do not end the session.
+        """
+        while (text := self._lines.get()) is not None:
+            with suppress(OSError):
+                self._print_line(text)
 
 
 def join_and_run(parts: SiteParts) -> int:
@@ -135,9 +182,7 @@ def join_and_run(parts: SiteParts) -> int:
     if running is None:
         return parts.interrupt.exit_code
 
-    outcome = running.run()
-    end = SiteEnd(parts, running.publisher, running.link_monitors, outcome)
-    return end.leave_session()
+    return running.run().leave_session()
 
 
 def _join_session(parts: SiteParts, give_up_ns: int) -> RunningSite | None:

@@ -22,8 +22,8 @@ from trilat_net.app.demo_session import create_file
 from trilat_net.errors import LogRefused, UsageError
 from trilat_net.files import (
     format_extra_install,
+    make_folder,
     make_results_folder,
-    make_subfolder,
     open_regular,
     refuse_existing,
     stage_output,
@@ -187,7 +187,7 @@ def test_every_written_text_states_its_line_ends() -> None:
         lambda path: write_whole(path, b"1"),
         lambda path: create_file(path),
         lambda path: extend_file(path),
-        lambda path: make_subfolder(path),
+        lambda path: make_folder(path, may_be_link=False),
         lambda path: write_output(path, "1", folder=False, force=True),
         lambda path: write_output(path, "1", folder=True, force=True),
         lambda path: LogFile(path, force=True),

@@ -272,11 +272,11 @@ def count_nouns(count: object, singular: str, plural: str = "") -> str:
     Args:
         count: The number, or its text, as in "1,000".
         singular: The noun, possibly with words before it, as in "late sample".
-        plural: The noun for other numbers. By default `pluralise(singular)`.
+        plural: The noun for other numbers. By default the regular plural of `singular`.
     """
     if str(count) == "1":
         return f"{count} {singular}"
-    return f"{count} {plural or pluralise(singular)}"
+    return f"{count} {plural or _pluralise(singular)}"
 
 
 def format_wall_time(seconds: float) -> str:
@@ -294,7 +294,7 @@ def format_wall_time(seconds: float) -> str:
     return f"{max(1, round(seconds))} s"
 
 
-def pluralise(singular: str) -> str:
+def _pluralise(singular: str) -> str:
     """Returns the plural of an English noun, as in "samples" for "sample" or "axes" for "axis".
 
     Args:

@@ -15,7 +15,7 @@ import pkgutil
 import re
 from collections.abc import Iterator
 from importlib import import_module
-from typing import Annotated, Any, NamedTuple, TypeVar
+from typing import Annotated, Any, NamedTuple, Self
 
 import msgspec
 from msgspec import Meta
@@ -31,34 +31,30 @@ class Frozen(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tr
     have no effect.
     """
 
+    @classmethod
+    def find_kinds(cls, package: str) -> Iterator[type[Self]]:
+        """Yields the subclasses that a scenario can select by name, as in `kind = "wall"`.
 
-K = TypeVar("K", bound=Frozen)
+        To add a kind, add a file to the package; there is no other list. Classes without a tag
+        (name) of their own serve only as base classes, and are left out. The classes are in the
+        order of their files, and of their positions in each file.
 
-
-def find_kinds(package: str, base: type[K]) -> Iterator[type[K]]:
-    """Yields the classes that a scenario can select by name, as in `kind = "wall"`.
-
-    To add a kind, add a file to the package; there is no other list. Classes without a tag
-    (name) of their own serve only as base classes, and are left out. The classes are in the
-    order of their files, and of their positions in each file.
-
-    Args:
-        package: Dotted name of the package whose files are searched.
-        base: Base class of the kinds, for example that of all control laws.
-    """
-    folders = import_module(package).__path__
-    for file in pkgutil.iter_modules(folders):
-        name = f"{package}.{file.name}"
-        for value in vars(import_module(name)).values():
-            is_subclass = isinstance(value, type) and issubclass(value, base)
-            # A class that this file imports is listed with the file that defines it.
-            if not is_subclass or value.__module__ != name:
-                continue
-            tag = value.__struct_config__.tag
-            # Without a tag of its own, a class is only a base of others. msgspec then uses
-            # the name of the class as its tag.
-            if tag is not None and tag != value.__name__:
-                yield value
+        Args:
+            package: Dotted name of the package whose files are searched.
+        """
+        folders = import_module(package).__path__
+        for file in pkgutil.iter_modules(folders):
+            name = f"{package}.{file.name}"
+            for value in vars(import_module(name)).values():
+                is_subclass = isinstance(value, type) and issubclass(value, cls)
+                # A class that this file imports is listed with the file that defines it.
+                if not is_subclass or value.__module__ != name:
+                    continue
+                tag = value.__struct_config__.tag
+                # Without a tag of its own, a class is only a base of others. msgspec then uses
+                # the name of the class as its tag.
+                if tag is not None and tag != value.__name__:
+                    yield value
 
 
 MAX_QUANTITY = 1e9

@@ -266,15 +266,22 @@ def read_foreign_permissions(path: Path) -> int:
     return 0 if os.name == "nt" else path.stat().st_mode & 0o077
 
 
-def make_folder(folder: Path) -> Path:
+def make_folder(folder: Path, *, may_be_link: bool = True) -> Path:
     """Creates a folder, with all parent folders that do not exist yet, and returns its path.
 
     A folder that exists is left as it is.
 
+    Args:
+        folder: Path of the folder.
+        may_be_link: False to reject a symbolic link, as for a folder inside an output folder.
+
     Raises:
-        UsageError: The folder cannot be created.
+        UsageError: The path is a symbolic link that is not allowed, or the folder cannot be
+            created.
         LogRefused: The disk is full.
     """
+    if not may_be_link:
+        refuse_link(folder)
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -304,19 +311,6 @@ def refuse_link(path: Path) -> None:
         problem = "is a symbolic link, and no output is written through a link"
         advice = "remove the link, or choose another name"
         raise UsageError(f"{path} {problem}; {advice}")
-
-
-def make_subfolder(folder: Path) -> Path:
-    """Creates a folder inside an output folder unless it exists, and returns its path.
-
-    Args:
-        folder: Path of the folder.
-
-    Raises:
-        UsageError: The path is a symbolic link, or the folder cannot be created.
-    """
-    refuse_link(folder)
-    return make_folder(folder)
 
 
 def make_results_folder(folder: Path | None, name: str, *, force: bool | None) -> Path:

@@ -24,7 +24,7 @@ from trilat_net.analysis.link_summary import (
 )
 from trilat_net.core.links import link_schedule as module
 from trilat_net.core.links.channel import LOST
-from trilat_net.core.links.link_schedule import first_ticks
+from trilat_net.core.links.link_schedule import LinkSchedule
 from trilat_net.core.step.site_step import Site
 from trilat_net.core.step.ticks import first_tick_at
 from trilat_net.errors import LogError
@@ -415,5 +415,5 @@ def test_lost_samples_equal_those_of_the_link():
 
 @given(st.lists(st.integers(0, 10**14), max_size=20), st.integers(1, 20_000))
 def test_first_ticks_follow_the_grid(due_ns, rate_hz):
-    ticks = first_ticks(np.array(due_ns, dtype=np.int64), rate_hz)
+    ticks = LinkSchedule.first_ticks(np.array(due_ns, dtype=np.int64), rate_hz)
     assert ticks.tolist() == [first_tick_at(due, rate_hz) for due in due_ns]

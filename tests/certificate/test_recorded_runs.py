@@ -29,7 +29,7 @@ def count_recordings(
 
         return simulate_and_count
 
-    for function in ("simulate_scenario", "simulate_columns"):
+    for function in ("SimulatedLog", "simulate_columns"):
         monkeypatch.setattr(judge, function, count(function))
     scenario = load_scenario(name, settings)
     run = run_fused(scenario)

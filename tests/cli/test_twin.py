@@ -12,7 +12,7 @@ from tests.cli.running import simulate_by_command, trilat
 from tests.execution.builders import make_log_without
 from trilat_net.app.cli.runs import certify_command
 from trilat_net.errors import NotRepeatable
-from trilat_net.execution.fused import explain_not_repeatable
+from trilat_net.execution.fused import FusedRun
 
 OWN_LAW = Path(__file__).parents[1] / "golden" / "own-law.mcap"
 
@@ -88,7 +88,7 @@ def test_unexecutable_logs_have_no_twin() -> None:
     external = SimpleNamespace(
         scenario=tn.load_scenario("free", {"sites.m1.plant": "external"})
     )
-    assert "the external arm of m1" in explain_not_repeatable(external)
+    assert "the external arm of m1" in FusedRun.explain_not_repeatable(external)
 
 
 @pytest.mark.parametrize("command", ["certify", "twin"])

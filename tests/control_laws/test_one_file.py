@@ -5,7 +5,6 @@ from pathlib import Path
 import pytest
 
 from tests.dropped_files import run_in_folder
-from trilat_net.laws.interface import format_class_name
 from trilat_net.scenario.laws import BUILT_IN
 
 LAW = '''
@@ -71,5 +70,5 @@ def test_an_added_file_is_a_law_everywhere(tmp_path: Path) -> None:
 def test_file_class_and_name_are_one(name: str) -> None:
     law = BUILT_IN[name]
     assert law.__module__ == f"trilat_net.laws.{name}"
-    assert law.__name__ == format_class_name(name)
+    assert law.__name__ == "".join(map(str.capitalize, name.split("_")))
     assert law.tune  # no law is left out of tuning

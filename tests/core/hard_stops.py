@@ -20,7 +20,6 @@ from trilat_net.analysis.arm_rows import build_arm_rows
 from trilat_net.core.step.site_setup import Law
 from trilat_net.core.step.site_step import Site
 from trilat_net.core.step.ticks import CoreChange, LifeOrder, TickInput, TickRecord
-from trilat_net.execution.resumption import read_output
 from trilat_net.log.log_reader import Log
 from trilat_net.scenario import Scenario, load_scenario
 from trilat_net.scenario.rest_bounds import AT_REST_RAD_S, find_rest_bounds
@@ -148,7 +147,7 @@ def draw_records(
     follows = np.isin(part.mode, ("return", "run"))
     rows = np.flatnonzero(follows[1:] & follows[:-1]) + 1
     at = int(rng.choice(rows))
-    before, last = (read_output(part.states[row], part.peers) for row in (at - 1, at))
+    before, last = (part.states[row].to_tick_record(part.peers) for row in (at - 1, at))
     if not synthetic:
         return before, last
     spec = scenario.sites[site]

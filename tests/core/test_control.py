@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 from tests.core import physical_arms as physics
 from tests.core.physical_arms import Array, angles, links, speeds
-from trilat_net.core.arms.two_link_arm import ArmLinks, regressor, theta_from_links
+from trilat_net.core.arms.two_link_arm import ArmLinks, regressor
 from trilat_net.core.step import control
 
 gains = physics.vectors(st.floats(0.1, 20.0))
@@ -33,7 +33,7 @@ def test_torque(
     """
     r = qd + Lambda * e
     Y = regressor(9.81, q, qd, -Lambda * e, -Lambda * ed)
-    tau = np.array(control.adaptive_torque(Y, theta_from_links(a), Kp, Kd, r, ed, NO_LIMIT))
+    tau = np.array(control.adaptive_torque(Y, a.theta(), Kp, Kd, r, ed, NO_LIMIT))
     wanted = (
         -physics.inertia(a, q) @ (Lambda * ed)
         - physics.coriolis(a, q, qd) @ (Lambda * e)
@@ -42,7 +42,7 @@ def test_torque(
         - Kd * ed
     )
     assert np.abs(tau - wanted).max() <= 1e-12 * (
-        1 + np.abs(wanted).max() + 1e4 * theta_from_links(a).sum()
+        1 + np.abs(wanted).max() + 1e4 * a.theta().sum()
     )
 
 

@@ -6,7 +6,7 @@ from hypothesis import assume, given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from trilat_net.core.links.dominance import is_irreducible, perron_vector
+from trilat_net.core.links.dominance import DominanceMatrix
 from trilat_net.scenario.validate import find_row_problem
 
 Array = NDArray[np.float64]
@@ -54,7 +54,7 @@ def strongly_connected(a: Array) -> bool:
 def test_beta_is_the_positive_left_null_vector(a: Array) -> None:
     """beta'Upsilon = 0 after Eq. (20), to 1e-12 of each entry, and every entry is positive."""
     assume(strongly_connected(a))
-    beta = perron_vector(a)
+    beta = DominanceMatrix(a).find_beta()
     assert (beta > 0).all()
     assert beta.sum() == pytest.approx(1.0, abs=1e-14)
     assert beta @ a == pytest.approx(beta, rel=1e-12, abs=0.0)
@@ -62,7 +62,7 @@ def test_beta_is_the_positive_left_null_vector(a: Array) -> None:
 
 @given(a=draw_matrix())
 def test_irreducible_matrices_have_strongly_connected_graphs(a: Array) -> None:
-    assert is_irreducible(a) == strongly_connected(a)
+    assert DominanceMatrix(a).is_irreducible == strongly_connected(a)
 
 
 @given(a=draw_matrix(zeros=False), closed=st.integers(2, 5))
@@ -71,9 +71,9 @@ def test_a_reducible_matrix_has_no_beta(a: Array, closed: int) -> None:
     assume(closed < len(a))
     a[:closed, closed:] = 0.0
     a[:closed] /= a[:closed].sum(1, keepdims=True)
-    assert not is_irreducible(a)
+    assert not DominanceMatrix(a).is_irreducible
     with pytest.raises(ValueError, match="reducible"):
-        perron_vector(a)
+        DominanceMatrix(a).find_beta()
 
 
 @given(a=draw_matrix(), off=st.floats(-0.5, 0.5), own=st.integers(0, 1))

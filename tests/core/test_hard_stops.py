@@ -14,7 +14,6 @@ from tests.core.hard_stops import (
     run_stop,
 )
 from trilat_net.analysis.arm_rows import build_arm_rows
-from trilat_net.execution.resumption import read_output
 from trilat_net.scenario import load_scenario
 from trilat_net.scenario.rest_bounds import find_rest_bounds
 
@@ -53,7 +52,7 @@ def test_no_stop_adds_energy_to_a_swinging_arm(rate_nm_s: float) -> None:
             if speed.max() < wanted:
                 continue
             at = int(np.argmax(speed >= wanted))
-            before, last = (read_output(part.states[row], part.peers) for row in (at - 1, at))
+            before, last = (part.states[row].to_tick_record(part.peers) for row in (at - 1, at))
             records = run_stop(log.scenario, site, before, last)
             stop = measure_stop(log.scenario, site, 8.0, f"{site} at {at}", last, records)
             assert stop.energy <= 1.05, stop

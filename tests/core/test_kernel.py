@@ -8,7 +8,7 @@ from scipy.integrate import solve_ivp
 from tests.core import physical_arms as physics
 from tests.core.physical_arms import Array, angles, speeds
 from trilat_net.core.arms.exogenous import TorqueKind, TorqueSource, torque_source_rows
-from trilat_net.core.arms.two_link_arm import ArmLinks, theta_from_links
+from trilat_net.core.arms.two_link_arm import ArmLinks
 from trilat_net.core.arms.two_link_stages import rk4_step
 
 ARM = ArmLinks(1.0, 1.1, 0.5, 0.09, 0.9, 0.8, 0.4, 0.05)
@@ -28,7 +28,7 @@ def advance_arm(
     qd = (qd0[0], qd0[1])
     who = torque_source_rows(actors)
     for k in range(periods):
-        q, qd = rk4_step(k * h_s, h_s, q, qd, u, theta_from_links(ARM), G, LENGTHS, *who)
+        q, qd = rk4_step(k * h_s, h_s, q, qd, u, ARM.theta(), G, LENGTHS, *who)
     return np.array(q), np.array(qd)
 
 

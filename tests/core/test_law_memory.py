@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from trilat_net.core.plug.user_law import read_memory, write_memory
+from trilat_net.core.plug.user_law import SiteLaw
 
 reals = st.floats(-1e6, 1e6)
 shapes = st.sampled_from([(2,), (3, 2), (1, 2, 2)])
@@ -43,17 +43,17 @@ def describe_value(value: Any) -> Any:
 
 @given(values)
 def test_memory_is_restored_in_its_own_form(kept: Any) -> None:
-    first = Holder(kept)
+    first = SiteLaw(Holder(kept), "s")
     again = Holder(kept)
-    memory = read_memory(first)
-    write_memory(again, memory)
+    restored = SiteLaw(again, "s")
+    restored.restore(first.memory)
     assert describe_value(again.kept) == describe_value(kept)
-    assert read_memory(again) == memory
+    assert restored.memory == first.memory
 
 
 @given(arrays(np.float64, shapes, elements=reals), reals)
 def test_arrays_of_memory_take_numbers_in_order(kept: Any, behind: float) -> None:
     law = Holder([np.zeros_like(kept), 0.0])
-    write_memory(law, [*kept.ravel().tolist(), behind])
+    SiteLaw(law, "s").restore([*kept.ravel().tolist(), behind])
     np.testing.assert_array_equal(law.kept[0], kept)
     assert law.kept[1] == behind

@@ -20,9 +20,6 @@ from trilat_net.core.step.site_arrays import (
     MAX_LINKS_BYTES,
     CalendarSizer,
     SiteArrays,
-    links_bytes,
-    needed_pages,
-    widen_calendars,
 )
 from trilat_net.core.step.site_step import Site
 from trilat_net.core.step.ticks import CoreChange, TickInput
@@ -62,14 +59,16 @@ def test_100_ms_links_take_below_a_mebibyte(kind: str) -> None:
             setup = scenario.setup(name)
             arrays = Site(setup)._arrays
             assert count_link_bytes(arrays) <= MIB * len(setup.links)
-            assert count_link_bytes(arrays) == links_bytes(setup, arrays.calendars.shape[1])
+            assert count_link_bytes(arrays) == SiteArrays.count_link_bytes(
+                setup, arrays.calendars.shape[1]
+            )
 
 
 # Calendars that widen give what the widest give.
 
 
 def make_wide_site(site: Site, pages: int) -> Site:
-    site._arrays = widen_calendars(site._arrays, 0, pages)
+    site._arrays = site._arrays.widen_calendars(0, pages)
     site._tick_arrays = (*site._arrays, *site._buffers)
     return site
 
@@ -198,7 +197,9 @@ def test_changes_beyond_the_limit_are_refused() -> None:
 def test_limited_links_count_what_they_refuse() -> None:
     """A site with less memory refuses stamps from further ahead; all others come into use."""
     setup = load_scenario("paper").setup("m1")
-    assert CalendarSizer(setup).most_pages == calendar_pages(1000) > needed_pages(setup)
+    assert (
+        CalendarSizer(setup).most_pages == calendar_pages(1000) > SiteArrays.count_pages(setup)
+    )
     free = make_site_with_delay(1000, 1000, 1_000_000)
     tight = make_site_with_delay(1000, 1000, 1_000_000)
     tight._sizer.most_pages = 1024
@@ -218,5 +219,6 @@ def test_the_most_pages_are_within_the_limit() -> None:
     """The number of pages is bounded for every limit below twenty seconds."""
     setup = parse_scenario(many_sites_text(12, 4000, 100.0)).setup("a0")
     pages = CalendarSizer(setup).most_pages
-    assert needed_pages(setup) < pages < calendar_pages(4000)
-    assert links_bytes(setup, pages) <= MAX_LINKS_BYTES < links_bytes(setup, 2 * pages)
+    assert SiteArrays.count_pages(setup) < pages < calendar_pages(4000)
+    assert SiteArrays.count_link_bytes(setup, pages) <= MAX_LINKS_BYTES
+    assert SiteArrays.count_link_bytes(setup, 2 * pages) > MAX_LINKS_BYTES

@@ -24,7 +24,6 @@ from trilat_net.core.life.live_hand import (
     HandReach,
     HandRules,
     HandStep,
-    empty_hand_vector,
     find_stopping_speed,
 )
 
@@ -68,7 +67,7 @@ def message_at(
 def test_holds_begin_without_force_and_grow() -> None:
     steps = advance_ticks(message_at(10, (1.2, 0.5)), 150)
     before, first, *rest = list_hands(steps)[9:]
-    assert before == HandInForce.read(empty_hand_vector(2))
+    assert before == HandInForce.read(HandInForce.list_empty(2))
     assert first.target == ARM
     assert first.grip == 0.0
     assert steps[10].changes == ((7, TAKEN),)
@@ -160,7 +159,7 @@ def test_an_overtaken_message_changes_nothing() -> None:
         message_at(10, (1.1, 0.5)) | message_at(50, (), n=50, grip=False) | late, 200
     )
     assert steps[30].refused == steps[70].refused == (OUT_OF_ORDER,)
-    assert steps[-1].vector == empty_hand_vector(2)
+    assert steps[-1].vector == HandInForce.list_empty(2)
 
 
 def test_a_silent_hand_resumes_its_goal() -> None:

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 
 import trilat_net
 from tests.execution.builders import run_fused
-from trilat_net.core.plug.law_channel import LawChannel, SentVector, join_received
+from trilat_net.core.plug.law_channel import LawChannel, SentVector
 from trilat_net.core.plug.user_law import LawVector
 from trilat_net.core.step.site_step import Site
 from trilat_net.core.step.ticks import Arrival, TickInput, TickRecord
@@ -183,12 +183,12 @@ def test_torques_have_the_documented_signs() -> None:
 def test_names_of_several_senders_are_joined() -> None:
     a = LawChannel((SentVector("E", "J", 1), SentVector("u", "", 2, True)), 2)
     b = LawChannel((SentVector("F", "N m", 2), SentVector("E", "J", 1)), 2)
-    vectors = join_received([a, b])
+    vectors = LawChannel.join_received([a, b])
     assert [vector.name for vector in vectors] == ["E", "u", "F"]
     assert a.find_columns(vectors) == [0, 1, 2, -1, -1]
     assert b.find_columns(vectors) == [2, -1, -1, 0, 1]
     with pytest.raises(ValueError, match="E with different lengths, 1 and 3 numbers"):
-        join_received([a, LawChannel((SentVector("E", "J", 3),), 2)])
+        LawChannel.join_received([a, LawChannel((SentVector("E", "J", 3),), 2)])
 
 
 REFUSED = {

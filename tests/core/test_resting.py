@@ -29,7 +29,6 @@ from trilat_net.core.step.site_setup import LEAST_STOP_S, RestGains
 from trilat_net.core.step.site_step import Site
 from trilat_net.core.step.ticks import CoreChange, LifeOrder, Mode, TickInput
 from trilat_net.core.step.vectors import Array
-from trilat_net.execution.resumption import read_output
 from trilat_net.execution.verification import verify_log
 from trilat_net.log.log_reader import Log
 from trilat_net.scenario import Scenario, load_scenario
@@ -241,7 +240,7 @@ def stop_at_instants(log: Log, count: int, ticks: int = 1700) -> Iterator[Stop]:
         part = log[names[n % len(names)]]
         site = Site(log.scenario.setup(part.name))
         site.restore_state(
-            *(read_output(part.states[row], part.peers) for row in (at - 2, at - 1))
+            *(part.states[row].to_tick_record(part.peers) for row in (at - 2, at - 1))
         )
         order = [CoreChange("stop", order=LifeOrder.STOP)]
         stops = [

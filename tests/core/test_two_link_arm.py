@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from tests.core import physical_arms as physics
 from tests.core.physical_arms import Array, angles, links, speeds
 from trilat_net.core.arms import two_link_arm
-from trilat_net.core.arms.two_link_arm import ArmLinks, theta_from_links
+from trilat_net.core.arms.two_link_arm import ArmLinks
 
 g_values = st.sampled_from([0.0, 1.62, 9.81])
 
@@ -38,7 +38,7 @@ def is_near(a: Array, b: Array, scale: float) -> bool:
 
 def measure_size(a: ArmLinks) -> float:
     """Returns an upper bound of the entries of theta."""
-    return float(np.abs(theta_from_links(a)).sum())
+    return float(np.abs(a.theta()).sum())
 
 
 def test_theta_of_the_two_readings() -> None:
@@ -46,14 +46,14 @@ def test_theta_of_the_two_readings() -> None:
     point = ArmLinks(1, 1, 1, 0, 1, 1, 1, 0)
     third = 1 / 12
     rods = ArmLinks(1, 1, 0.5, third, 1, 1, 0.5, third)
-    assert theta_from_links(point).tolist() == [3, 1, 1, 2, 1]
-    assert theta_from_links(rods) == pytest.approx([5 / 3, 1 / 2, 1 / 3, 3 / 2, 1 / 2])
+    assert point.theta().tolist() == [3, 1, 1, 2, 1]
+    assert rods.theta() == pytest.approx([5 / 3, 1 / 2, 1 / 3, 3 / 2, 1 / 2])
 
 
 @given(a=links)
 def test_theta_2_is_l1_times_theta_5(a: ArmLinks) -> None:
     """Eq. (24) has five parameters and four of them are independent; theta_5 is m2 lc2."""
-    theta = theta_from_links(a)
+    theta = a.theta()
     assert theta[1] == pytest.approx(a.l1_m * theta[4], rel=1e-14)
     assert theta[4] == a.m2_kg * a.lc2_m
 
@@ -61,7 +61,7 @@ def test_theta_2_is_l1_times_theta_5(a: ArmLinks) -> None:
 @given(a=links, q=angles)
 def test_the_inertia_is_symmetric_and_positive_definite(a: ArmLinks, q: Array) -> None:
     """Property 1."""
-    M = M_of(theta_from_links(a), q)
+    M = M_of(a.theta(), q)
     assert M[0, 1] == M[1, 0]
     assert M[0, 0] > 0
     assert np.linalg.det(M) > 0
@@ -69,7 +69,7 @@ def test_the_inertia_is_symmetric_and_positive_definite(a: ArmLinks, q: Array) -
 
 @given(a=links, q=angles, qd=speeds)
 def test_the_inertia_gives_the_masses_energy(a: ArmLinks, q: Array, qd: Array) -> None:
-    M = M_of(theta_from_links(a), q)
+    M = M_of(a.theta(), q)
     energy = physics.kinetic(a, q, qd)
     assert 0.5 * qd @ M @ qd == pytest.approx(energy, rel=1e-11, abs=1e-12 * measure_size(a))
     assert is_near(M, physics.inertia(a, q), measure_size(a))
@@ -77,25 +77,21 @@ def test_the_inertia_gives_the_masses_energy(a: ArmLinks, q: Array, qd: Array) -
 
 @given(a=links, q=angles, qd=speeds)
 def test_the_coriolis_matrix_uses_christoffel_symbols(a: ArmLinks, q: Array, qd: Array) -> None:
-    assert is_near(
-        C_of(theta_from_links(a), q, qd), physics.coriolis(a, q, qd), 20 * measure_size(a)
-    )
+    assert is_near(C_of(a.theta(), q, qd), physics.coriolis(a, q, qd), 20 * measure_size(a))
 
 
 @given(a=links, g=g_values, q=angles)
 def test_gravity_is_the_gradient_of_the_potential_energy(
     a: ArmLinks, g: float, q: Array
 ) -> None:
-    assert is_near(
-        G_of(theta_from_links(a), g, q), physics.gravity(a, g, q), g * measure_size(a)
-    )
+    assert is_near(G_of(a.theta(), g, q), physics.gravity(a, g, q), g * measure_size(a))
 
 
 @given(a=links, q=angles, qd=speeds, x=speeds)
 def test_mdot_minus_two_c_is_skew(a: ArmLinks, q: Array, qd: Array, x: Array) -> None:
     """Eq. (4), with Mdot as the exact derivative of the masses' inertia along qd."""
     Mdot = physics.inertia_rates(a, q) @ qd
-    S = Mdot - 2.0 * C_of(theta_from_links(a), q, qd)
+    S = Mdot - 2.0 * C_of(a.theta(), q, qd)
     assert abs(x @ S @ x) <= 1e-13 * (1 + measure_size(a)) * (1 + np.abs(qd).sum()) * (
         1 + x @ x
     )
@@ -106,7 +102,7 @@ def test_the_regressor_separates_the_two_velocities(
     a: ArmLinks, g: float, q: Array, qd: Array, v: Array, acceleration: Array
 ) -> None:
     """Eq. (12): Y(q, qd, v, a) theta = M a + C(q, qd) v + G."""
-    theta = theta_from_links(a)
+    theta = a.theta()
     wanted = (
         physics.inertia(a, q) @ acceleration
         + physics.coriolis(a, q, qd) @ v
@@ -133,7 +129,7 @@ def test_forward_dynamics_solve_the_equation_of_motion(
     a: ArmLinks, g: float, q: Array, qd: Array, torque: Array
 ) -> None:
     """Eq. (8): M qdd + C qd + G = tau - tau_x."""
-    qdd = np.array(two_link_arm.forward_dynamics(theta_from_links(a), g, q, qd, torque))
+    qdd = np.array(two_link_arm.forward_dynamics(a.theta(), g, q, qd, torque))
     M = physics.inertia(a, q)
     rest = M @ qdd + physics.coriolis(a, q, qd) @ qd + physics.gravity(a, g, q) - torque
     terms = np.abs(M).max() * np.abs(qdd).max() + 400 * measure_size(a) + 200

@@ -11,7 +11,7 @@ from tests.log.builders import Record, edit_log_bytes, open_bytes
 from tests.scenario.builders import six_joint_text
 from trilat_net.errors import LogError
 from trilat_net.execution.verification import verify_log
-from trilat_net.execution.virtual import simulate_scenario, write_virtual_log
+from trilat_net.execution.virtual import SimulatedLog, write_virtual_log
 from trilat_net.log.log_reader import Log
 from trilat_net.scenario.scenario_reader import load_scenario, parse_scenario
 
@@ -99,7 +99,7 @@ def test_a_planar_arm_equals_its_chain() -> None:
             plain = load_scenario("paper", settings)
             if law["law"] == "adaptive":
                 settings["control"] = {**law, "theta_hat0": plain.arms["s"].theta.tolist()}
-            logs.append(simulate_scenario(load_scenario("paper", settings)))
+            logs.append(SimulatedLog(load_scenario("paper", settings)))
         for site in logs[0].sites:
             for name in ("q", "qd", "tau", "q_des"):
                 planar, chain = (getattr(log[site], name) for log in logs)

@@ -158,7 +158,7 @@ def test_totals_are_those_of_the_log(name: str, changes: dict[str, Any]) -> None
     scenario = load_scenario(load_scenario(name), changes)
     fused = run_fused(scenario, 0.5 * scenario.duration_s)
     fused.advance_to(scenario.duration_s)
-    log = virtual.simulate_scenario(scenario)
+    log = virtual.SimulatedLog(scenario)
     whole = {
         quantity.key: LogMetrics.of_log(log).run_value(quantity).value
         for quantity in Quantity.list_all()

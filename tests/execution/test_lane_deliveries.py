@@ -10,8 +10,8 @@ from tests.execution.varying_links import LINKS
 from trilat_net.core import first_tick_at, tick_ns
 from trilat_net.core.lanes.lane_deliveries import (
     BLOCK_TICKS,
-    copy_link_states,
-    find_draw_addresses,
+    DrawAddresses,
+    LinkStates,
     use_samples_of_rates,
 )
 from trilat_net.execution.fused import FusedRun
@@ -48,7 +48,7 @@ def compute_used(
     run: FusedRun, ends_s: list[float], rates_hz: list[int], draws: random.Random
 ) -> list[NDArray[Any]]:
     """The same, computed in blocks of random durations."""
-    states = copy_link_states([run.memory.tables])
+    states = LinkStates.copy_from([run.memory.tables])
     rates = np.array(rates_hz)
     next_samples = np.zeros((len(SITES), len(SITES) - 1), np.int64)
     room = np.zeros((len(SITES), len(SITES) - 1, 1, BLOCK_TICKS), np.int64)
@@ -73,7 +73,7 @@ def compute_used(
                 next_samples,
                 np.array([-1]),
                 states,
-                find_draw_addresses(),
+                DrawAddresses.find(),
                 room,
             )
             for i in range(len(SITES)):

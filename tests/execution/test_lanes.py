@@ -14,7 +14,7 @@ from tests.execution.varying_links import LINKS
 from trilat_net.core.lanes.lane_rows import LANES
 from trilat_net.core.lanes.lane_run import LaneRun, read_assembly
 from trilat_net.core.lanes.lane_structure import find_obstacle
-from trilat_net.core.lanes.run_groups import LEAST_RUNS, group_runs
+from trilat_net.core.lanes.run_groups import LEAST_RUNS, RunGroup
 from trilat_net.core.step.row_fields import FIELDS
 from trilat_net.errors import LawFailed
 from trilat_net.execution import virtual
@@ -239,7 +239,7 @@ def test_only_the_run_whose_law_fails_ends() -> None:
         for n, fail_at in enumerate([-1, -1, 150, -1, 42])
     ]
     runs = [FusedRun(cell) for cell in cells]
-    (group,) = group_runs(runs)
+    (group,) = RunGroup.divide(runs)
     group.advance_to(0.03)
     for run, cell in zip(runs, cells, strict=True):
         check_equal(run, run_alone(cell, 0.03))
@@ -272,7 +272,7 @@ def test_groups_share_structure_and_small_groups_split() -> None:
     unfit = [FusedRun(load_scenario("free", {"duration_s": 0.1, **plain}))]
     sizes = []
     members = []
-    for group in group_runs([*free, *longer, *unfit]):
+    for group in RunGroup.divide([*free, *longer, *unfit]):
         sizes.append(len(group.members))
         members += group.members
     assert sorted(members) == list(range(LANES + LEAST_RUNS + 1))

@@ -10,7 +10,7 @@ from trilat_net.analysis.certificate.energy_balance import EnergyBalance, SiteEn
 from trilat_net.analysis.torque_sources import SourceRows, TorqueSplit
 from trilat_net.errors import ScenarioError
 from trilat_net.execution.verification import verify_log
-from trilat_net.execution.virtual import simulate_scenario
+from trilat_net.execution.virtual import SimulatedLog
 from trilat_net.execution.virtual_comparison import compare_with_virtual
 from trilat_net.execution.what_if import rerun
 from trilat_net.log.log_reader import Log
@@ -24,7 +24,7 @@ def held_log(request: pytest.FixtureRequest) -> Log:
     """Returns a run in which a person held m1 in each way."""
     live = [{"kind": "live", "mode": request.param}]
     scenario = load_scenario("paper", {"duration_s": SECONDS, "sites.m1.hands": live})
-    return simulate_scenario(scenario, hands={"m1": CirclingHand(scenario, "m1")})
+    return SimulatedLog(scenario, hands={"m1": CirclingHand(scenario, "m1")})
 
 
 def test_logs_of_people_are_verified_and_repeated(held_log: Log) -> None:

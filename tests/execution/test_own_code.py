@@ -14,7 +14,7 @@ from trilat_net.core.life.own_hand import HandView
 from trilat_net.core.step.site_step import Site
 from trilat_net.errors import CodeWithheld, PlantFailed, ScenarioError
 from trilat_net.execution.fused import FusedRun
-from trilat_net.execution.virtual import SimulatedLog, record_virtual, simulate_scenario
+from trilat_net.execution.virtual import SimulatedLog, record_virtual
 from trilat_net.log.log_reader import Log
 from trilat_net.own_code.imported_code import allowed_code
 from trilat_net.scenario import Scenario, load_scenario
@@ -54,7 +54,7 @@ def without_code(log: SimulatedLog) -> Log:
 @pytest.mark.parametrize("name", ["paper", "free"])
 def test_compiled_runs_pause_for_a_hand(name: str, kind: str, keys: dict[str, Any]) -> None:
     scenario = load_scenario(name, at_m2(kind, **keys))
-    log = simulate_scenario(scenario)
+    log = SimulatedLog(scenario)
     run = FusedRun(scenario, keep=2000)
     run.advance_to(scenario.duration_s)
     for (_, rows), site in zip(run.pop_records(), scenario.names, strict=True):
@@ -86,7 +86,7 @@ def test_a_hand_sees_its_peers_after_the_delay() -> None:
             seen.append(player.hand.build_view(k, site.arrays, scenario.layout("m2")))
         return player.track(site, k)
 
-    log = simulate_scenario(scenario, hands={"m2": take})
+    log = SimulatedLog(scenario, hands={"m2": take})
     for view in seen[15:]:
         for peer, name in zip(view.peers, scenario.peers("m2"), strict=True):
             assert peer.tick == log["m2"].states[view.k - 1].used[name] <= view.k - 1 - 200
@@ -268,7 +268,7 @@ def test_compiled_runs_pause_for_a_plant(rate_hz: int) -> None:
     scenario = load_scenario(
         "paper", {**with_plant(), "duration_s": 1.0, "sites.s.rate_hz": rate_hz}
     )
-    log = simulate_scenario(scenario)
+    log = SimulatedLog(scenario)
     run = FusedRun(scenario, keep=2000, plants=make_plant_players(scenario))
     for until_s in (0.3, 0.3015, 1.0):
         run.advance_to(until_s)

@@ -10,7 +10,7 @@ from tests.execution.deliveries import TICKS
 from tests.log.builders import make_log_bytes, open_bytes
 from trilat_net.core.step.site_step import Site
 from trilat_net.core.step.ticks import TickInput
-from trilat_net.execution.resumption import RecordedInputs, read_output
+from trilat_net.execution.resumption import RecordedInputs
 from trilat_net.execution.verification import verify_log
 from trilat_net.execution.virtual_comparison import compare_with_virtual
 from trilat_net.execution.what_if import rerun
@@ -80,7 +80,7 @@ def test_any_record_resumes_the_whole_run(law: str) -> None:
                 record = site.step(TickInput(state.tick, arrivals))
                 assert record._replace(
                     x=[], xd=[], wrench=[], hand=[], bodies=[]
-                ) == read_output(state, part.peers)
+                ) == state.to_tick_record(part.peers)
 
 
 def test_a_changed_gain_changes_only_its_effect() -> None:

@@ -25,7 +25,7 @@ PAPER = make_log_bytes("paper", {"duration_s": 0.4, "link.delay_ms": 20.0})
 def verify_singly(log: Log, **options: Any) -> verification.VerifyResult:
     """Verifies a log by `Site.step` alone."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(verification, "make_sample_table", lambda _: None)
+        patch.setattr(verification.SampleTable, "of_log", lambda _: None)
         return verification.verify_log(log, **options)
 
 

@@ -14,7 +14,7 @@ from trilat_net.execution.twins import (
     Push,
     Twins,
 )
-from trilat_net.execution.virtual import simulate_scenario
+from trilat_net.execution.virtual import SimulatedLog
 from trilat_net.scenario import Scenario, load_scenario
 
 GOLDEN = Path(__file__).parents[1] / "golden"
@@ -110,7 +110,7 @@ def test_twins_of_hand_log_equal_in_lanes(
         "paper",
         {"duration_s": 1.2, "on_stale": glide, "sites.m1.hands": live, **links, **rates},
     )
-    log = simulate_scenario(scenario, hands={"m1": CirclingHand(scenario, "m1")})
+    log = SimulatedLog(scenario, hands={"m1": CirclingHand(scenario, "m1")})
     assert log["m1"].hand[:, 0].any()
     assert {"hold", "return"} <= set(log["s"].mode.tolist())
     pushes = [push for push in push_in_many_ways(scenario, "m1") if push.at_s < 1.0]

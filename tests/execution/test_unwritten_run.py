@@ -8,7 +8,7 @@ import pytest
 
 from trilat_net.analysis.certificate.stability_certificate import Certificate
 from trilat_net.errors import LogError
-from trilat_net.execution import SimulatedLog, simulate_columns, simulate_scenario
+from trilat_net.execution import SimulatedLog, simulate_columns
 from trilat_net.log import UnwrittenLog
 from trilat_net.scenario import load_scenario
 
@@ -32,7 +32,7 @@ RUNS: list[tuple[str, dict[str, Any]]] = [
 @pytest.mark.parametrize(("name", "settings"), RUNS)
 def test_columns_equal_those_of_a_written_log(name: str, settings: dict[str, Any]) -> None:
     scenario = load_scenario(name, {"duration_s": 1.0, **settings})
-    written = simulate_scenario(scenario)
+    written = SimulatedLog(scenario)
     unwritten = simulate_columns(scenario)
     assert isinstance(unwritten, UnwrittenLog)
     for site in written.sites:
@@ -47,7 +47,7 @@ def test_columns_equal_those_of_a_written_log(name: str, settings: dict[str, Any
 @pytest.mark.parametrize(("name", "settings"), RUNS)
 def test_its_certificate_is_that_of_a_written_log(name: str, settings: dict[str, Any]) -> None:
     scenario = load_scenario(name, {"duration_s": 1.0, **settings})
-    written = Certificate.of_log(simulate_scenario(scenario)).to_dict()
+    written = Certificate.of_log(SimulatedLog(scenario)).to_dict()
     unwritten = Certificate.of_log(simulate_columns(scenario)).to_dict()
     assert json.dumps(unwritten) == json.dumps(written)
 

@@ -19,7 +19,6 @@ from trilat_net.execution import virtual
 from trilat_net.execution.virtual_comparison import (
     compare_with_virtual,
     find_absent_samples,
-    simulate_without_operators,
 )
 from trilat_net.execution.virtual_network import PromptNetwork
 from trilat_net.log.log_reader import Log
@@ -249,7 +248,7 @@ def test_foreign_samples_are_never_late(entry: list[int], gap: range) -> None:
 
 def test_twins_without_hands_are_free() -> None:
     log = make_log("paper", {"duration_s": 1.2})
-    twin = simulate_without_operators(log)
+    twin = virtual.SimulatedLog.without_operators(log)
     assert (twin["m1"].tau_x == 0.0).all()
     assert (log["m1"].tau_x[1100:] < 0.0).all()
     assert twin["m1"].q[:1000].tolist() == log["m1"].q[:1000].tolist()

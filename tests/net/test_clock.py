@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tests.net.manual_clock import ManualClock
-from trilat_net.net.clock import Clock, SkewedClock, SystemClock, make_system_clock
+from trilat_net.net.clock import Clock, SkewedClock, SystemClock
 
 CLOCKS = {
     "system": SystemClock,
@@ -124,6 +124,6 @@ def test_skewed_clocks_state_their_skew() -> None:
 
 
 def test_machine_clocks_are_skewed_only_on_request() -> None:
-    assert type(make_system_clock()) is SystemClock
-    clock = make_system_clock(1.5, -20.5)
+    assert type(SystemClock.with_error(0.0, 0.0)) is SystemClock
+    clock = SystemClock.with_error(1.5, -20.5)
     assert "skewed by 1500000000 ns and -20500 ns/s since" in clock.identity()

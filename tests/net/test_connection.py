@@ -1,8 +1,7 @@
-"""Endpoints by default, from the command line and from a file together; the router process."""
+"""Endpoints by default, and from the command line and a file together."""
 
 import re
 import socket
-from collections.abc import Callable
 from contextlib import ExitStack, closing
 from itertools import chain
 
@@ -12,20 +11,13 @@ from hypothesis import strategies as st
 
 from tests.net.manual_clock import ManualClock
 from trilat_net.errors import SessionError, UsageError
-from trilat_net.net.bus import Bus
 from trilat_net.net.connection import (
-    ROUTER_POLL_NS,
     Connection,
-    default_endpoint,
-    default_endpoints,
+    DefaultEndpoints,
     find_free_endpoints,
-    reserve_session_endpoints,
-    run_router,
 )
 from trilat_net.net.zenoh_bus import ZenohBus
-from trilat_net.net.zenoh_config import ZenohFile, check_zenoh_file
-
-from .local_bus import LocalNetwork
+from trilat_net.net.zenoh_config import ZenohFile
 
 HERE = ["tcp/127.0.0.1:1"]
 THERE = ["tcp/127.0.0.1:2"]
@@ -35,7 +27,7 @@ C = "tcp/c:1"
 
 
 def check_file(**stated: object) -> ZenohFile:
-    return check_zenoh_file("mine.json5", stated, lambda _: "")
+    return ZenohFile.check("mine.json5", stated, lambda _: "")
 
 
 def make_member_connection(
@@ -185,20 +177,21 @@ def find_port(endpoint: str) -> int:
 
 @given(NAMES, st.integers(0, 1000))
 def test_default_ports_are_below_the_ephemeral_ones(session: str, index: int) -> None:
-    assert 1024 <= find_port(default_endpoint(session, index)) < 32_768
+    assert 1024 <= find_port(DefaultEndpoints(session).of_site(index)) < 32_768
 
 
 @given(NAMES, st.lists(NAMES, min_size=2, max_size=64, unique=True))
 def test_sites_have_endpoints_of_their_own(session: str, sites: list[str]) -> None:
-    places = default_endpoints(session, sites)
+    default_endpoints = DefaultEndpoints(session)
+    places = default_endpoints.by_site(sites)
     assert list(places) == sites
     assert len(set(places.values())) == len(sites)
-    assert places[sites[0]] == default_endpoint(session, 0)
+    assert places[sites[0]] == default_endpoints.of_site(0)
 
 
 def test_endpoints_are_a_published_function() -> None:
-    assert default_endpoint("paper", 0) == "tcp/127.0.0.1:24448"
-    assert default_endpoint("paper", 2) == "tcp/127.0.0.1:24450"
+    assert DefaultEndpoints("paper").of_site(0) == "tcp/127.0.0.1:24448"
+    assert DefaultEndpoints("paper").of_site(2) == "tcp/127.0.0.1:24450"
 
 
 def test_free_endpoints_can_be_used_together() -> None:
@@ -211,117 +204,24 @@ def test_free_endpoints_can_be_used_together() -> None:
 
 def test_sessions_keep_free_ports() -> None:
     """So that `trilat set` and `trilat ping` find the session without its ports."""
-    sites = ("a", "b", "c")
-    places = list(default_endpoints("endpoints-test", sites).values())
-    with reserve_session_endpoints("endpoints-test", sites) as reserved:
+    default_endpoints = DefaultEndpoints("endpoints-test")
+    places = list(default_endpoints.by_site(("a", "b", "c")).values())
+    with default_endpoints.reserve(3) as reserved:
         assert reserved == places
     with socket.socket() as taken:
         taken.bind(("127.0.0.1", find_port(places[1])))
         taken.listen()
-        with reserve_session_endpoints("endpoints-test", sites) as others:
+        with default_endpoints.reserve(3) as others:
             assert len(set(others)) == 3
             assert not set(others) & set(places)
 
 
 def test_namesake_sessions_get_their_own_ports() -> None:
     """Each keeps its choice, and its sites can listen there all the same."""
-    sites = ("a", "b", "c")
+    default_endpoints = DefaultEndpoints("endpoints-test")
     with ExitStack() as stack:
-        chosen = [
-            stack.enter_context(reserve_session_endpoints("endpoints-test", sites))
-            for _ in range(3)
-        ]
+        chosen = [stack.enter_context(default_endpoints.reserve(3)) for _ in range(3)]
         places = list(chain.from_iterable(chosen))
         assert len(set(places)) == 9
         for endpoint in places:
             stack.enter_context(closing(ZenohBus([endpoint])))
-
-
-class Played(ManualClock):
-    """A clock on which events happen, each after one more sleep; then the router is stopped."""
-
-    def __init__(self, *events: Callable[[], object], rest: int = 0) -> None:
-        super().__init__()
-        self._events = [*events, *([lambda: None] * rest)]
-        self.over = False
-
-    def sleep_until(self, deadline_ns: int) -> None:
-        super().sleep_until(deadline_ns)
-        if self._events:
-            self._events.pop(0)()
-        else:
-            self.over = True
-
-    def stopped(self) -> bool:
-        return self.over
-
-
-def run_router_until_idle(
-    clock: Played, network: LocalNetwork, until_idle_s: float | None = None
-) -> list[str]:
-    said: list[str] = []
-    run_router(network.join(), clock, clock.stopped, said.append, until_idle_s)
-    return said
-
-
-def announce_member(network: LocalNetwork, key: str) -> Bus:
-    bus = network.join()
-    bus.announce(key)
-    return bus
-
-
-def test_routers_report_members_in_every_session() -> None:
-    network = LocalNetwork()
-    other_token = announce_member(network, "trilat/one/m1/alive/1")
-    announce_member(network, "other/one/m1/alive/1")
-    clock = Played(lambda: announce_member(network, "trilat/two/s/alive/2"), other_token.close)
-    assert run_router_until_idle(clock, network) == [
-        "session one: m1 is here",
-        "session two: s is here",
-        "session one: m1 has left",
-    ]
-
-
-def test_two_starts_of_a_member_count_twice() -> None:
-    """A token may be heard twice, as after a link that healed; it is reported once."""
-    network = LocalNetwork()
-    first = announce_member(network, "trilat/t/m1/alive/1")
-    clock = Played(
-        lambda: first.announce("trilat/t/m1/alive/1"),
-        lambda: announce_member(network, "trilat/t/m1/alive/2"),
-        first.close,
-    )
-    assert run_router_until_idle(clock, network) == [
-        "session t: m1 is here",
-        "session t: m1 is here",
-        "session t: m1 has left",
-    ]
-
-
-def test_a_router_stays_until_all_members_have_left() -> None:
-    network = LocalNetwork()
-    members: list[Bus] = []
-
-    def comes() -> None:
-        members.append(announce_member(network, f"trilat/t/m1/alive/{len(members)}"))
-
-    def goes() -> None:
-        members[-1].close()
-
-    idle_ns = 4 * ROUTER_POLL_NS
-    nothing = [lambda: None] * 10
-    pause = [lambda: None] * 2
-    clock = Played(*nothing, comes, *nothing, goes, *pause, comes, *nothing, goes, rest=100)
-    said = run_router_until_idle(clock, network, idle_ns * 1e-9)
-    assert said[-1] == "no member for 0.2 s"
-    assert len(said) == 5
-    assert not clock.over
-    assert clock.monotonic_ns() == (10 + 1 + 10 + 1 + 2 + 1 + 10 + 1 + 4) * ROUTER_POLL_NS
-
-
-def test_without_a_time_it_stays_for_ever() -> None:
-    network = LocalNetwork()
-    other_token = announce_member(network, "trilat/t/m1/alive/1")
-    clock = Played(other_token.close, rest=1000)
-    run_router_until_idle(clock, network)
-    assert clock.over

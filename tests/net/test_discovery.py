@@ -11,13 +11,14 @@ from sites.change_server import ChangeServer
 from tests.net.manual_clock import ManualClock
 from trilat_net.app.running_session import RunningSession
 from trilat_net.errors import SessionError
-from trilat_net.net import discovery, topics
+from trilat_net.net import session_members, topics
 from trilat_net.net.clock import SystemClock
-from trilat_net.net.connection import Connection, default_endpoint, find_free_endpoints
-from trilat_net.net.discovery import SessionMembers, connect_to_session
+from trilat_net.net.connection import Connection, DefaultEndpoints, find_free_endpoints
+from trilat_net.net.discovery import connect_to_session
 from trilat_net.net.membership import EventPublisher, liveliness_token
 from trilat_net.net.messages import VERSION, Info
 from trilat_net.net.requests import ChangeReply, ChangeRequest
+from trilat_net.net.session_members import SessionMembers
 from trilat_net.net.wire import encode
 from trilat_net.net.zenoh_bus import ZenohBus
 from trilat_net.scenario import load_scenario, parse_scenario
@@ -64,7 +65,7 @@ class Answering:
 
 @pytest.fixture(autouse=True)
 def impatient(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(discovery, "REPLY_TIMEOUT_S", 0.8)
+    monkeypatch.setattr(session_members, "REPLY_TIMEOUT_S", 0.8)
 
 
 @pytest.fixture
@@ -136,7 +137,7 @@ def test_answers_of_other_versions_name_their_member() -> None:
 
 def test_waiting_recorders_announce_themselves_first() -> None:
     session = f"discovery-{CLOCK.monotonic_ns()}"
-    first = ZenohBus([default_endpoint(session, 0)])
+    first = ZenohBus([DefaultEndpoints(session).of_site(0)])
     presence = first.presence(topics.presence_key(session, "*"))
     scenario = load_scenario("two_sites")
     info = answer_info("m", 1, scenario=scenario.text, scenario_sha256=scenario.sha256)

@@ -26,10 +26,8 @@ from trilat_net.net.ros2.ros2_graph import (
     Refusals,
     Ros2Graph,
     Ros2Member,
-    describe_mismatch,
     find_type_hash,
     make_gid,
-    topic_key,
 )
 from trilat_net.net.ros2.ros2_names import check_ros_name
 from trilat_net.net.zenoh_bus import RouterSilent
@@ -39,17 +37,18 @@ STRING = "std_msgs/msg/String"
 LOG = "rcl_interfaces/msg/Log"
 STRING_HASH = "RIHS01_df668c740482bbd48fb39d76a70dfd4bd59db1288021743503259e948f6b1a18"
 ADD_HASH = "RIHS01_e118de6bf5eeb66a2491b5bda11202e7b68f198d6f67922cf30364858239c81a"
+NODE = Ros2Member(0, "aac3178e146ba6f1fc6e6a4085e77f21", "", "node")
 LISTENER = Ros2Member(2, "aac3178e146ba6f1fc6e6a4085e77f21", "", "listener")
 
 
 def test_keys_follow_the_design_of_rmw_zenoh() -> None:
-    assert topic_key(0, "chatter", STRING, find_type_hash(STRING, "jazzy")) == (
+    assert NODE.topic_key("chatter", STRING, find_type_hash(STRING, "jazzy")) == (
         f"0/chatter/std_msgs::msg::dds_::String_/{STRING_HASH}"
     )
-    assert topic_key(2, "add_two_ints", "example_interfaces/srv/AddTwoInts", ADD_HASH) == (
-        f"2/add_two_ints/example_interfaces::srv::dds_::AddTwoInts_/{ADD_HASH}"
-    )
-    assert topic_key(0, "a/b", STRING, find_type_hash(STRING, "humble")).endswith(
+    assert LISTENER.topic_key(
+        "add_two_ints", "example_interfaces/srv/AddTwoInts", ADD_HASH
+    ) == (f"2/add_two_ints/example_interfaces::srv::dds_::AddTwoInts_/{ADD_HASH}")
+    assert NODE.topic_key("a/b", STRING, find_type_hash(STRING, "humble")).endswith(
         "/TypeHashNotSupported"
     )
 
@@ -205,14 +204,14 @@ def test_mismatched_publishers_are_named(
     sent = talker.endpoint_token(
         1, EndpointKind.PUBLISHER, "a/b", kind, type_hash, QualityOfService()
     )
-    assert describe_mismatch(sent, 0, STRING) == misfit
+    assert NODE.describe_mismatch(sent, STRING) == misfit
 
 
 @given(
     st.lists(st.text(max_size=9).filter(lambda part: "/" not in part), min_size=10, max_size=15)
 )
 def test_foreign_tokens_have_misfits_and_raise_nothing(parts: list[str]) -> None:
-    assert describe_mismatch("/".join(parts), 0, STRING)
+    assert NODE.describe_mismatch("/".join(parts), STRING)
 
 
 class Wire:
@@ -266,14 +265,14 @@ SENT = Attachment(1, 5, b"s" * 16)
 def test_messages_of_other_types_are_refused(wire: Wire) -> None:
     messages: list[tuple[bytes, Attachment]] = []
     wire.graph.subscribe("a", STRING, lambda data, sent: messages.append((data, sent)))
-    right = topic_key(0, "a", STRING, STRING_HASH)
+    right = NODE.topic_key("a", STRING, STRING_HASH)
     for attachment in (None, b"", b"x" * 33):
         wire.say(right, b"bare", attachment)
     for kind, type_hash in ((LOG, STRING_HASH), (STRING, "RIHS01_0")):
         wire.stranger.put(
-            topic_key(0, "a", kind, type_hash), b"other", attachment=SENT.encode()
+            NODE.topic_key("a", kind, type_hash), b"other", attachment=SENT.encode()
         )
-    wire.say(topic_key(0, "a", STRING, "TypeHashNotSupported"), b"humble", SENT.encode())
+    wire.say(NODE.topic_key("a", STRING, "TypeHashNotSupported"), b"humble", SENT.encode())
     wire.say(right, b"jazzy", SENT.encode())
     until(lambda: len(messages) == 2)
     assert messages == [(b"humble", SENT), (b"jazzy", SENT)]
@@ -289,7 +288,7 @@ def test_raising_messages_are_refused_without_effect(wire: Wire) -> None:
 
     wire.graph.subscribe("a", STRING, take)
     for data in (b"1", b"2"):
-        wire.say(topic_key(0, "a", STRING, STRING_HASH), data, SENT.encode())
+        wire.say(NODE.topic_key("a", STRING, STRING_HASH), data, SENT.encode())
     until(lambda: len(payloads) == 2)
     until(lambda: wire.graph.refusals.counts == {"a is none": 2})
     assert wire.said == ["refused: a is none"]
@@ -313,7 +312,7 @@ def test_mismatched_publishers_are_named_at_once(wire: Wire) -> None:
 
 def test_requests_without_attachment_get_no_answer(wire: Wire) -> None:
     wire.graph.serve("end", TRIGGER, lambda _: b"done")
-    key = topic_key(0, "end", TRIGGER, find_type_hash(TRIGGER, "jazzy"))
+    key = NODE.topic_key("end", TRIGGER, find_type_hash(TRIGGER, "jazzy"))
 
     def ask(**how: Any) -> list[Any]:
         return [reply.ok for reply in wire.stranger.get(key, timeout=5.0, payload=b"", **how)]

@@ -17,7 +17,7 @@ from trilat_net.core.step.site_setup import Layout
 from trilat_net.core.step.ticks import Arrival, Mode, TickRecord
 from trilat_net.errors import WireError
 from trilat_net.net.bus import BoundedRing
-from trilat_net.net.membership import read_records
+from trilat_net.net.membership import read_messages
 from trilat_net.net.messages import (
     MOST_PEERS,
     READABLE,
@@ -490,4 +490,4 @@ def test_waiting_records_are_read_despite_strangers() -> None:
     bad = b"\xc1"
     for sent in (first + two, b"no record", first + bad + two, b"", two):
         ring.put(("t/m1/state", sent))
-    assert [record.tick for record in read_records(ring)] == [1, 2, 1, 2]
+    assert [record.tick for record in read_messages(ring, State)] == [1, 2, 1, 2]

@@ -13,7 +13,6 @@ from trilat_net.net.zenoh_bus import MAX_DEPTH, read_zenoh_file
 from trilat_net.net.zenoh_config import (
     REQUIREMENTS,
     ZenohFile,
-    check_zenoh_file,
     make_zenoh_config,
     merge_settings,
 )
@@ -35,7 +34,7 @@ def look_up(settings: Mapping[str, Any], path: str) -> object:
 
 
 def check_stated(stated: object) -> ZenohFile:
-    return check_zenoh_file(SOURCE, stated, lambda _: "")
+    return ZenohFile.check(SOURCE, stated, lambda _: "")
 
 
 WRONG = {

@@ -12,7 +12,7 @@ from tests.core.chain_references import chain_references
 from tests.presentation.figure_content import list_misplaced
 from tests.scenario.builders import six_joint_text
 from trilat_net.analysis.arm_rows import build_arm_rows
-from trilat_net.execution.virtual import simulate_scenario
+from trilat_net.execution.virtual import SimulatedLog
 from trilat_net.log.log_reader import Log
 from trilat_net.log.ros2.ros2_messages import Ros2SiteChannels
 from trilat_net.presentation import charts
@@ -28,7 +28,7 @@ JOINTS = ["shoulder_pan", "shoulder_lift", "elbow", "wrist_1", "wrist_2", "wrist
 
 @cache
 def simulate_six_joints() -> Log:
-    return simulate_scenario(parse_scenario(SIX, overrides={"rate_hz": 200}))
+    return SimulatedLog(parse_scenario(SIX, overrides={"rate_hz": 200}))
 
 
 def test_chains_end_where_pinocchio_says():
@@ -120,7 +120,7 @@ def test_wall_forces_equal_the_recorded_torques():
         "normal": normal.tolist(),
     }
     push = {"sites.s.environment": [{**wall, "stiffness_n_m": 800.0, "damping_n_s_m": 5.0}]}
-    log = simulate_scenario(parse_scenario(SIX, overrides={"rate_hz": 200, **push}))
+    log = SimulatedLog(parse_scenario(SIX, overrides={"rate_hz": 200, **push}))
     part = log["s"]
     force_panel, depth_panel = FIGURES["contact"].draw(log).axes
     t_s, force = force_panel.lines[0].get_data()

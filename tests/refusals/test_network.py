@@ -10,7 +10,7 @@ from tests.refusals.corpus import Case, names_file, parametrize_cases
 from trilat_net.errors import UsageError
 from trilat_net.net.connection import Connection
 from trilat_net.net.zenoh_bus import read_zenoh_file
-from trilat_net.net.zenoh_config import check_zenoh_file
+from trilat_net.net.zenoh_config import ZenohFile
 
 NAME = "mine.json5"
 
@@ -27,7 +27,7 @@ class ConnectionCase(Case, frozen=True, kw_only=True, forbid_unknown_fields=True
 
 @parametrize_cases("connections.toml", ConnectionCase)
 def test_contradicting_connections_are_refused(case: ConnectionCase) -> None:
-    zenoh_settings = check_zenoh_file(NAME, case.file, lambda _: "") if case.file else None
+    zenoh_settings = ZenohFile.check(NAME, case.file, lambda _: "") if case.file else None
     defaults = {"listen_else": ["tcp/127.0.0.1:1"], "connect_else": ["tcp/127.0.0.1:2"]}
     with pytest.raises(UsageError) as caught:
         Connection.of_member(

@@ -7,7 +7,7 @@ import pytest
 
 from tests.scenario.builders import planar_task_text
 from trilat_net.errors import ScenarioError
-from trilat_net.execution import simulate_scenario
+from trilat_net.execution import SimulatedLog
 from trilat_net.scenario import load_scenario, parse_scenario
 from trilat_net.scenario.describe import describe_scenario
 from trilat_net.scenario.laws import LAWS
@@ -40,5 +40,5 @@ def test_every_law_runs_or_is_refused(law: str, name: str) -> None:
     """Gains per joint and per shared coordinate differ in number if arms share positions."""
     changes = {"control": {"law": law}, "scheme": "digital", "duration_s": 0.01}
     with suppress(ScenarioError):
-        log = simulate_scenario(load_scenario(name, changes))
+        log = SimulatedLog(load_scenario(name, changes))
         assert all(np.isfinite(log[site].tau).all() for site in log.sites)

@@ -14,7 +14,7 @@ from tests.net.local_bus import LocalNetwork
 from tests.net.manual_clock import ManualClock
 from tests.net.waiting import sleep_for_ns
 from trilat_net.app.running_session import open_hand
-from trilat_net.core.life.live_hand import ANOTHER_HOLDS, HandInForce, empty_hand_vector
+from trilat_net.core.life.live_hand import ANOTHER_HOLDS, HandInForce
 from trilat_net.errors import UsageError
 from trilat_net.execution.verification import verify_log
 from trilat_net.execution.virtual_comparison import compare_with_virtual
@@ -176,7 +176,7 @@ def encode_message(**fields: Any) -> bytes:
 )
 def test_a_hostile_message_is_refused_and_counted(payload: bytes, reason: str) -> None:
     served = Served()
-    assert served.take(payload) == HandInForce.read(empty_hand_vector(2))
+    assert served.take(payload) == HandInForce.read(HandInForce.list_empty(2))
     assert served.dropped == {reason: 1}
 
 

@@ -13,7 +13,7 @@ from tests.own_code import Circle, Failing, Follower
 from trilat_net.core.life.own_hand import HandProgram, HandView
 from trilat_net.errors import PlantFailed, RunFailed
 from trilat_net.execution.verification import verify_log
-from trilat_net.execution.virtual import simulate_scenario
+from trilat_net.execution.virtual import SimulatedLog
 from trilat_net.log.log_reader import Log
 from trilat_net.net.bus import Bus
 from trilat_net.net.requests import HandMessage
@@ -89,11 +89,11 @@ def test_records_are_alike_wherever_a_hand_runs(kind: type[Any], tmp_path: Path)
     at, session = make_hand_session(alone, tmp_path)
     add_program(session, kind(at.describe()))
     log = session.run()
-    assert_same(log, simulate_scenario(alone))
+    assert_same(log, SimulatedLog(alone))
     (tmp_path / "within").mkdir()
     within = make_hand_scenario(kind.__name__)
     inner_log = Session.whole(within, tmp_path / "within").run()
-    assert_same(inner_log, simulate_scenario(within))
+    assert_same(inner_log, SimulatedLog(within))
     assert_same(log, inner_log)
     assert verify_log(log).passed
 
@@ -102,7 +102,7 @@ def test_thinking_within_the_delay_changes_nothing(tmp_path: Path) -> None:
     scenario = make_hand_scenario("Follower", process=True, delay_ms=20.0)
     at, session = make_hand_session(scenario, tmp_path)
     add_program(session, Follower(at.describe()), thinks_ns=15 * MS_NS)
-    assert_same(session.run(), simulate_scenario(scenario))
+    assert_same(session.run(), SimulatedLog(scenario))
     assert not any("hand:" in text for text in session.said)
 
 
@@ -178,7 +178,7 @@ def test_strangers_move_no_own_hand(tmp_path: Path) -> None:
             sleep_for_ns(clock, 5 * MS_NS)
 
     session.relay.add("stranger", meddle)
-    assert_same(session.run(), simulate_scenario(scenario))
+    assert_same(session.run(), SimulatedLog(scenario))
     assert any("hand: stranger" in text for text in session.said)
 
 
@@ -199,14 +199,14 @@ def test_announcements_decide_nothing(tmp_path: Path) -> None:
             sleep_for_ns(clock, MS_NS)
 
     session.relay.add("here", say)
-    assert_same(session.run(), simulate_scenario(scenario))
+    assert_same(session.run(), SimulatedLog(scenario))
 
 
 @pytest.mark.parametrize("how", ["raise", "nan"])
 def test_hands_failing_within_sites_let_go(how: str, tmp_path: Path) -> None:
     scenario = make_hand_scenario("Failing", settings={"how": how})
     log = Session.whole(scenario, tmp_path).run()
-    assert_same(log, simulate_scenario(scenario))
+    assert_same(log, SimulatedLog(scenario))
     assert [
         event.text
         for event in log.events
@@ -220,7 +220,7 @@ def test_plants_move_alike_live_and_virtually(tmp_path: Path) -> None:
         "paper", {"sites.s.plant": "tests.own_code:Arm", "duration_s": 1.0}
     )
     log = Session.whole(scenario, tmp_path).run()
-    assert_same(log, simulate_scenario(scenario))
+    assert_same(log, SimulatedLog(scenario))
     assert verify_log(log).passed
 
 

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sites.site_loop import PeerInbox, make_sample_readers
+from sites.site_loop import PeerInbox
 from tests.net.local_bus import LocalNetwork
 from tests.net.manual_clock import ManualClock
 from trilat_net.core.links.link import AHEAD_LIMIT_NS
@@ -18,7 +18,7 @@ from trilat_net.core.step.ticks import MAX_ARRIVALS
 from trilat_net.net.messages import VERSION
 from trilat_net.net.offset import OffsetEstimate
 from trilat_net.net.timing import LinkTimingMonitor, PeerClock, SentStamps
-from trilat_net.net.wire import MAX_BYTES
+from trilat_net.net.wire import MAX_BYTES, make_sample_reader
 from trilat_net.scenario import load_scenario
 
 PEERS = ("m2", "s")
@@ -49,10 +49,10 @@ class Desk:
         receiver = network.join()
         sender = network.join()
         self.clock = ManualClock(EPOCH_NS)
-        read = make_sample_readers(SETUP)
+        read = make_sample_reader(SETUP.layout)
         rings = [
-            receiver.stamped_inbox(name, self.clock.monotonic_ns, reader, capacity)
-            for name, reader in zip(PEERS, read, strict=True)
+            receiver.stamped_inbox(name, self.clock.monotonic_ns, read, capacity)
+            for name in PEERS
         ]
         self.send = [sender.publisher(name) for name in PEERS]
         self.dropped: Counter[str] = Counter()

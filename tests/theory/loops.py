@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from trilat_net.analysis.theory.linear_loop import DelayedTerm, LinearLoop
 from trilat_net.core.arms.exogenous import TorqueKind, TorqueSource
-from trilat_net.core.arms.two_link_arm import ArmLinks, theta_from_links
+from trilat_net.core.arms.two_link_arm import ArmLinks
 from trilat_net.core.step.site_setup import Gains, Law, Scheme, SiteSetup
 
 Array = NDArray[np.float64]
@@ -85,7 +85,7 @@ def draw_site(
         rate_hz=1000,
         scheme=Scheme.SECOND_ORDER,
         gains=GAINS[law](rng),
-        theta=theta_from_links(links),
+        theta=links.theta(),
         g_m_s2=9.81,
         lengths_m=(l1, l2),
         tau_limit_nm=1e300,

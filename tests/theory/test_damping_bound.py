@@ -13,12 +13,11 @@ from tests.theory.position_networks import compute_rod_inertia, count_growing, p
 from trilat_net.analysis.judge import list_law_proofs
 from trilat_net.analysis.theory import analyse_linear_loop
 from trilat_net.analysis.theory.characteristic_roots import Spectrum
-from trilat_net.core.links.dominance import find_balancing_weights
+from trilat_net.core.links.dominance import DominanceMatrix
 from trilat_net.laws.conditions import (
     COMMON_MOTION_SHARE,
     LawSituation,
     StabilityCondition,
-    judge_position_exchange,
 )
 from trilat_net.scenario import load_scenario
 from trilat_net.scenario.describe import describe_law_conditions
@@ -48,19 +47,22 @@ def test_balanced_shares_are_reversible() -> None:
     rng = np.random.default_rng(1)
     for count in (2, 3, 5, 8):
         alpha = draw_shares(rng, count, reversible=True)
-        D = find_balancing_weights(alpha)
+        D = DominanceMatrix(alpha).find_balancing_weights()
         assert D is not None
         np.testing.assert_allclose(D[:, None] * alpha, (D[:, None] * alpha).T, rtol=1e-12)
         assert np.abs(np.linalg.eigvals(alpha).imag).max() < 1e-9
         assert (
             count == 2
-            or find_balancing_weights(draw_shares(rng, count, reversible=False)) is None
+            or DominanceMatrix(
+                draw_shares(rng, count, reversible=False)
+            ).find_balancing_weights()
+            is None
         )
-    assert find_balancing_weights(np.array(LAB)) is None
-    assert find_balancing_weights(np.array(RING)) is None
+    assert DominanceMatrix(np.array(LAB)).find_balancing_weights() is None
+    assert DominanceMatrix(np.array(RING)).find_balancing_weights() is None
     # nobody follows the third
     follower = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.3, 0.7, 0.0]])
-    assert find_balancing_weights(follower) is not None
+    assert DominanceMatrix(follower).find_balancing_weights() is not None
 
 
 def test_common_motion_determines_the_worst_mass() -> None:
@@ -253,7 +255,7 @@ def judge_equal_sites(count: int, ticks: int, d: float) -> StabilityCondition:
     situation = LawSituation(
         0, names, laws, make_equal_shares(count), delay_s, (1e3,), 30, hold_s=TICK_S
     )
-    condition = judge_position_exchange(situation, "d")
+    condition = situation.judge_position_exchange("d")
     assert condition is not None
     return condition
 
@@ -332,7 +334,7 @@ def test_slopes_of_tanh_obey_p_d_bounds() -> None:
     for count in (2, 3, 4, 6):
         for _ in range(50):
             alpha = draw_shares(rng, count, reversible=True)
-            D = find_balancing_weights(alpha)
+            D = DominanceMatrix(alpha).find_balancing_weights()
             assert D is not None
             S = np.sqrt(D)[:, None] * alpha / np.sqrt(D)
             poses = rng.normal(0.0, rng.uniform(0.01, 3.0), count)

@@ -19,7 +19,7 @@ from tests.theory.symbols import (
     make_symbols,
     normalise,
 )
-from trilat_net.core.arms.two_link_arm import ArmLinks, regressor, theta_from_links
+from trilat_net.core.arms.two_link_arm import ArmLinks, regressor
 
 
 def derive_by_lagrange() -> tuple[sp.Matrix, dict[str, Any]]:
@@ -98,9 +98,7 @@ def test_programs_regressor_equals_the_energies() -> None:
     for _ in range(20):
         q, qd, qdd = rng.normal(size=(3, 2))
         Y = np.array(regressor(9.81, q, qd, qd, qdd))
-        assert Y @ theta_from_links(links) == pytest.approx(
-            exact(q, qd, qdd).ravel(), abs=1e-12
-        )
+        assert Y @ links.theta() == pytest.approx(exact(q, qd, qdd).ravel(), abs=1e-12)
 
 
 def test_known_lengths_reduce_five_parameters_to_four() -> None:
@@ -115,7 +113,7 @@ def test_known_lengths_reduce_five_parameters_to_four() -> None:
     four[1, 3] = 0.7  # theta_2 from theta_5, l1 = 0.7 m
     assert np.linalg.matrix_rank(stacked) == 5
     assert np.linalg.matrix_rank(stacked @ four) == 4
-    theta = theta_from_links(ArmLinks(0.7, 1.3, 0.4, 0.11, 0.9, 0.8, 0.35, 0.07))
+    theta = ArmLinks(0.7, 1.3, 0.4, 0.11, 0.9, 0.8, 0.35, 0.07).theta()
     assert four @ np.delete(theta, 1) == pytest.approx(theta)
 
 

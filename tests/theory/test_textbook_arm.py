@@ -15,7 +15,7 @@ from tests.theory.loops import Array
 from trilat_net.analysis.arm_rows import PlacedArm
 from trilat_net.analysis.theory.textbook_arm import PlacedChain
 from trilat_net.core.arms.chain import ChainJoint, build_chain, find_acceleration, place_joints
-from trilat_net.core.arms.two_link_arm import ArmLinks, theta_from_links
+from trilat_net.core.arms.two_link_arm import ArmLinks
 from trilat_net.core.step.site_setup import ChainSetup
 
 
@@ -27,7 +27,7 @@ def place_arm(q: Array) -> PlacedArm:
 def test_matrices_are_those_of_two_bodies(
     a: ArmLinks, q: Array, qd: Array, v: Array, acc: Array
 ) -> None:
-    theta = theta_from_links(a)
+    theta = a.theta()
     scale = 1e-12 * (1.0 + 1e4 * theta.sum())
     assert place_arm(q).inertia_matrix(theta) == pytest.approx(physics.inertia(a, q), abs=scale)
     assert place_arm(q).coriolis_matrix(theta, qd) == pytest.approx(
@@ -44,7 +44,7 @@ def test_matrices_are_those_of_two_bodies(
 def test_the_acceleration_needs_the_torque(
     a: ArmLinks, q: Array, qd: Array, torque: Array
 ) -> None:
-    theta = theta_from_links(a)
+    theta = a.theta()
     qdd = place_arm(q).joint_acceleration(theta, qd, torque)
     needed = place_arm(q).required_torque(theta, qd, qd, qdd)
     assert needed == pytest.approx(torque, abs=1e-9 * (1.0 + np.abs(qdd).max() * theta.sum()))

@@ -23,7 +23,7 @@ from trilat_net.analysis.theory.textbook_arm import (
     vector_from_rotation,
 )
 from trilat_net.core.step.kernel import site_tick
-from trilat_net.core.step.site_arrays import SiteArrays, build_tick_buffers
+from trilat_net.core.step.site_arrays import SiteArrays, TickBuffers
 from trilat_net.core.step.site_setup import SiteSetup
 from trilat_net.core.step.vectors import Array
 from trilat_net.scenario import parse_scenario
@@ -131,7 +131,7 @@ def by_tick(site: SiteSetup, state: Array, peers: list[Array]) -> dict[str, Arra
     for rate_hz in (10_000, 20_000):
         faster_site = site._replace(rate_hz=rate_hz)
         arrays = SiteArrays.build(faster_site, pages=8)
-        buffers = build_tick_buffers(faster_site)
+        buffers = TickBuffers.build(faster_site)
         s = arrays.site[0]
         s.q = state[at.q]
         s.qd = state[at.qd]

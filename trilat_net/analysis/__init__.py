@@ -75,7 +75,6 @@ __all__ = [
     "FileOverview",
     "info",
     "link_summary",
-    "DominanceMatrix",
     "SharedSlave",
     "Timeline",
     "summarise_run",
@@ -91,7 +90,7 @@ if TYPE_CHECKING:
     from .certificate.observed_energy import ObservedEnergy, ObservedFinding
     from .certificate.running_energy import KEPT_S, RunningEnergy
     from .certificate.stability_certificate import Certificate
-    from .dominance_history import DominanceHistory, DominanceMatrix
+    from .dominance_history import DominanceHistory
     from .file_overview import FileOverview, info, summarise_run
     from .judge import certify_run, judge_virtual_run
     from .link_summary import DelayDistribution
@@ -145,7 +144,7 @@ else:
             "certificate.stability_certificate": "Certificate",
             "certificate.verdict_facts": "verdict_facts",
             "decision_facts": "decision_facts",
-            "dominance_history": "DominanceHistory DominanceMatrix",
+            "dominance_history": "DominanceHistory",
             "file_overview": "FileOverview info summarise_run",
             "judge": "certify_run judge_virtual_run",
             "link_summary": "DelayDistribution link_summary",

@@ -18,7 +18,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..core import DelayKind, TraceEnd
+from ..core import DelayKind
 from ..scenario import LinkBase, Scenario
 
 MAX_PERIOD_TICKS = 400_000
@@ -197,8 +197,7 @@ def is_ending_trace(link: LinkBase) -> bool:
     Args:
         link: Delay model of the link.
     """
-    model = link.to_core_model()
-    return model.kind == DelayKind.TRACE and model.at_end == TraceEnd.HOLD
+    return link.to_core_model().has_ending_trace
 
 
 def find_final_link(scenario: Scenario, name: str) -> LinkBase:

@@ -23,7 +23,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core import Array, DominanceRamp, find_reach, perron_vector
+from ..core import Array, DominanceMatrix, DominanceRamp
 from ..log import Log
 from ..scenario import Scenario
 
@@ -377,76 +377,28 @@ def find_kd_scales(Kd: Array) -> Array | None:
     return scales
 
 
-class DominanceMatrix(NamedTuple):
-    """Weights (dominance factors) with which all N arms follow each other at one time.
+def compute_lyapunov_weights(alpha: Array, Kd: Array) -> _LyapunovWeights:
+    """Computes the weight of each site in the energy function of the stability proof.
 
-    Attributes:
-        alpha: The factors: entry (i, j) is the weight with which site i follows site j, shape
-            (N, N).
+    A site is the process that runs one arm. The weight of site i is beta_i = pi_i / c_i, where
+    pi is the left eigenvector of `alpha` for the eigenvalue 1, and c_i is the factor between
+    the damping gain of site i and that of the first site. The weights are scaled so that their
+    sum is N. If the gains are not multiples of each other, c_i = 1 is used, and the energy may
+    rise.
+
+    Args:
+        alpha: Dominance factors: entry (i, j) is the weight with which site i follows site j,
+            shape (N, N).
+        Kd: Damping gains of the N sites along n axes, shape (N, n).
     """
-
-    alpha: Array
-
-    def find_closed_groups(self) -> tuple[tuple[int, ...], ...]:
-        """Finds the groups of arms that follow each other, and no arm outside the group.
-
-        An arm may follow another arm directly or through further arms. If there are several
-        groups, the weights of the arms in the energy function V are not unique.
-
-        Returns:
-            Indices of the sites of each group.
-        """
-        reachable = find_reach(self.alpha)
-        groups = []
-        for site in range(len(self.alpha)):
-            is_mutual = reachable[site] & reachable[:, site]
-            group = tuple(np.flatnonzero(is_mutual).tolist())
-            # the first site of a group stands for the group
-            is_first = group[0] == site
-            is_closed = reachable[site].sum() == len(group)
-            if is_first and is_closed:
-                groups.append(group)
-        return tuple(groups)
-
-    def compute_perron_vector(self) -> Array:
-        """Returns the left eigenvector pi of the dominance factors for the eigenvalue 1.
-
-        The vector satisfies pi >= 0 and pi' alpha = pi', and its sum is 1. A closed group is a
-        group of sites that follow no site outside the group. pi is 0 for sites outside closed
-        groups. With several closed groups pi is not unique: the sum of its entries in each
-        group is then chosen proportional to the number of sites in the group.
-
-        Returns:
-            The vector, shape (N,).
-        """
-        pi = np.zeros(len(self.alpha))
-        groups = self.find_closed_groups()
-        total = sum(map(len, groups))
-        for group in groups:
-            group_alpha = self.alpha[np.ix_(group, group)]
-            group_pi = perron_vector(group_alpha)
-            pi[list(group)] = group_pi * len(group) / total
-        return pi
-
-    def compute_lyapunov_weights(self, Kd: Array) -> _LyapunovWeights:
-        """Computes the weight of each site in the energy function of the stability proof.
-
-        A site is the process that runs one arm. The weight of site i is beta_i = pi_i / c_i,
-        where pi is the left eigenvector of `alpha` for the eigenvalue 1, and c_i is the factor
-        between the damping gain of site i and that of the first site. The weights are scaled so
-        that their sum is N. If the gains are not multiples of each other, c_i = 1 is used, and
-        the energy may rise.
-
-        Args:
-            Kd: Damping gains of the N sites along n axes, shape (N, n).
-        """
-        pi = self.compute_perron_vector()
-        scales = find_kd_scales(Kd)
-        beta = pi if scales is None else pi / scales
-        sites = len(beta)
-        factor = sites / beta.sum()
-        return _LyapunovWeights(
-            beta=beta * factor,
-            groups=self.find_closed_groups(),
-            scales=scales,
-        )
+    dominance = DominanceMatrix(alpha)
+    pi = dominance.find_pi()
+    scales = find_kd_scales(Kd)
+    beta = pi if scales is None else pi / scales
+    sites = len(beta)
+    factor = sites / beta.sum()
+    return _LyapunovWeights(
+        beta=beta * factor,
+        groups=dominance.find_closed_groups(),
+        scales=scales,
+    )

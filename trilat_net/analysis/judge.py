@@ -17,7 +17,7 @@ from typing import NamedTuple
 
 import msgspec
 
-from ..execution import FusedRun, simulate_columns, simulate_scenario
+from ..execution import FusedRun, SimulatedLog, simulate_columns
 from ..log import MIN_COVERAGE, Log
 from ..scenario import Scenario, describe_law_conditions, list_law_situations
 from .blas_threads import limit_blas_threads
@@ -173,7 +173,7 @@ def judge_virtual_run(
     if is_weak and ticks <= MAX_RECORDED_TICKS and _has_energies(executed_scenario):
         # Only a written log contains the memories from which laws compute declared energies.
         if ObservedEnergy.find_laws(executed_scenario, own_laws=True):
-            log: Log = simulate_scenario(executed_scenario)
+            log: Log = SimulatedLog(executed_scenario)
         else:
             log = simulate_columns(executed_scenario)
         certificate_of_log = Certificate.of_log(log, own_laws=True)

@@ -22,7 +22,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..core import AHEAD_LIMIT_NS, LOST, Array, DelayKind, LinkSchedule, first_ticks
+from ..core import AHEAD_LIMIT_NS, LOST, Array, DelayKind, LinkSchedule
 from ..log import Ints, Log, SiteLog
 from ..records import NS_PER_S
 from .aligned import Bools
@@ -85,7 +85,7 @@ class _PredictedDelivery(NamedTuple):
         Returns:
             The tick of each of the M samples, shape (M,). `LOST` for a lost sample.
         """
-        ticks = first_ticks(np.maximum(self.due_ns, self.stamp_ns + 1), rate_hz)
+        ticks = LinkSchedule.first_ticks(np.maximum(self.due_ns, self.stamp_ns + 1), rate_hz)
         return np.where(self.lost, LOST, ticks)
 
 
@@ -255,7 +255,7 @@ def _mark_judged_samples(
     if not len(site_log):
         return np.zeros(samples, dtype=np.bool_)
 
-    earliest_tick = first_ticks(stamp_ns + 1, site_log.rate_hz)
+    earliest_tick = LinkSchedule.first_ticks(stamp_ns + 1, site_log.rate_hz)
     slowest_ticks = int((arrivals.tick - earliest_tick[arrivals.sample]).max(initial=0))
     newest = int(arrivals.sample.max(initial=-1))
     last_tick = min(int(site_log.tick[-1]), log.scenario.ticks(site) - 1)

@@ -30,7 +30,7 @@ from typing import Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core import BUCKETS_PER_S, LIVE_KINDS, OWN_KINDS, Array, TorqueKind, find_reach
+from ..core import BUCKETS_PER_S, LIVE_KINDS, OWN_KINDS, Array, DominanceMatrix, TorqueKind
 from ..execution import FusedRun
 from ..hooks import find_hook
 from ..log import Ints, Log, SiteLog
@@ -878,7 +878,7 @@ def find_coupled_sites(scenario: Scenario) -> list[list[int]]:
         for peer, share in change.to.items():
             total_shares[site, scenario.names.index(peer)] += share
     # a share in either direction couples two sites
-    reachable = find_reach(total_shares + total_shares.T)
+    reachable = DominanceMatrix(total_shares + total_shares.T).reach
     groups: list[list[int]] = []
     for reachable_from_site in reachable:
         group = np.flatnonzero(reachable_from_site).tolist()

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 from ..analysis import Certificate, LogMetrics
 from ..entry_points import find_viewer
 from ..errors import UsageError
-from ..execution import LogCheckReport, SimulatedLog, simulate_scenario
+from ..execution import LogCheckReport, SimulatedLog
 from ..files import make_results_folder
 from ..log import MIN_COVERAGE, Log, open_log, open_logs
 from ..scenario import Scenario, load_scenario
@@ -67,7 +67,7 @@ def simulate(
         ScenarioError: The scenario or an override is not valid.
     """
     resolved = load_scenario(scenario, set, duration_s=duration_s, seed=seed)
-    log = simulate_scenario(resolved)
+    log = SimulatedLog(resolved)
     log.warn_of_failures()
     return log
 

@@ -37,7 +37,7 @@ from setproctitle import setproctitle
 from sites import check_machine_load, warm_up
 from trilat_net.entry_points import COMMANDS, load_entry
 from trilat_net.errors import LogRefused, RunFailed
-from trilat_net.files import find_page, make_results_folder, make_subfolder, write_whole
+from trilat_net.files import find_page, make_folder, make_results_folder, write_whole
 from trilat_net.net import topics
 from trilat_net.process import freeze_gc
 from trilat_net.scenario import Scenario, load_scenario
@@ -46,7 +46,7 @@ from trilat_net.signals import Interrupt
 from ..core import compiling_notice, is_core_cached
 from ..files import refuse_link
 from ..log import Log, open_log
-from ..net import Clock, SystemClock, ZenohBus, reserve_session_endpoints
+from ..net import Clock, DefaultEndpoints, SystemClock, ZenohBus
 from ..own_code import list_imported_code
 from ..records import NS_PER_S
 from ..scenario import HandSite, check_outside_arms
@@ -345,7 +345,8 @@ def run_demo(
         load_warning = check_machine_load(clock)
         if load_warning:
             display.say(f"warning: {load_warning}")
-        endpoints = reserved.enter_context(reserve_session_endpoints(session, scenario.names))
+        default_endpoints = DefaultEndpoints(session)
+        endpoints = reserved.enter_context(default_endpoints.reserve(len(scenario.names)))
         patience_s = JOIN_S if begins is None else WAIT_S
         starter, sites, start_recorder = _start(
             scenario=scenario,
@@ -447,7 +448,7 @@ def _start(
     log = folder / "run.mcap"
     output = folder / "processes"
     write_whole(scenario_file, scenario.text)
-    make_subfolder(output)
+    make_folder(output, may_be_link=False)
     log.unlink(missing_ok=True)  # of an earlier run, in a folder that may be replaced
     starter = reserved.enter_context(closing(ProcessStarter(scenario_file, output)))
 

@@ -46,7 +46,6 @@ from ..net import (
     RouterSilent,
     SystemClock,
     ZenohBus,
-    find_endpoint_addresses,
     is_loopback,
     read_member_keys,
 )
@@ -215,14 +214,14 @@ def examine_links(
         yield DoctorFinding("links", "fail", str(error))
         return
 
-    for endpoint in find_endpoint_addresses(secured.reach(secured.listen)):
+    for endpoint in secured.listen_addresses:
         address = _split_address(endpoint)
         if address is None:
             yield _describe_untried(endpoint)
         else:
             yield _examine_listening(endpoint, address)
 
-    for endpoint in find_endpoint_addresses(secured.reach(secured.connect or ())):
+    for endpoint in secured.connect_addresses:
         address = _split_address(endpoint)
         if endpoint.startswith("quic/"):
             yield _examine_quic(endpoint, member_keys)

@@ -23,7 +23,7 @@ from trilat_net.scenario import Scenario
 
 from ..core import HandInForce, LifeAlarm
 from ..log import compute_task_errors
-from ..net import Bus, Clock, Event, LinkStats, State, read_messages, read_records
+from ..net import Bus, Clock, Event, LinkStats, State, read_messages
 from ..records import NS_PER_S
 
 AGES = "age of each peer's sample"
@@ -356,7 +356,7 @@ class SessionMonitor:
             if event.kind in LOUD_EVENTS:
                 self._display.say(event.text)
         for name, states in self._states.items():
-            for record in read_records(states, scenario.layout(name)):
+            for record in read_messages(states, State, scenario.layout(name)):
                 self.records[name] = record
 
         if self._display.due:

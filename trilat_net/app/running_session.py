@@ -45,7 +45,6 @@ from ..net import (
     SystemClock,
     connect_to_session,
     read_messages,
-    read_records,
 )
 from ..scenario import PictureDelay, parse_core_change
 from .input_device import Device
@@ -632,7 +631,7 @@ class RunningSession:
                 A record contains the measurements and results of one period of a control loop.
                 The list is empty if no record has arrived.
                 """
-                return [record for inbox in inboxes for record in read_records(inbox)]
+                return [record for inbox in inboxes for record in read_messages(inbox, State)]
 
             yield receive
 
@@ -675,7 +674,7 @@ class RunningSession:
                 records that arrive from `inbox`.
                 """
                 nonlocal picture_delay
-                for record in read_records(inbox):
+                for record in read_messages(inbox, State):
                     if record.site not in latest_records:
                         latest_records[record.site] = deque(maxlen=STATES_KEPT)
                     latest_records[record.site].append(record)
@@ -785,7 +784,7 @@ class RunningSession:
                 nonlocal now_ns
                 for event in read_messages(events, Event):
                     history.add_change(event.command)
-                for record in read_records(records):
+                for record in read_messages(records, State):
                     now_ns = max(now_ns, record.t_ns)
                 shares = history.advance_to(now_ns)
                 return dict(zip(scenario.peers(site), shares, strict=True))

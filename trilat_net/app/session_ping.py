@@ -26,12 +26,12 @@ from ..net import (
     Bus,
     Clock,
     Connection,
+    DefaultEndpoints,
     Info,
     LinkStats,
-    MemberQuery,
     Pinger,
+    SessionMembers,
     connect_to_session,
-    default_endpoint,
     read_messages,
 )
 
@@ -111,7 +111,7 @@ class SessionPing:
         self._clock = clock
         self._session = session
         self._trips_per_member = count
-        self._members = MemberQuery(bus, clock, session)
+        self._members = SessionMembers(bus, clock, session)
         self._stats = bus.inbox(topics.key(session, "*", topics.LINK), 256)
         self.pinger = Pinger(bus, clock, session, count)
         self._first_ns: int | None = None
@@ -288,7 +288,7 @@ def ping_session(
         raise RunFailed(str(error)) from None
 
     if not ping.infos:
-        endpoints = connection.connect or [default_endpoint(session, 0)]
+        endpoints = connection.connect or [DefaultEndpoints(session).of_site(0)]
         raise RunFailed(
             f"no member of session {session!r} answered at {', '.join(map(str, endpoints))} "
             f"within {timeout_s:g} s; check the name of the session and whether the session "

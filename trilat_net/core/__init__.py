@@ -26,7 +26,6 @@ __all__ = [
     "CoreChange",
     "DominanceRamp",
     "LifeAlarm",
-    "LifeOrder",
     "LifeReason",
     "PlantState",
     "TickInput",
@@ -53,8 +52,6 @@ __all__ = [
     "StaleRule",
     "TaskSetup",
     "TickRepeater",
-    "links_bytes",
-    "make_layout",
     # Numbers and vectors
     "Array",
     "IntArray",
@@ -84,7 +81,6 @@ __all__ = [
     "chain_stages",
     "forward_kinematics",
     "regressor",
-    "theta_from_links",
     "two_link_stages",
     # Torques of operators and environments
     "LIVE_KINDS",
@@ -99,17 +95,11 @@ __all__ = [
     "MAX_DELAY_US",
     "ROW_SUM_TOLERANCE",
     "DelayKind",
+    "DominanceMatrix",
     "LinkModel",
     "LinkSchedule",
-    "TraceEnd",
-    "dominance",
     "draw_pair",
-    "find_balancing_weights",
-    "find_reach",
-    "first_ticks",
-    "is_irreducible",
     "link_key",
-    "perron_vector",
     # Live hands and hands of users
     "GRIP_NS",
     "SILENCE_NS",
@@ -138,10 +128,9 @@ __all__ = [
     "PeerView",
     "SentVector",
     "UserLaw",
+    "UserModel",
     "UserLawFactory",
-    "compile_to_address",
     "compiled",
-    "list_numbers",
     "plug_law",
     # Runs of several sites, alone and side by side
     "CompiledRun",
@@ -149,9 +138,6 @@ __all__ = [
     "RunGroup",
     "RunInputs",
     "TwinLanes",
-    "describe_structure",
-    "group_runs",
-    "prepare_lanes",
 ]
 
 if TYPE_CHECKING:
@@ -163,10 +149,9 @@ if TYPE_CHECKING:
     from .arms.frame_pose import FramePose
     from .arms.rotation import rotation_matrix
     from .arms.task_space import POSE, POSITION
-    from .arms.two_link_arm import ArmLinks, forward_kinematics, regressor, theta_from_links
+    from .arms.two_link_arm import ArmLinks, forward_kinematics, regressor
     from .lanes.lane_episodes import LaneEpisodes
-    from .lanes.lane_structure import describe_structure
-    from .lanes.run_groups import RunGroup, group_runs, prepare_lanes
+    from .lanes.run_groups import RunGroup
     from .lanes.twin_lanes import TwinLanes
     from .life.live_hand import (
         GRIP_NS,
@@ -181,30 +166,16 @@ if TYPE_CHECKING:
     from .life.resting import REST_RATE_1_S
     from .life.safeguards import BLEND_S
     from .life.session_life import HELD_OVERRUN_TICKS
-    from .links import dominance
     from .links.channel import LOST
-    from .links.delay import (
-        LINK_MODEL_DTYPE,
-        MAX_DELAY_US,
-        DelayKind,
-        LinkModel,
-        TraceEnd,
-        draw_pair,
-    )
-    from .links.dominance import (
-        ROW_SUM_TOLERANCE,
-        find_balancing_weights,
-        find_reach,
-        is_irreducible,
-        perron_vector,
-    )
+    from .links.delay import LINK_MODEL_DTYPE, MAX_DELAY_US, DelayKind, LinkModel, draw_pair
+    from .links.dominance import ROW_SUM_TOLERANCE, DominanceMatrix
     from .links.link import AHEAD_LIMIT_NS
-    from .links.link_schedule import LinkSchedule, first_ticks
+    from .links.link_schedule import LinkSchedule
     from .links.philox import link_key
     from .plug.compiled_law import compiled, plug_law
     from .plug.law_channel import MAX_RECORD_SENT, MAX_SENT, LawChannel, SentVector
     from .plug.law_energy import LawEnergies, LawRecords, PeerRecords
-    from .plug.plugged import compile_to_address, list_numbers
+    from .plug.plugged import UserModel
     from .plug.user_law import LawContext, LawInput, PeerView, UserLaw, UserLawFactory
     from .step.compiled_run import CompiledRun
     from .step.control import ROBUST_RESIDUE
@@ -212,13 +183,7 @@ if TYPE_CHECKING:
     from .step.jit import compiling_notice, is_core_cached, leaf, loop_leaf
     from .step.recorded_ticks import RecordedRows, TickRepeater
     from .step.run_inputs import RunInputs
-    from .step.site_arrays import (
-        MAX_CHANGES,
-        MAX_LINKS_BYTES,
-        MAX_RAMPS,
-        SiteArrays,
-        links_bytes,
-    )
+    from .step.site_arrays import MAX_CHANGES, MAX_LINKS_BYTES, MAX_RAMPS, SiteArrays
     from .step.site_setup import (
         ChainSetup,
         Gains,
@@ -231,7 +196,6 @@ if TYPE_CHECKING:
         StaleAction,
         StaleRule,
         TaskSetup,
-        make_layout,
     )
     from .step.site_step import Site
     from .step.ticks import (
@@ -241,7 +205,6 @@ if TYPE_CHECKING:
         CoreChange,
         DominanceRamp,
         LifeAlarm,
-        LifeOrder,
         LifeReason,
         PlantState,
         TickInput,
@@ -262,11 +225,10 @@ else:
             "arms.frame_pose": "FramePose",
             "arms.rotation": "rotation_matrix",
             "arms.task_space": "POSE POSITION",
-            "arms.two_link_arm": "ArmLinks forward_kinematics regressor theta_from_links",
+            "arms.two_link_arm": "ArmLinks forward_kinematics regressor",
             "arms.two_link_stages": "two_link_stages",
             "lanes.lane_episodes": "LaneEpisodes",
-            "lanes.lane_structure": "describe_structure",
-            "lanes.run_groups": "RunGroup group_runs prepare_lanes",
+            "lanes.run_groups": "RunGroup",
             "lanes.twin_lanes": "TwinLanes",
             "life.live_hand": (
                 "GRIP_NS HandCommand HandInForce HandReach HandRules SILENCE_NS TAKEN"
@@ -276,20 +238,15 @@ else:
             "life.safeguards": "BLEND_S",
             "life.session_life": "HELD_OVERRUN_TICKS",
             "links.channel": "LOST",
-            "links.delay": (
-                "DelayKind LINK_MODEL_DTYPE LinkModel MAX_DELAY_US TraceEnd draw_pair"
-            ),
-            "links.dominance": (
-                "ROW_SUM_TOLERANCE dominance find_balancing_weights find_reach "
-                "is_irreducible perron_vector"
-            ),
+            "links.delay": "DelayKind LINK_MODEL_DTYPE LinkModel MAX_DELAY_US draw_pair",
+            "links.dominance": "DominanceMatrix ROW_SUM_TOLERANCE",
             "links.link": "AHEAD_LIMIT_NS",
-            "links.link_schedule": "LinkSchedule first_ticks",
+            "links.link_schedule": "LinkSchedule",
             "links.philox": "link_key",
             "plug.compiled_law": "compiled plug_law",
             "plug.law_channel": "LawChannel MAX_RECORD_SENT MAX_SENT SentVector",
             "plug.law_energy": "LawEnergies LawRecords PeerRecords",
-            "plug.plugged": "compile_to_address list_numbers",
+            "plug.plugged": "UserModel",
             "plug.user_law": "LawContext LawInput PeerView UserLaw UserLawFactory",
             "step.compiled_run": "CompiledRun",
             "step.control": "ROBUST_RESIDUE",
@@ -297,16 +254,15 @@ else:
             "step.jit": "compiling_notice is_core_cached leaf loop_leaf",
             "step.recorded_ticks": "RecordedRows TickRepeater",
             "step.run_inputs": "RunInputs",
-            "step.site_arrays": "MAX_CHANGES MAX_LINKS_BYTES MAX_RAMPS SiteArrays links_bytes",
+            "step.site_arrays": "MAX_CHANGES MAX_LINKS_BYTES MAX_RAMPS SiteArrays",
             "step.site_setup": (
                 "ChainSetup Gains Law LinkSetup MotionLimits RestGains Scheme SiteSetup "
-                "StaleAction StaleRule TaskSetup make_layout"
+                "StaleAction StaleRule TaskSetup"
             ),
             "step.site_step": "Site",
             "step.ticks": (
-                "BUCKETS_PER_S CoreChange DominanceRamp LifeAlarm LifeOrder LifeReason "
-                "MAX_ARRIVALS PlantState RELEASE_REASONS TickInput describe_mode "
-                "first_tick_at tick_ns"
+                "BUCKETS_PER_S CoreChange DominanceRamp LifeAlarm LifeReason MAX_ARRIVALS "
+                "PlantState RELEASE_REASONS TickInput describe_mode first_tick_at tick_ns"
             ),
             "step.vectors": "Array IntArray Pair Points Vector",
         },

@@ -13,19 +13,14 @@ __all__ = [
     # Runs in virtual time
     "FusedRun",
     "SimulatedLog",
-    "check_fusable",
     "check_virtual",
     "execute_virtual",
-    "explain_not_repeatable",
     "find_absent_samples",
     "record_virtual",
     "simulate_columns",
-    "simulate_scenario",
-    "simulate_without_operators",
     # Execution of a log
     "LogCheckReport",
     "Rerun",
-    "check_log_files",
     "rerun",
     "verify_log",
     # Twins
@@ -39,33 +34,25 @@ __all__ = [
 ]
 
 if TYPE_CHECKING:
-    from .fused import FusedRun, check_fusable, explain_not_repeatable
-    from .log_checks import LogCheckReport, check_log_files
+    from .fused import FusedRun
+    from .log_checks import LogCheckReport
     from .twins import LEAST_PUSH, MOST_PUSH, PUSH_RAD, SMALLEST, Push, TwinPath, Twins
     from .unwritten_run import simulate_columns
     from .verification import verify_log
-    from .virtual import (
-        SimulatedLog,
-        check_virtual,
-        execute_virtual,
-        record_virtual,
-        simulate_scenario,
-    )
-    from .virtual_comparison import find_absent_samples, simulate_without_operators
+    from .virtual import SimulatedLog, check_virtual, execute_virtual, record_virtual
+    from .virtual_comparison import find_absent_samples
     from .what_if import Rerun, rerun
 else:
     __getattr__ = import_on_use(
         __name__,
         {
-            "fused": "FusedRun check_fusable explain_not_repeatable",
-            "log_checks": "LogCheckReport check_log_files",
+            "fused": "FusedRun",
+            "log_checks": "LogCheckReport",
             "twins": "LEAST_PUSH MOST_PUSH PUSH_RAD Push SMALLEST TwinPath Twins",
             "unwritten_run": "simulate_columns",
             "verification": "verify_log",
-            "virtual": (
-                "SimulatedLog check_virtual execute_virtual record_virtual simulate_scenario"
-            ),
-            "virtual_comparison": "find_absent_samples simulate_without_operators",
+            "virtual": "SimulatedLog check_virtual execute_virtual record_virtual",
+            "virtual_comparison": "find_absent_samples",
             "what_if": "Rerun rerun",
         },
     )

@@ -19,7 +19,7 @@ from collections.abc import Collection, Mapping
 
 import numpy as np
 
-from ..core import MAX_ARRIVALS, CompiledRun, CoreChange, IntArray, RunInputs, first_ticks
+from ..core import MAX_ARRIVALS, CompiledRun, CoreChange, IntArray, LinkSchedule, RunInputs
 from ..errors import ScenarioError, count_nouns
 from ..log import Log
 from ..own_code import find_user_laws
@@ -30,33 +30,6 @@ from ..scenario import (
     Scenario,
     make_hand_players,
 )
-
-
-def check_fusable(scenario: Scenario, plants: Collection[str] = ()) -> None:
-    """Checks that the compiled loop can execute a scenario.
-
-    The loop computes the motion of all arms itself. It cannot use a real robot, and a user's
-    program may move an arm only if the caller provides that program.
-
-    Args:
-        scenario: Description of the experiment.
-        plants: Names of the sites for which the caller provides a user's program that computes
-            the motion of the arm. By default, there are no such sites.
-
-    Raises:
-        ScenarioError: Another arm is external, or the tick rates differ so much that too many
-            samples (sent states) would arrive in one tick (control period) of the slowest site.
-    """
-    scenario.refuse_external_arms(plants)
-    ratio = _find_largest_ratio(scenario)
-    if ratio > MAX_ARRIVALS:
-        raise ScenarioError(
-            f"the fastest site executes {count_nouns(ratio, 'tick')} within one tick of the "
-            f"slowest, but at most {MAX_ARRIVALS} samples can arrive in a tick; choose tick "
-            "rates that differ less",
-            path="rate_hz",
-            source=scenario.name,
-        )
 
 
 def _find_largest_ratio(scenario: Scenario) -> int:
@@ -85,8 +58,8 @@ class FusedRun(CompiledRun):
         scenario: The scenario.
 
     Raises:
-        ScenarioError: The loop cannot execute the scenario, see `check_fusable`, or a law
-            cannot be created.
+        ScenarioError: The loop cannot execute the scenario, see `check_scenario`, or a
+            law cannot be created.
     """
 
     def __init__(
@@ -98,7 +71,7 @@ class FusedRun(CompiledRun):
         hands: Mapping[str, HandPlayer] = {},
         plants: Mapping[str, PlantPlayer] = {},
     ) -> None:
-        check_fusable(scenario, plants)
+        self.check_scenario(scenario, plants)
         names = scenario.names
         setups = [scenario.setup(name) for name in names]
         live_hands: Mapping[str, HandPlayer] = {}
@@ -120,66 +93,95 @@ class FusedRun(CompiledRun):
         )
         self.scenario = scenario
 
+    @staticmethod
+    def check_scenario(scenario: Scenario, plants: Collection[str] = ()) -> None:
+        """Checks that the compiled loop can execute a scenario.
 
-def explain_not_repeatable(log: Log, *, own_laws: bool = False) -> str:
-    """Explains why a run cannot be repeated exactly from its log alone.
+        The loop computes the motion of all arms itself. It cannot use a real robot, and a
+        user's program may move an arm only if the caller provides that program.
 
-    For example, the log may lack records (results of control periods), or a control law may be
-    code that must not run here.
+        Args:
+            scenario: Description of the experiment.
+            plants: Names of the sites for which the caller provides a user's program that
+                computes the motion of the arm. By default, there are no such sites.
 
-    Args:
-        log: Log of the run.
-        own_laws: True if control laws that are code of users may run.
+        Raises:
+            ScenarioError: Another arm is external, or the tick rates differ so much that too
+                many samples (sent states) would arrive in one tick (control period) of the
+                slowest site.
+        """
+        scenario.refuse_external_arms(plants)
+        ratio = _find_largest_ratio(scenario)
+        if ratio > MAX_ARRIVALS:
+            raise ScenarioError(
+                f"the fastest site executes {count_nouns(ratio, 'tick')} within one tick of "
+                f"the slowest, but at most {MAX_ARRIVALS} samples can arrive in a tick; choose "
+                "tick rates that differ less",
+                path="rate_hz",
+                source=scenario.name,
+            )
 
-    Returns:
-        A reason for the user. Empty if the run can be repeated.
-    """
-    scenario = log.scenario
-    if scenario.external:
-        arms = ", ".join(sorted(scenario.external))
-        return f"the reaction of the external arm of {arms} is not known"
-    if find_user_laws(scenario) and not own_laws:
-        return "the imported control laws may not run (permit them with --law FILE)"
-    if set(log.executed_sites) != set(log.sites):
-        return "in a rerun, the sites whose records were copied did not react"
-    for name in log.sites:
-        part = log[name]
-        if not len(part) or not np.array_equal(part.tick, np.arange(len(part))):
-            return f"records of {name} are missing"
-    return ""
+    @staticmethod
+    def explain_not_repeatable(log: Log, *, own_laws: bool = False) -> str:
+        """Explains why the compiled loop cannot repeat a run exactly from its log alone.
 
+        For example, the log may lack records (results of control periods), or a control law may
+        be code that must not run here.
 
-def read_run_inputs(log: Log) -> RunInputs:
-    """Reads from a log everything that is needed to repeat its run.
+        Args:
+            log: Log of the run.
+            own_laws: True if control laws that are code of users may run.
 
-    These inputs are the ticks (periods of the control loop) in which samples (sent states) of
-    other sites arrived, the changes of settings, and the actions of live operators (persons or
-    programs that moved an arm). The run must be repeatable, see `explain_not_repeatable`.
+        Returns:
+            A reason for the user. Empty if the run can be repeated.
+        """
+        scenario = log.scenario
+        if scenario.external:
+            arms = ", ".join(sorted(scenario.external))
+            return f"the reaction of the external arm of {arms} is not known"
+        if find_user_laws(scenario) and not own_laws:
+            return "the imported control laws may not run (permit them with --law FILE)"
+        if set(log.executed_sites) != set(log.sites):
+            return "in a rerun, the sites whose records were copied did not react"
+        for name in log.sites:
+            part = log[name]
+            if not len(part) or not np.array_equal(part.tick, np.arange(len(part))):
+                return f"records of {name} are missing"
+        return ""
 
-    Args:
-        log: Log of the run.
+    @staticmethod
+    def read_inputs(log: Log) -> RunInputs:
+        """Reads from a log everything that is needed to repeat its run.
 
-    Returns:
-        The inputs, ready for `FusedRun`.
+        These inputs are the ticks (periods of the control loop) in which samples (sent states)
+        of other sites arrived, the changes of settings, and the actions of live operators
+        (persons or programs that moved an arm). The run must be repeatable, see
+        `explain_not_repeatable`.
 
-    Raises:
-        LogError: The log contains a text that is not a change of the scenario.
-    """
-    names = log.scenario.names
-    ticks = max(len(log[name]) for name in log.sites)
-    inputs = RunInputs.prompt(len(names))._replace(changes=_read_changes(log))
-    # In a log of virtual time, all samples arrived at once.
-    if log.driver != "virtual":
-        first_arrivals, sample_ticks, late_ns = _read_arrivals(log, ticks)
-        feed = inputs.feed._replace(first=first_arrivals, samples=sample_ticks)
-        inputs = inputs._replace(feed=feed, late_ns=late_ns)
+        Args:
+            log: Log of the run.
 
-    setups = [log.scenario.setup(name) for name in names]
-    sites = [i for i, setup in enumerate(setups) if setup.live_actor >= 0]
-    inputs = inputs.with_hands(setups, sites, ticks)
-    for i in sites:
-        inputs.write_actions(i, 0, log[names[i]].hand)
-    return inputs
+        Returns:
+            The inputs, as the argument `inputs`.
+
+        Raises:
+            LogError: The log contains a text that is not a change of the scenario.
+        """
+        names = log.scenario.names
+        ticks = max(len(log[name]) for name in log.sites)
+        inputs = RunInputs.prompt(len(names))._replace(changes=_read_changes(log))
+        # In a log of virtual time, all samples arrived at once.
+        if log.driver != "virtual":
+            first_arrivals, sample_ticks, late_ns = _read_arrivals(log, ticks)
+            feed = inputs.feed._replace(first=first_arrivals, samples=sample_ticks)
+            inputs = inputs._replace(feed=feed, late_ns=late_ns)
+
+        setups = [log.scenario.setup(name) for name in names]
+        sites = [i for i, setup in enumerate(setups) if setup.live_actor >= 0]
+        inputs = inputs.with_hands(setups, sites, ticks)
+        for i in sites:
+            inputs.write_actions(i, 0, log[names[i]].hand)
+        return inputs
 
 
 def _read_changes(log: Log) -> list[tuple[int, int, CoreChange]]:
@@ -226,7 +228,7 @@ def _read_arrivals(log: Log, ticks: int) -> tuple[IntArray, IntArray, int]:
             sample_ticks = sent_ticks[selected]
             stamps_ns = sample_ticks * NS_PER_S // log[peer].rate_hz
             # A sample is not used before the first tick after its stamp (L2).
-            earliest = first_ticks(stamps_ns + 1, part.rate_hz)
+            earliest = LinkSchedule.first_ticks(stamps_ns + 1, part.rate_hz)
             delivery_ticks = np.maximum(arrival_ticks[selected], earliest)
             order = np.argsort(delivery_ticks, kind="stable")
             starts = np.searchsorted(delivery_ticks[order], np.arange(ticks + 1))

@@ -31,7 +31,7 @@ from ..log import (
 )
 from ..own_code import CodeConsents, allowed_code, find_user_laws
 from .verification import VerifyResult, verify_log
-from .virtual_comparison import RecordComparison, compare_with_virtual
+from .virtual_comparison import compare_with_virtual
 
 _MAX_GAPS_NAMED = 60
 """Largest number of gaps that a finding lists."""
@@ -140,37 +140,38 @@ class LogCheckReport(CheckReport):
             findings = [_add_memory_advice(finding, log, result) for finding in findings]
         return LogCheckReport(log, result, findings)
 
+    @classmethod
+    def check_files(
+        cls, sources: Sequence[str], min_coverage: float, allowed: CodeConsents
+    ) -> list[Finding]:
+        """Checks one log, as a function that a worker process of a pool can run.
+
+        Many logs can thus be checked in parallel: the arguments and the result can be sent to
+        another process. A user's control law that cannot be created gives a failed finding
+        instead of an error.
+
+        Args:
+            sources: Paths of the files that the log consists of.
+            min_coverage: Smallest fraction of the ticks (control periods) of every site that
+                must be compared.
+            allowed: Permissions to run users' code, in addition to the permissions of this
+                process.
+
+        Returns:
+            One finding for each check.
+        """
+        allowed_code.update(allowed)
+        log = open_log(*sources)
+        try:
+            return cls.of_log(log, virtual=True, min_coverage=min_coverage).findings
+        except ScenarioError as error:
+            return [Finding("executed again", f"cannot be: {error}", False)]
+
 
 def _to_range(gap: tuple[str, int, int]) -> dict[str, Any]:
     """Returns a range of ticks as plain values."""
     site, first, last = gap
     return {"site": site, "first": first, "last": last}
-
-
-def check_log_files(
-    sources: Sequence[str], min_coverage: float, allowed: CodeConsents
-) -> list[Finding]:
-    """Checks one log, as a function that a worker process of a pool can run.
-
-    Many logs can thus be checked in parallel: the arguments and the result can be sent to
-    another process. A user's control law that cannot be created gives a failed finding instead
-    of an error.
-
-    Args:
-        sources: Paths of the files that the log consists of.
-        min_coverage: Smallest fraction of the ticks (control periods) of every site that must
-            be compared.
-        allowed: Permissions to run users' code, in addition to the permissions of this process.
-
-    Returns:
-        One finding for each check.
-    """
-    allowed_code.update(allowed)
-    log = open_log(*sources)
-    try:
-        return LogCheckReport.of_log(log, virtual=True, min_coverage=min_coverage).findings
-    except ScenarioError as error:
-        return [Finding("executed again", f"cannot be: {error}", False)]
 
 
 def _check_log(
@@ -254,7 +255,7 @@ def _check_virtual_time(
     # The arrivals in a gap are unknown, so a difference after the first gap is excused.
     first_gap_tick = min((first for _, first, _ in result.gaps), default=None)
     label = "virtual time fed with the log's arrivals"
-    yield _check_comparison(label, comparison.fed, first_gap_tick)
+    yield comparison.fed.to_finding(label, first_gap_tick)
 
     reason = ""
     if log.scenario.external:
@@ -275,7 +276,7 @@ def _check_virtual_time(
         description += f"; {len(lost_samples)} lost on the way, the first: {lost_samples[0]}"
     label = f"plain virtual time ({description})"
     first_affected_tick = comparison.excused_from
-    yield _check_comparison(label, comparison.plain, first_affected_tick)
+    yield comparison.plain.to_finding(label, first_affected_tick)
 
 
 def _check_coverage(log: Log, result: VerifyResult) -> Finding:
@@ -425,22 +426,3 @@ def _describe_gaps(gaps: Sequence[tuple[str, int, int]]) -> str:
     if remaining < 0:
         text += f" and {count_nouns(-remaining, 'more range')}, which --json names"
     return text
-
-
-def _check_comparison(
-    label: str, comparison: RecordComparison, excused_from: int | None
-) -> Finding:
-    """Returns the finding that states whether a log equals another execution of its run.
-
-    Args:
-        label: Name of the check.
-        comparison: The comparison.
-        excused_from: Tick (control period) from which differences are expected and do not fail
-            the check. None if there is no such tick.
-    """
-    first = comparison.first
-    text = f"{comparison.identical}/{count_nouns(comparison.records, 'record')} identical"
-    if first is None:
-        return Finding(label, text, True)
-    excused = excused_from is not None and first.tick >= excused_from
-    return Finding(label, f"{text}; the first that differs: {first}", excused)

@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core import MAX_ARRIVALS, Array, IntArray, RecordedRows, Site, TickRepeater, leaf
+from ..core import MAX_ARRIVALS, Array, IntArray, RecordedRows, TickRepeater, leaf
 from ..log import IndexedRecords, Log, SiteLog
 from ..records import NS_PER_S
 
@@ -45,38 +45,38 @@ class SampleTable(NamedTuple):
     rows: IntArray
     sites: Mapping[str, int]
 
+    @classmethod
+    def of_log(cls, log: Log) -> "SampleTable | None":
+        """Collects the states (samples) that all sites of a log sent, for the compiled loop.
 
-def make_sample_table(log: Log) -> SampleTable | None:
-    """Collects the states (samples) that all sites of a log sent, for the compiled loop.
+        The loop executes a site (arm controller) again, and looks up the content of each sample
+        that arrived.
 
-    The loop executes a site (arm controller) again, and looks up the content of each sample
-    that arrived.
+        Args:
+            log: The log.
 
-    Args:
-        log: The log.
-
-    Returns:
-        The samples. None if a record (result of a control period) of the log does not have the
-        exact layout.
-    """
-    bits = []
-    last_tick = max(site_log.last_tick for site_log in log.values())
-    rows = np.full((len(log), last_tick + 1), -1, np.int64)
-    sample_count = 0
-    for site, site_log in enumerate(log.values()):
-        if site_log.indexed is None:
+        Returns:
+            The samples. None if a record (result of a control period) of the log does not have
+            the exact layout.
+        """
+        bits = []
+        last_tick = max(site_log.last_tick for site_log in log.values())
+        rows = np.full((len(log), last_tick + 1), -1, np.int64)
+        sample_count = 0
+        for site, site_log in enumerate(log.values()):
+            if site_log.indexed is None:
+                return None
+            # A sender in task space sends the motion of its end effector.
+            fields = ("x", "xd", "wrench") if site_log.layout.task else ("q", "qd", "tau_x")
+            bits.append(site_log.indexed.vector_words(fields))
+            # Of several records of one tick, the last one counts.
+            rows[site, site_log.tick] = np.arange(sample_count, sample_count + len(site_log))
+            sample_count += len(site_log)
+        widths = {part_words.shape[1] for part_words in bits}
+        if len(widths) > 1:
             return None
-        # A sender in task space sends the motion of its end effector.
-        fields = ("x", "xd", "wrench") if site_log.layout.task else ("q", "qd", "tau_x")
-        bits.append(site_log.indexed.vector_words(fields))
-        # Of several records of one tick, the last one counts.
-        rows[site, site_log.tick] = np.arange(sample_count, sample_count + len(site_log))
-        sample_count += len(site_log)
-    widths = {part_words.shape[1] for part_words in bits}
-    if len(widths) > 1:
-        return None
-    sites = {name: site for site, name in enumerate(log)}
-    return SampleTable(np.concatenate(bits), rows, sites)
+        sites = {name: site for site, name in enumerate(log)}
+        return cls(np.concatenate(bits), rows, sites)
 
 
 @leaf
@@ -307,12 +307,3 @@ def _read_plants(block: IndexedRecords) -> Array:
     """
     vectors = block.vectors(["q", "qd", "tau_x"])
     return np.concatenate([vectors["q"], vectors["qd"], -vectors["tau_x"]], axis=1)
-
-
-def can_repeat(site: Site) -> bool:
-    """True if compiled code can execute the recorded control periods of a site again.
-
-    Compiled code is much faster than Python, but cannot call a user's own control law. A site
-    is the controller of one arm.
-    """
-    return not site.parts.has_user_law

@@ -45,14 +45,11 @@ from .resumption import (
     RecordedInputs,
     find_recorded_hand,
     make_arrival,
-    read_output,
 )
 from .verification import (
     PROGRESS_EVERY,
     RecordDifference,
-    equal_bits,
     equal_record,
-    find_first_difference,
 )
 from .virtual_network import Deliveries
 
@@ -433,7 +430,7 @@ class RerunTick(NamedTuple):
     stats: LinkStats | None
 
 
-class RerunSite:
+class _RerunSite:
     """Executes one site (arm controller) of a log again, tick (control period) by tick.
 
     The state of the site is certain if it follows from the ticks before. It becomes uncertain
@@ -606,11 +603,10 @@ class RerunSite:
             if not same and not self._changed and self._inputs.is_uncertain(state, output):
                 return self._keep_record(row)
             if not same and self.first is None:
-                self.first = find_first_difference(
+                self.first = RecordDifference.find(
                     logged=state,
                     computed=comparable,
                     peers=self._site_log.peers,
-                    equal=equal_bits,
                     channel=self._channel,
                 )
 
@@ -644,7 +640,7 @@ class RerunSite:
             row: Index of the record in the log.
         """
         self._certain = False
-        output = read_output(self._site_log.states[row], self._site_log.peers)
+        output = self._site_log.states[row].to_tick_record(self._site_log.peers)
         self.output = output
         return RerunTick(
             site=self.name,
@@ -696,7 +692,7 @@ class RerunExecution:
         # The computed samples are added to these dictionaries during the execution.
         samples |= self._recent
         self.sites = {
-            name: RerunSite(
+            name: _RerunSite(
                 log=log,
                 request=request,
                 name=name,
@@ -785,7 +781,7 @@ class RerunExecution:
             if progress is not None and executed % PROGRESS_EVERY == 0:
                 progress(executed, total)
 
-    def _keep_sample(self, site: RerunSite) -> None:
+    def _keep_sample(self, site: _RerunSite) -> None:
         """Stores the newest state of an executed site, which its peers will receive.
 
         States that are too old to arrive are removed.

@@ -21,7 +21,7 @@ import numpy as np
 
 from ..core import MAX_ARRIVALS, MAX_DELAY_US, CoreChange, LinkSetup, Site
 from ..log import SiteLog
-from ..net import MODES, RESTING_MODES, State
+from ..net import RESTING_MODES, State
 from ..records import NS_PER_S, Arrival, TickRecord
 
 _LOOK_BACK = 100
@@ -36,53 +36,6 @@ ArrivalEntry = Sequence[int]
 
 ReceivedMotion = State | Arrival
 """Sample of a peer: a record of the log, or a newly computed arrival."""
-
-
-def read_output(state: State, peers: tuple[str, ...]) -> TickRecord:
-    """Converts a record of a log to the object that an execution of the same tick returns.
-
-    A tick is one period of the control loop, and a record is its stored result. The object can
-    be compared with the result of executing the tick again by `Site.step`. Most fields are the
-    same in both forms, and are explained in `TickRecord`. Three fields differ:
-
-    - The mode is a word in the log. An unknown word, as in the log of another version, becomes
-      "diverged".
-    - `used`, the tick of the newest sample in use, is given by the name of the peer in the log,
-      and by the index of the peer in the object. -1 stands for no sample.
-    - `mem`, the memory of the site, is empty unless it is complete.
-
-    Args:
-        state: Record of a tick, as the log contains it.
-        peers: Names of the other sites (processes that each run one arm), in the order of the
-            scenario.
-    """
-    mode = MODES.get(state.mode, MODES["diverged"]).mode
-    # The memory begins with a pose, which has as many numbers as `q_des`. A memory without
-    # further numbers is not complete.
-    has_complete_memory = len(state.mem) > len(state.q_des)
-    mem = state.mem if has_complete_memory else []
-    return TickRecord(
-        tick=state.tick,
-        t_ns=state.t_ns,
-        mode=mode,
-        q=state.q,
-        qd=state.qd,
-        q_des=state.q_des,
-        qd_des=state.qd_des,
-        tau=state.tau,
-        tau_x=state.tau_x,
-        theta_hat=state.theta_hat,
-        used=[state.used.get(peer, -1) for peer in peers],
-        rx_crc=state.rx_crc,
-        cmd=state.cmd,
-        mem=mem,
-        x=state.x,
-        xd=state.xd,
-        wrench=state.wrench,
-        ch=state.ch,
-        hand=state.hand,
-        bodies=state.bodies,
-    )
 
 
 def make_arrival(
@@ -309,7 +262,7 @@ class RecordedInputs(Generic[Change]):
         last_record = states[row - 1]
         if detached and last_record.mode in RESTING_MODES:
             return True
-        used_ticks = read_output(last_record, self._site_log.peers).used
+        used_ticks = last_record.to_tick_record(self._site_log.peers).used
         for used_tick, samples in zip(used_ticks, self.samples, strict=True):
             has_sample = used_tick >= 0
             if has_sample and used_tick not in samples:
@@ -336,8 +289,8 @@ class RecordedInputs(Generic[Change]):
 
         # For each link the site stores the sample (state of a peer) that it uses, and newer
         # samples that have arrived, but wait until the delay of the link has passed.
-        before_last = read_output(states[row - 2], peers)
-        last = read_output(states[row - 1], peers)
+        before_last = states[row - 2].to_tick_record(peers)
+        last = states[row - 1].to_tick_record(peers)
         samples_in_use: list[Arrival | None] = []
         waiting_samples: list[Arrival] = []
         for peer, used_tick in enumerate(last.used):

@@ -30,7 +30,7 @@ from ..errors import NotRepeatable, UsageError, count_nouns
 from ..log import Ints, Log
 from ..records import NS_PER_S
 from ..scenario import Scenario
-from .fused import FusedRun, explain_not_repeatable, read_run_inputs
+from .fused import FusedRun
 
 MAX_PUSHES = 32
 """Largest number of pushes that are chosen if the user states no number."""
@@ -250,14 +250,14 @@ class Twins(NamedTuple):
                 records (results of control periods).
             LogError: A record cannot be read.
         """
-        reason = explain_not_repeatable(log, own_laws=own_laws)
+        reason = FusedRun.explain_not_repeatable(log, own_laws=own_laws)
         if reason:
             raise NotRepeatable(f"twins cannot be run: {reason}")
         return _run_twins(
             scenario=log.scenario,
             pushes=pushes,
             ticks=[len(log[name]) for name in log.scenario.names],
-            inputs=read_run_inputs(log),
+            inputs=FusedRun.read_inputs(log),
             log=log,
         )
 

@@ -1,10 +1,10 @@
 """Simulates a run in compiled code, and keeps its records as a log that was never encoded.
 
-`simulate_scenario` executes each tick in Python and writes a message for it. A study that
+`SimulatedLog` executes each tick in Python and writes a message for it. A study that
 judges thousands of runs, and needs the records of some, uses `simulate_columns` instead.
 
 Invariant:
-    - The columns have the same bits as those of the log that `simulate_scenario` returns.
+    - The columns have the same bits as those of the log that `SimulatedLog` returns.
 """
 
 from typing import Any
@@ -16,7 +16,7 @@ from ..log import Log, UnwrittenLog
 from ..records import NS_PER_S
 from ..scenario import Scenario
 from .fused import FusedRun
-from .virtual import simulate_scenario
+from .virtual import SimulatedLog
 
 _BLOCK_TICKS = 4096
 """Number of ticks of the fastest site after which the records are copied."""
@@ -38,14 +38,14 @@ def simulate_columns(scenario: Scenario) -> Log:
         LawFailed: A user's control law failed.
     """
     if not _is_described_by_columns(scenario):
-        return simulate_scenario(scenario)
+        return SimulatedLog(scenario)
     run = FusedRun(scenario, keep=_BLOCK_TICKS + 1)
     blocks: dict[str, list[Array]] = {name: [] for name in scenario.names}
     for batch in run.iterate_batches():
         for name, (_, rows) in zip(scenario.names, batch, strict=True):
             blocks[name].append(rows)
     if run.diverged_s is not None:
-        return simulate_scenario(scenario)
+        return SimulatedLog(scenario)
 
     columns = {}
     for i, name in enumerate(scenario.names):

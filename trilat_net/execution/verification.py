@@ -56,14 +56,22 @@ from ..own_code import find_user_laws
 from ..recorded_change import count_skipped_ticks
 from ..records import TickRecord
 from ..scenario import parse_core_change
-from .recorded_rows import LEAST_ROWS, PlainRows, SampleTable, can_repeat, make_sample_table
-from .resumption import ArrivalEntry, RecordedInputs, read_output
+from .recorded_rows import LEAST_ROWS, PlainRows, SampleTable
+from .resumption import ArrivalEntry, RecordedInputs
 
 TOLERANCE = 1e-9
 """Numbers a and b of different platforms count as equal if |a - b| <= TOLERANCE (1 + |a|)."""
 
 NumberEquality = Callable[[float, float], bool]
 """Function that decides whether a logged and a computed number count as equal."""
+
+
+def _equal_bits(a: float, b: float) -> bool:
+    """True if two floating-point numbers are identical bit by bit.
+
+    Unlike `==`, this distinguishes -0.0 from 0.0, and counts two NaNs as equal.
+    """
+    return a.hex() == b.hex()
 
 
 class RecordDifference(NamedTuple):
@@ -112,18 +120,47 @@ class RecordDifference(NamedTuple):
             computed=failure.problem,
         )
 
+    @classmethod
+    def find(
+        cls,
+        logged: State,
+        computed: TickRecord,
+        peers: tuple[str, ...],
+        equal: NumberEquality = _equal_bits,
+        channel: LawChannel = LawChannel(),  # noqa: B008
+    ) -> "RecordDifference | None":
+        """Finds the first field of a record that differs from a repeated control period.
+
+        Args:
+            logged: Record of a tick (control period), as the log contains it.
+            computed: Result of executing the same tick again.
+            peers: Names of the other sites (arm controllers), in the order of the scenario.
+            equal: Function that decides whether two numbers count as equal. By default, they
+                must have the same bits.
+            channel: Layout of the vectors that the site's control law sends, with their names.
+                By default, the law sends no vectors.
+
+        Returns:
+            The difference. None if all computed fields agree.
+        """
+        comparisons = _compare_fields(
+            logged=logged, computed=computed, peers=peers, equal=equal, channel=channel
+        )
+        for name, logged_value, computed_value, is_equal in comparisons:
+            if not is_equal:
+                return cls(
+                    site=logged.site,
+                    tick=logged.tick,
+                    field=name,
+                    logged=logged_value,
+                    computed=computed_value,
+                )
+        return None
+
 
 def _format_value(value: object) -> str:
     """Returns a value as a string. The text of a floating-point number also shows its bits."""
     return f"{value!r} ({value.hex()})" if isinstance(value, float) else repr(value)
-
-
-def equal_bits(a: float, b: float) -> bool:
-    """True if two floating-point numbers are identical bit by bit.
-
-    Unlike `==`, this distinguishes -0.0 from 0.0, and counts two NaNs as equal.
-    """
-    return a.hex() == b.hex()
 
 
 def _equal_to_tolerance(a: float, b: float) -> bool:
@@ -147,7 +184,7 @@ def equal_record(logged: State, computed: TickRecord, peers: tuple[str, ...]) ->
     """True if a record has the same bits as the result of executing its tick again.
 
     All computed fields are compared. Nearly all records are equal, so this function is
-    optimised for speed. If it returns False, `find_first_difference` finds the field that
+    optimised for speed. If it returns False, `RecordDifference.find` finds the field that
     differs.
 
     Args:
@@ -166,41 +203,6 @@ def equal_record(logged: State, computed: TickRecord, peers: tuple[str, ...]) ->
     )
 
 
-def find_first_difference(
-    logged: State,
-    computed: TickRecord,
-    peers: tuple[str, ...],
-    equal: NumberEquality,
-    channel: LawChannel = LawChannel(),  # noqa: B008
-) -> RecordDifference | None:
-    """Finds the first field of a record that differs from a repeated control period.
-
-    Args:
-        logged: Record of a tick (control period), as the log contains it.
-        computed: Result of executing the same tick again.
-        peers: Names of the other sites (arm controllers), in the order of the scenario.
-        equal: Function that decides whether two numbers count as equal.
-        channel: Layout of the vectors that the site's control law sends, with their names. By
-            default, the law sends no vectors.
-
-    Returns:
-        The difference. None if all computed fields agree.
-    """
-    comparisons = _compare_fields(
-        logged=logged, computed=computed, peers=peers, equal=equal, channel=channel
-    )
-    for name, logged_value, computed_value, is_equal in comparisons:
-        if not is_equal:
-            return RecordDifference(
-                site=logged.site,
-                tick=logged.tick,
-                field=name,
-                logged=logged_value,
-                computed=computed_value,
-            )
-    return None
-
-
 def _compare_fields(
     logged: State,
     computed: TickRecord,
@@ -210,7 +212,7 @@ def _compare_fields(
 ) -> Iterator[tuple[str, Any, Any, bool]]:
     """Compares a recorded control period with its repeated execution, field by field.
 
-    See `find_first_difference`.
+    See `RecordDifference.find`.
 
     Yields:
         Name of the field, logged value, computed value, and whether they are equal.
@@ -412,7 +414,7 @@ class _SiteVerifier:
         self._start_tick = 0
         self._applied: list[CoreChange] = []
         self._resume_every = resume_every
-        self._equal = equal_bits if result.whole_run else _equal_to_tolerance
+        self._equal = _equal_bits if result.whole_run else _equal_to_tolerance
         self._certain = True
         self._law_failed = False
         self._plain_rows: PlainRows | None = None
@@ -422,7 +424,9 @@ class _SiteVerifier:
         self._single_records = 0
         self._next_single_records = 1
         indexed = self._log.indexed
-        if samples is not None and indexed is not None and can_repeat(self._site):
+        # Compiled code cannot call a user's own control law.
+        has_user_law = self._site.parts.has_user_law
+        if samples is not None and indexed is not None and not has_user_law:
             self._plain_rows = PlainRows(self._log, indexed, samples, resume_every)
         self._states = _list_states(self._log, lazy=self._plain_rows is not None)
         self._inputs = RecordedInputs(
@@ -726,8 +730,8 @@ class _SiteVerifier:
         # On another platform, each tick is computed from the two records before it.
         follows_two = row - 2 >= self._start_row and states[row - 2].tick == state.tick - 2
         if follows_two and not result.whole_run:
-            before = read_output(states[row - 2], peers)
-            last = read_output(states[row - 1], peers)
+            before = states[row - 2].to_tick_record(peers)
+            last = states[row - 1].to_tick_record(peers)
             self._site.restore_state(before, last)
 
         arrivals, missing = self._inputs.find_arrivals(state.rx)
@@ -755,7 +759,7 @@ class _SiteVerifier:
 
         difference = invalid_change or invalid_arrival or difference
         if difference is None and not equal_record(state, output, peers):
-            difference = find_first_difference(
+            difference = RecordDifference.find(
                 logged=state,
                 computed=output,
                 peers=peers,
@@ -910,7 +914,7 @@ def _execute_sites(
         resume_every: See `verify_log`.
     """
     # On another platform, each tick is computed from the two records before it.
-    samples = make_sample_table(log) if result.whole_run else None
+    samples = SampleTable.of_log(log) if result.whole_run else None
     if samples is None:
         _map_records(log, lazy=False)  # raises an error if a record cannot be read
     withheld_laws = [law for law in find_user_laws(log.scenario) if not law.allowed]

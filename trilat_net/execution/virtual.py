@@ -63,7 +63,7 @@ from ..own_code import ImportedLaw
 from ..recorded_change import count_skipped_ticks
 from ..records import NS_PER_S, Arrival, Mode, TickRecord
 from ..scenario import POLICY, PlantPlayer, Scenario, make_hand_players, make_plant_players
-from .resumption import read_output, select_peer_channels
+from .resumption import select_peer_channels
 from .virtual_network import Network, PromptNetwork
 
 
@@ -233,7 +233,7 @@ class SiteChannels:
                 site=state.site,
                 boot=state.boot,
                 peers=self.peers,
-                output=read_output(state, self.peers),
+                output=state.to_tick_record(self.peers),
                 arrivals=arrivals,
                 late_us=state.late_us,
                 busy_us=state.busy_us,
@@ -694,22 +694,45 @@ def record_virtual(
 
 
 class SimulatedLog(Log):
-    """Log of a simulated run, held in memory.
+    """Log of a run that this object simulates in virtual time, held in memory.
 
-    `simulate_scenario` returns it. It can be used like a log that was read from a file, and
-    `save` writes it to a file.
+    In virtual time, all sites (arm controllers) run in this process, as fast as possible. The
+    object can be used like a log that was read from a file, and `save` writes it to a file.
 
     Args:
-        write: Function that runs the scenario and writes its log. Its arguments are the stream
-            to write to, and the rate of the additional channels for viewers in Hz.
+        scenario: Description of the experiment.
+        hands: Actions of live operators, see `execute_virtual`. By default, nobody moves the
+            arms.
+
+    Raises:
+        ScenarioError: The scenario cannot run in virtual time.
+        LawFailed: A user's control law failed.
     """
 
-    def __init__(self, write: Callable[[Sink, float], object]) -> None:
+    def __init__(
+        self,
+        scenario: Scenario,
+        *,
+        hands: HandTracks = {},  # noqa: B006
+    ) -> None:
         stream = io.BytesIO()
-        write(stream, 0.0)
+        write_virtual_log(scenario, stream, hands=hands)
         stream.seek(0)
         super().__init__(LogContents.read(stream, "log", trusted=True))
-        self._write = write
+        self._simulated_scenario = scenario
+        self._hands = hands
+
+    @classmethod
+    def without_operators(cls, log: Log) -> "SimulatedLog":
+        """Simulates the experiment of a log, up to its last record, but without operators.
+
+        An operator is a person or program that moves an arm. The result shows how the arms move
+        without operators.
+
+        Args:
+            log: The log that contains the scenario.
+        """
+        return cls(cut_to_records(log).without_hands())
 
     def save(self, path: str | Path, *, force: bool = False) -> Path:
         """Writes the log to a file, as `trilat sim -o` does.
@@ -729,30 +752,16 @@ class SimulatedLog(Log):
             LogRefused: The disk refused to store the log.
         """
         with LogFile(Path(path), force=force) as stream:
-            self._write(stream, VIZ_HZ)
+            write_virtual_log(
+                self._simulated_scenario, stream, views_hz=VIZ_HZ, hands=self._hands
+            )
         return Path(path)
 
 
-def simulate_scenario(
-    scenario: Scenario,
-    *,
-    hands: HandTracks = {},  # noqa: B006
-) -> SimulatedLog:
-    """Simulates an experiment in virtual time, and returns the log of the run.
-
-    In virtual time, all sites (arm controllers) run in this process, as fast as possible.
-
-    Args:
-        scenario: Description of the experiment.
-        hands: Actions of live operators, see `execute_virtual`. By default, nobody moves the
-            arms.
-
-    Raises:
-        ScenarioError: The scenario cannot run in virtual time.
-        LawFailed: A user's control law failed.
-    """
-
-    def write(stream: Sink, views_hz: float) -> None:
-        write_virtual_log(scenario, stream, views_hz=views_hz, hands=hands)
-
-    return SimulatedLog(write)
+def cut_to_records(log: Log) -> Scenario:
+    """Returns the scenario of a log, shortened so that it ends at the last record."""
+    ends_s = [
+        (log[name].last_tick + 1) / log[name].rate_hz for name in log.sites if len(log[name])
+    ]
+    duration_s = min(log.scenario.duration_s, max(ends_s, default=log.scenario.duration_s))
+    return msgspec.structs.replace(log.scenario, duration_s=duration_s)

@@ -18,28 +18,24 @@ from contextlib import suppress
 from functools import partial
 from typing import NamedTuple
 
-import msgspec
 import numpy as np
 
 from .. import process
 from ..core import PlantState, Site
-from ..errors import LawFailed, LogError
-from ..log import Log, Progress, SiteLog
+from ..errors import LawFailed, LogError, count_nouns
+from ..log import Finding, Log, Progress, SiteLog
 from ..records import NS_PER_S, TickRecord
-from ..scenario import Scenario
 from . import virtual
 from .resumption import ArrivalEntry, find_recorded_hand
 from .verification import (
     PROGRESS_EVERY,
     RecordDifference,
-    equal_bits,
     equal_record,
-    find_first_difference,
 )
 from .virtual_network import Deliveries, Network, RecordedNetwork
 
 
-class RecordComparison(NamedTuple):
+class _RecordComparison(NamedTuple):
     """Result of comparing the records of a log with another execution of the same run.
 
     Attributes:
@@ -52,6 +48,21 @@ class RecordComparison(NamedTuple):
     records: int
     identical: int
     first: RecordDifference | None
+
+    def to_finding(self, label: str, excused_from: int | None) -> Finding:
+        """Returns the finding that states whether a log equals another execution of its run.
+
+        Args:
+            label: Name of the check.
+            excused_from: Tick (control period) from which differences are expected and do not
+                fail the check. None if there is no such tick.
+        """
+        first = self.first
+        text = f"{self.identical}/{count_nouns(self.records, 'record')} identical"
+        if first is None:
+            return Finding(label, text, True)
+        excused = excused_from is not None and first.tick >= excused_from
+        return Finding(label, f"{text}; the first that differs: {first}", excused)
 
 
 class _LateSample(NamedTuple):
@@ -87,7 +98,7 @@ class _LateSample(NamedTuple):
 
 def _compare_records(
     log: Log, executed: Iterable[tuple[str, TickRecord]], *, arrivals: bool
-) -> RecordComparison:
+) -> _RecordComparison:
     """Compares every record of a log with another execution of the run, bit for bit.
 
     Args:
@@ -113,12 +124,12 @@ def _compare_records(
             if equal_record(state, computed, peers):
                 identical += 1
                 continue
-            difference = find_first_difference(state, computed, peers, equal_bits)
+            difference = RecordDifference.find(state, computed, peers)
             if first is None or (difference is not None and difference.tick < first.tick):
                 first = difference
     except LawFailed as failure:  # the law did not fail when the log was recorded
         first = first or RecordDifference.of_law_failure(failure)
-    return RecordComparison(records, identical, first)
+    return _RecordComparison(records, identical, first)
 
 
 def find_absent_samples(log: Log) -> list[_LateSample]:
@@ -244,8 +255,8 @@ class _VirtualComparison(NamedTuple):
             they were due.
     """
 
-    fed: RecordComparison
-    plain: RecordComparison
+    fed: _RecordComparison
+    plain: _RecordComparison
     absent: list[_LateSample]
 
     @property
@@ -286,7 +297,7 @@ def compare_with_virtual(log: Log, progress: Progress | None = None) -> _Virtual
         progress: Function that is called now and then with the number of executed ticks and
             their total.
     """
-    scenario = _cut_to_records(log)
+    scenario = virtual.cut_to_records(log)
     total = 2 * sum(map(scenario.ticks, scenario.names))
     peers = {name: scenario.peers(name) for name in scenario.names}
     arm_states = {
@@ -333,7 +344,7 @@ def compare_with_virtual(log: Log, progress: Progress | None = None) -> _Virtual
         arrivals = {name: _read_arrivals(log, name) for name in log.sites}
         fed = _compare_records(log, execute(RecordedNetwork(arrivals, peers), 0), arrivals=True)
         if arm_states:
-            plain = RecordComparison(0, 0, None)
+            plain = _RecordComparison(0, 0, None)
         else:
             plain = _compare_records(log, execute(None, total // 2), arrivals=False)
         return _VirtualComparison(fed, plain, find_absent_samples(log))
@@ -350,27 +361,3 @@ def _read_arrivals(log: Log, name: str) -> Mapping[int, Sequence[ArrivalEntry]]:
     with suppress(LogError):
         return Deliveries.complete(site_log, rates_hz, ends).entries
     return Deliveries.read(site_log).entries
-
-
-def _cut_to_records(log: Log) -> Scenario:
-    """Returns the scenario of a log, shortened so that it ends at the last record."""
-    ends_s = [
-        (log[name].last_tick + 1) / log[name].rate_hz for name in log.sites if len(log[name])
-    ]
-    duration_s = min(log.scenario.duration_s, max(ends_s, default=log.scenario.duration_s))
-    return msgspec.structs.replace(log.scenario, duration_s=duration_s)
-
-
-def simulate_without_operators(log: Log) -> Log:
-    """Simulates the experiment of a log in virtual time, but without operators.
-
-    An operator is a person or program that moves an arm. The result shows how the arms move
-    without operators.
-
-    Args:
-        log: The log that contains the scenario.
-
-    Returns:
-        The log of the simulation.
-    """
-    return virtual.simulate_scenario(_cut_to_records(log).without_hands())

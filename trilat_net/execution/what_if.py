@@ -50,8 +50,7 @@ from ..net import READABLE, State, decode
 from ..own_code import find_user_laws
 from ..records import NS_PER_S, Mode
 from ..results import Result, finite_or_none
-from .rerun_execution import RerunExecution, RerunOverrides, RerunRequest, RerunSite, RerunTick
-from .resumption import read_output
+from .rerun_execution import RerunExecution, RerunOverrides, RerunRequest, RerunTick
 from .verification import RecordDifference
 from .virtual import SiteChannels, SiteEntry, render_accounts
 
@@ -180,14 +179,19 @@ class _CommonRecords(NamedTuple):
 
 
 def _compare_site_rerun(
-    log: Log, request: RerunRequest, site: RerunSite, ticks: Sequence[RerunTick]
+    log: Log,
+    request: RerunRequest,
+    execution: RerunExecution,
+    name: str,
+    ticks: Sequence[RerunTick],
 ) -> tuple[_SiteEffect, list[_LinkEffect]]:
     """Computes how a repeated run differs at one arm, and on the links to this arm.
 
     Args:
         log: The log that was executed again.
         request: Executed sites and changed settings of the rerun.
-        site: The executed site, after its last tick.
+        execution: The rerun, after its last tick.
+        name: Name of the executed site.
         ticks: All ticks of this site in the rerun, in order of time.
 
     Returns:
@@ -195,12 +199,13 @@ def _compare_site_rerun(
     """
     # Copied records are neither executed nor compared.
     executed = [tick for tick in ticks if not tick.kept]
-    records = _pair_records(log, request, site.name, executed)
+    records = _pair_records(log, request, name, executed)
     diverged_at_s = None
     if executed and executed[-1].mode is Mode.DIVERGED:
         diverged_at_s = executed[-1].t_ns / NS_PER_S
+    site = execution.sites[name]
     effect = _SiteEffect(
-        site.name,
+        name,
         executed=len(executed),
         compared=len(records.before_rows),
         identical=sum(tick.same for tick in executed),
@@ -516,9 +521,11 @@ def rerun(
     with process.pause_gc():
         execution = RerunExecution(before, request)
         ticks = list(execution.run(progress))
-        for name, site in execution.sites.items():
+        for name in execution.sites:
             site_ticks = [tick for tick in ticks if tick.site == name]
-            sites[name], effects = _compare_site_rerun(before, request, site, site_ticks)
+            sites[name], effects = _compare_site_rerun(
+                before, request, execution, name, site_ticks
+            )
             links.update({effect.link: effect for effect in effects})
     return Rerun(before, request, ticks, sites, links)
 
@@ -588,7 +595,7 @@ def _make_executed_entries(
     for tick in ticks:
         state = decode(tick.payload, State, READABLE)
         yield channels.make_record_entry(state, tick.payload)
-        output = read_output(state, channels.peers)
+        output = state.to_tick_record(channels.peers)
         yield from channels.make_tick_entries(output, tick.stats)
     yield channels.make_end_entry()
 

@@ -29,10 +29,7 @@ __all__ = [
     "SentVectorSpecs",
     "TuningRun",
     "TuningSite",
-    "check_law_class",
     "convert_sends",
-    "format_class_name",
-    "make_instance",
     # Conditions of stability
     "COMMON_MOTION_SHARE",
     "ArmLoad",
@@ -41,7 +38,6 @@ __all__ = [
     "LinearForm",
     "LinearSituation",
     "StabilityCondition",
-    "find_least_reversible",
 ]
 
 if TYPE_CHECKING:
@@ -54,7 +50,6 @@ if TYPE_CHECKING:
         LinearForm,
         LinearSituation,
         StabilityCondition,
-        find_least_reversible,
     )
     from .interface import (
         DAMPING,
@@ -64,9 +59,6 @@ if TYPE_CHECKING:
         LawSettings,
         TuningRun,
         TuningSite,
-        check_law_class,
-        format_class_name,
-        make_instance,
     )
     from .p_d import PD
     from .sent_vectors import SentVectorSpecs, convert_sends
@@ -78,11 +70,10 @@ else:
             "adaptive": "Adaptive",
             "conditions": (
                 "ArmLoad BlockKey COMMON_MOTION_SHARE LawSituation LinearForm "
-                "LinearSituation StabilityCondition find_least_reversible"
+                "LinearSituation StabilityCondition"
             ),
             "interface": (
-                "ControlLaw DAMPING ERROR_DAMPING GainRange LawSettings TuningRun "
-                "TuningSite check_law_class format_class_name make_instance"
+                "ControlLaw DAMPING ERROR_DAMPING GainRange LawSettings TuningRun TuningSite"
             ),
             "p_d": "PD",
             "sent_vectors": "SentVectorSpecs convert_sends",

@@ -24,7 +24,6 @@ from .conditions import (
     LinearForm,
     LinearSituation,
     StabilityCondition,
-    judge_position_exchange,
 )
 from .interface import DAMPING, STIFFNESS, ControlLaw, TuningSite
 
@@ -183,7 +182,7 @@ class Authority(ControlLaw):
             )
             return StabilityCondition(True, text)
         loop_of_users = situation.restrict(users)
-        return judge_position_exchange(loop_of_users, "d")
+        return loop_of_users.judge_position_exchange("d")
 
     @classmethod
     def write_control(cls, gains: Mapping[str, float], site: TuningSite) -> dict[str, Any]:

@@ -18,7 +18,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ..core import Array, find_balancing_weights
+from ..core import Array, DominanceMatrix
 
 PASSIVE_OUTSIDE = "operators and environments are passive (*sufficient*)"
 """The premise of each law that balances energy, as part of a sentence."""
@@ -109,6 +109,73 @@ class LawSituation(NamedTuple):
             hands=tuple(self.hands[n] for n in sites) if self.hands else (),
         )
 
+    def judge_position_exchange(self, damping: str) -> "StabilityCondition | None":
+        """Evaluates whether arms that are coupled by springs and braked by dampers are stable.
+
+        The control law is called P+d. Its condition holds for arms of any mass. For two arms,
+        it is due to Nuno, Basanez, Ortega and Spong, IJRR 28, 2009. More than two arms need the
+        same stiffness K, damping d and delay T at all arms, and reversible weights with which
+        they follow each other, see `DominanceMatrix.find_balancing_weights`
+        (docs/theory/damping-conditions.md, 13).
+
+        A torque that is held for the period h acts h / 2 later. Therefore d is reduced by
+        K h / 2 and T increased by h / 2, for arms whose least inertia is above d h / 2
+        (docs/reference/laws-springs.md).
+
+        Args:
+            damping: Name of the law's attribute with d.
+
+        Returns:
+            The condition. It is undecided for delays that vary, for several tick rates, in task
+            space, if the sites have different laws or ratios Kd / K, and if another site does
+            not compensate gravity exactly. None if the law of this site does not compensate
+            gravity exactly, because then no condition is known.
+        """
+        laws = self.laws
+        gravity_factors = [getattr(law, "gravity", 1.0) for law in laws]
+        if gravity_factors[self.site] != 1.0:
+            return None
+        if self.in_task_space:
+            # The stiffness belongs to coordinates of the end effector, and the damping to
+            # joints.
+            return StabilityCondition(None, "known only for joints that follow joints")
+        if not self.alpha.any():
+            text = (
+                "no arm follows another, so there is no loop: stable in continuous time for "
+                "every delay and d > 0"
+            )
+            return StabilityCondition(True, text)
+        hold_s = self.hold_s
+        K = np.array([getattr(law, "K", [np.nan]) for law in laws])
+        d = np.array([getattr(law, damping, [np.nan]) for law in laws])
+
+        # Cases in which no condition is known. A law without K has NaN here.
+        if np.isnan(self.longest_s) or np.isnan(K).any():
+            text = "known for constant delays, and with this law at all sites"
+            return StabilityCondition(None, text)
+        if any(factor != 1.0 for factor in gravity_factors):
+            return StabilityCondition(None, "known for gravity = 1 at all sites")
+        error_dampings = [np.broadcast_to(getattr(law, "Kd", 0.0), K.shape[1:]) for law in laws]
+        ratios_s = np.array(error_dampings) / K
+        if not np.allclose(ratios_s, ratios_s[0], rtol=1e-9, atol=0.0):
+            # docs/theory/damping-conditions.md: with other ratios some arms are unstable
+            return StabilityCondition(None, "known for one ratio Kd / K at all sites")
+        if np.isnan(hold_s):
+            text = "known for held torques only with one tick rate at all sites"
+            return StabilityCondition(None, text)
+
+        scope = "sufficient in continuous time, whatever the masses"
+        if hold_s:
+            damps_error = any(np.any(getattr(law, "Kd", 0.0)) for law in laws)
+            least_inertia = 0.5 * float(d.max()) * hold_s
+            scope = f"sufficient for arms above d h / 2 = {least_inertia:.3g} kg m^2"
+            if damps_error:
+                scope = "sufficient for heavy arms"
+
+        if len(laws) == 2:
+            return _judge_two_sites(self, K, d, scope)
+        return _judge_several_sites(self, K, d, scope)
+
 
 class StabilityCondition(NamedTuple):
     """Answer to the question whether a control law is stable at one arm of an experiment.
@@ -126,93 +193,6 @@ class StabilityCondition(NamedTuple):
     holds: bool | None
     text: str
     proves_decay: bool = False
-
-
-def find_least_reversible(alpha: Array) -> float | None:
-    """Returns the least eigenvalue of a dominance matrix, or None if it is not reversible.
-
-    Row i of the matrix alpha contains the weights with which arm i follows the others. The
-    matrix is reversible if positive weights D_i exist with D_i alpha_ij = D_j alpha_ji. Then
-    all eigenvalues are real. The negative of the least eigenvalue is a lower bound on d / (K
-    T), where d is the damping, K the stiffness and T the delay, see `judge_position_exchange`.
-
-    Args:
-        alpha: Dominance matrix, shape (N, N).
-
-    Returns:
-        The eigenvalue. None if the matrix is not reversible.
-    """
-    if find_balancing_weights(alpha) is None:
-        return None
-    eigenvalues = np.linalg.eigvals(alpha)
-    return float(eigenvalues.real.min())
-
-
-def judge_position_exchange(situation: LawSituation, damping: str) -> StabilityCondition | None:
-    """Evaluates whether arms that are coupled by springs and braked by dampers are stable.
-
-    The control law is called P+d. Its condition holds for arms of any mass. For two arms, it is
-    due to Nuno, Basanez, Ortega and Spong, IJRR 28, 2009. More than two arms need the same
-    stiffness K, damping d and delay T at all arms, and reversible weights with which they
-    follow each other, see `find_least_reversible` (docs/theory/damping-conditions.md, 13).
-
-    A torque that is held for the period h acts h / 2 later. Therefore d is reduced by K h / 2
-    and T increased by h / 2, for arms whose least inertia is above d h / 2
-    (docs/reference/laws-springs.md).
-
-    Args:
-        situation: The situation of the site.
-        damping: Name of the law's attribute with d.
-
-    Returns:
-        The condition. It is undecided for delays that vary, for several tick rates, in task
-        space, if the sites have different laws or ratios Kd / K, and if another site does not
-        compensate gravity exactly. None if the law of this site does not compensate gravity
-        exactly, because then no condition is known.
-    """
-    laws = situation.laws
-    gravity_factors = [getattr(law, "gravity", 1.0) for law in laws]
-    if gravity_factors[situation.site] != 1.0:
-        return None
-    if situation.in_task_space:
-        # The stiffness belongs to coordinates of the end effector, and the damping to joints.
-        return StabilityCondition(None, "known only for joints that follow joints")
-    if not situation.alpha.any():
-        text = (
-            "no arm follows another, so there is no loop: stable in continuous time for every "
-            "delay and d > 0"
-        )
-        return StabilityCondition(True, text)
-    hold_s = situation.hold_s
-    K = np.array([getattr(law, "K", [np.nan]) for law in laws])
-    d = np.array([getattr(law, damping, [np.nan]) for law in laws])
-
-    # Cases in which no condition is known. A law without K has NaN here.
-    if np.isnan(situation.longest_s) or np.isnan(K).any():
-        text = "known for constant delays, and with this law at all sites"
-        return StabilityCondition(None, text)
-    if any(factor != 1.0 for factor in gravity_factors):
-        return StabilityCondition(None, "known for gravity = 1 at all sites")
-    error_dampings = [np.broadcast_to(getattr(law, "Kd", 0.0), K.shape[1:]) for law in laws]
-    ratios_s = np.array(error_dampings) / K
-    if not np.allclose(ratios_s, ratios_s[0], rtol=1e-9, atol=0.0):
-        # docs/theory/damping-conditions.md: with other ratios some arms are unstable
-        return StabilityCondition(None, "known for one ratio Kd / K at all sites")
-    if np.isnan(hold_s):
-        text = "known for held torques only with one tick rate at all sites"
-        return StabilityCondition(None, text)
-
-    scope = "sufficient in continuous time, whatever the masses"
-    if hold_s:
-        damps_error = any(np.any(getattr(law, "Kd", 0.0)) for law in laws)
-        least_inertia = 0.5 * float(d.max()) * hold_s
-        scope = f"sufficient for arms above d h / 2 = {least_inertia:.3g} kg m^2"
-        if damps_error:
-            scope = "sufficient for heavy arms"
-
-    if len(laws) == 2:
-        return _judge_two_sites(situation, K, d, scope)
-    return _judge_several_sites(situation, K, d, scope)
 
 
 def _judge_two_sites(
@@ -299,7 +279,7 @@ def _judge_several_sites(
     if gains_differ or np.ptp(delays_s):
         text = "known for more than two sites only with one K, one d and one delay"
         return StabilityCondition(None, text)
-    least = find_least_reversible(situation.alpha)
+    least = DominanceMatrix(situation.alpha).find_least_eigenvalue()
     if least is None:
         text = "shares that are not reversible: some heavy arms are unstable at any d"
         return StabilityCondition(False, text)

@@ -15,17 +15,19 @@ Invariant:
 
 import ast
 import inspect
+import pkgutil
 import re
 import sys
 import textwrap
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from importlib import import_module
 from typing import Any, ClassVar, NamedTuple, cast, get_origin
 
 import msgspec
 from msgspec.structs import asdict
 
 from ..core import Array, Gains, Law, LawContext, UserLaw, UserLawFactory
-from ..errors import ScenarioError, count_nouns, describe_exception
+from ..errors import ScenarioError, count_nouns
 from ..fields import Frozen, KeyProblem, NotNegative
 from ..files import find_page
 from .conditions import LawSituation, LinearForm, LinearSituation, StabilityCondition
@@ -297,6 +299,48 @@ class LawSettings(Frozen, frozen=True):
         sends = getattr(self.kind, "sends", {})
         return convert_sends(sends, self.kind.__name__, "control")
 
+    @staticmethod
+    def check_class(
+        kind: Any,
+        code: str,
+        context: LawContext,
+        sites: int,
+        scheme: str,
+    ) -> None:
+        """Rejects a class that is not a control law, or that does not suit the arm.
+
+        A law may restrict its use by class attributes: the number of arms by `sites = 2` or
+        `sites = (2, 4)`, the integration scheme by `schemes = ("digital",)`, and by
+        `needs_theta = True` to arms with known dynamic parameters.
+
+        Args:
+            kind: The class.
+            code: Name of the law for errors, as in "mylaws:Spring".
+            context: Facts about the arm and its controller.
+            sites: Number of arms (sites) in the scenario.
+            scheme: Integration scheme of the scenario.
+
+        Raises:
+            ScenarioError: The class is unsuitable. The error contains the path of the key.
+        """
+        path = f"sites.{context.site}.control.law"
+        _check_methods(kind, code, path)
+        _check_site_count(kind, code, path, sites)
+
+        schemes = getattr(kind, "schemes", None) or (scheme,)
+        if scheme not in schemes:
+            allowed = " or ".join(map(repr, schemes))
+            problem = f"{code} is for scheme = {allowed}, but the scheme here is {scheme!r}"
+            raise ScenarioError(problem, path=path)
+
+        needs_theta = getattr(kind, "needs_theta", False)
+        if needs_theta and not context.theta:
+            problem = (
+                f"{code} needs the arm's parameters, which are unknown (arm.known = false): "
+                "identify the arm and leave known out, or choose a law that learns them"
+            )
+            raise ScenarioError(problem, path=path)
+
     def build_factory(self, sites: int, scheme: str) -> UserLawFactory | None:
         """Returns a function that creates the control law of one arm before a run.
 
@@ -318,21 +362,20 @@ class LawSettings(Frozen, frozen=True):
 
             Otherwise, the check of the class raises an error.
             """
-            check_law_class(
+            self.check_class(
                 kind=self.kind,
                 code=self.tag,
                 context=context,
                 sites=sites,
                 scheme=scheme,
             )
-            gains = asdict(self)
-            law: UserLaw = make_instance(self.kind, self.tag, context, gains)
+            law: UserLaw = self.kind(context, **asdict(self))
             return law
 
         return make_law
 
 
-def format_class_name(tag: str) -> str:
+def _format_class_name(tag: str) -> str:
     """Returns the name that the class of a law must have: "FourChannel" for "four_channel".
 
     Laws are found by their files. The rule links the file, the class and the name in a
@@ -364,8 +407,17 @@ class ControlLaw:
 
     def __init_subclass__(cls) -> None:
         tag = cls.__module__.rpartition(".")[2]
-        if cls.__name__ == format_class_name(tag):
+        if cls.__name__ == _format_class_name(tag):
             cls.Settings = _derive_settings(cls, tag)
+
+    @staticmethod
+    def find_built_in() -> "Iterator[type[ControlLaw]]":
+        """Yields the control law of each Python file in the package of laws that has one."""
+        for file in pkgutil.iter_modules(import_module(__package__).__path__):
+            module = import_module(f"{__package__}.{file.name}")
+            kind = getattr(module, _format_class_name(file.name), None)
+            if isinstance(kind, type) and issubclass(kind, ControlLaw):
+                yield kind
 
     def __init__(self, facts: LawContext, **gains: Any) -> None:
         """Creates the control law of one arm, with its gains as attributes.
@@ -527,48 +579,6 @@ def _depends_on_gains(name: str, value: Any) -> bool:
     return name in LawSettings.__annotations__
 
 
-def check_law_class(
-    kind: Any,
-    code: str,
-    context: LawContext,
-    sites: int,
-    scheme: str,
-) -> None:
-    """Rejects a class that is not a control law, or that does not suit the arm.
-
-    A law may restrict its use by class attributes: the number of arms by `sites = 2` or
-    `sites = (2, 4)`, the integration scheme by `schemes = ("digital",)`, and by
-    `needs_theta = True` to arms with known dynamic parameters.
-
-    Args:
-        kind: The class.
-        code: Name of the law for errors, as in "mylaws:Spring".
-        context: Facts about the arm and its controller.
-        sites: Number of arms (sites) in the scenario.
-        scheme: Integration scheme of the scenario.
-
-    Raises:
-        ScenarioError: The class is unsuitable. The error contains the path of the key.
-    """
-    path = f"sites.{context.site}.control.law"
-    _check_methods(kind, code, path)
-    _check_site_count(kind, code, path, sites)
-
-    schemes = getattr(kind, "schemes", None) or (scheme,)
-    if scheme not in schemes:
-        allowed = " or ".join(map(repr, schemes))
-        problem = f"{code} is for scheme = {allowed}, but the scheme here is {scheme!r}"
-        raise ScenarioError(problem, path=path)
-
-    needs_theta = getattr(kind, "needs_theta", False)
-    if needs_theta and not context.theta:
-        problem = (
-            f"{code} needs the arm's parameters, which are unknown (arm.known = false): "
-            "identify the arm and leave known out, or choose a law that learns them"
-        )
-        raise ScenarioError(problem, path=path)
-
-
 def _check_methods(kind: Any, code: str, path: str) -> None:
     """Rejects a class without a method `torque`, or with a memory that it does not declare.
 
@@ -671,39 +681,3 @@ def _find_written_attributes(kind: Any) -> list[str]:
             if match:
                 written.append(match[1])
     return written
-
-
-def make_instance(
-    kind: Any,
-    code: str,
-    context: Any,
-    settings: dict[str, Any],
-    path: str = "",
-) -> Any:
-    """Returns an instance of a user's class, created from its context and settings.
-
-    A class without a constructor receives neither.
-
-    Args:
-        kind: The class.
-        code: Name of the class for errors.
-        context: First argument of the class: the facts about the site.
-        settings: Keyword arguments of the class.
-        path: Path of the key for errors. By default the site's [control] table.
-
-    Raises:
-        ScenarioError: The class raised an exception, of any kind.
-    """
-    has_init = kind.__init__ is not object.__init__
-    has_new = kind.__new__ is not object.__new__
-    takes_arguments = has_init or has_new
-    try:
-        return kind(context, **settings) if takes_arguments else kind()
-    except (Exception, SystemExit) as error:  # the user's code may raise any exception
-        arguments = ", ".join(f"{key} = {value!r}" for key, value in settings.items())
-        error_path = path or f"sites.{context.site}.control"
-        problem = (
-            f"{code} cannot be created with {arguments or 'no settings'}: "
-            f"{describe_exception(error)}"
-        )
-        raise ScenarioError(problem, path=error_path) from None

@@ -16,7 +16,7 @@ import numpy as np
 
 from ..core import Array, Gains, Law
 from ..fields import NotNegative, NotNegativeCoordinates, NotNegativeJoints, PositiveCoordinates
-from .conditions import LawSituation, StabilityCondition, judge_position_exchange
+from .conditions import LawSituation, StabilityCondition
 from .interface import DAMPING, ERROR_DAMPING, STIFFNESS, ControlLaw, TuningSite
 
 
@@ -111,7 +111,7 @@ class LeeSpong(ControlLaw):
             The condition. None if the law does not compensate gravity exactly, because then no
             condition is known.
         """
-        return judge_position_exchange(situation, "damping")
+        return situation.judge_position_exchange("damping")
 
     @classmethod
     def write_control(cls, gains: Mapping[str, float], site: TuningSite) -> dict[str, Any]:

@@ -15,7 +15,7 @@ import numpy as np
 
 from ..core import Array, Gains, Law
 from ..fields import NotNegative, NotNegativeJoints, PositiveCoordinates
-from .conditions import LawSituation, StabilityCondition, judge_position_exchange
+from .conditions import LawSituation, StabilityCondition
 from .interface import DAMPING, STIFFNESS, ControlLaw
 
 
@@ -80,10 +80,10 @@ class PD(ControlLaw):
                 each other.
 
         Returns:
-            The condition of `judge_position_exchange`. None if the law does not compensate
-            gravity exactly, because then no condition is known.
+            The condition of `LawSituation.judge_position_exchange`. None if the law does not
+            compensate gravity exactly, because then no condition is known.
         """
-        return judge_position_exchange(situation, "d")
+        return situation.judge_position_exchange("d")
 
     def exchanges_positions(self) -> bool:
         """Returns True if the law couples the arms like passive springs and dampers.

@@ -15,7 +15,7 @@ import numpy as np
 
 from ..core import Array, Gains, Law
 from ..fields import NotNegative, NotNegativeCoordinates, NotNegativeJoints, PositiveCoordinates
-from .conditions import LawSituation, StabilityCondition, judge_position_exchange
+from .conditions import LawSituation, StabilityCondition
 from .interface import DAMPING, ERROR_DAMPING, STIFFNESS, ControlLaw
 
 
@@ -94,7 +94,7 @@ class PdD(ControlLaw):
             The condition of P+d on K and d. None if the law does not compensate gravity
             exactly, because then no condition is known.
         """
-        return judge_position_exchange(situation, "d")
+        return situation.judge_position_exchange("d")
 
     def exchanges_positions(self) -> bool:
         """Returns True if the law couples the arms like passive springs and dampers.

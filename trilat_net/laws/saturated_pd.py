@@ -17,7 +17,7 @@ import numpy as np
 
 from ..core import Array, Gains, Law, LawInput, compiled, tanh
 from ..fields import NotNegative, NotNegativeJoints, PositiveJoints
-from .conditions import LawSituation, StabilityCondition, judge_position_exchange
+from .conditions import LawSituation, StabilityCondition
 from .interface import DAMPING, STIFFNESS, ControlLaw
 
 
@@ -120,7 +120,7 @@ class SaturatedPd(ControlLaw):
             condition is known.
         """
         # The condition of P+d, a spring K to the peers and a damper d.
-        condition = judge_position_exchange(situation, "d")
+        condition = situation.judge_position_exchange("d")
         if condition is None:
             return None
         if not situation.gravity_nm:

@@ -41,6 +41,7 @@ from msgspec.structs import replace
 
 from ..core import (
     Array,
+    DominanceMatrix,
     Gains,
     Law,
     LawContext,
@@ -48,7 +49,6 @@ from ..core import (
     LawInput,
     LawRecords,
     compiled,
-    find_balancing_weights,
 )
 from ..fields import KeyProblem, NotNegative, NotNegativeJoints, Positive, PositiveJoints
 from .conditions import (
@@ -735,7 +735,7 @@ class Wave(EnergyLaw):
         lines: dict[str, Any] = {}
         sites = range(len(names))
         pairs = list(combinations(sites, 2))
-        D = find_balancing_weights(alpha)
+        D = DominanceMatrix(alpha).find_balancing_weights()
         follows = alpha > 0.0
         is_symmetric = np.array_equal(follows, follows.T)
         if D is not None and is_symmetric:
@@ -786,7 +786,8 @@ class Wave(EnergyLaw):
         # Without impedances from the user, the law computes them from the factors if these are
         # reversible. Only if they are not is this the cause of the difference.
         are_chosen_by_user = bool(self.lines)
-        if are_chosen_by_user or find_balancing_weights(situation.alpha) is not None:
+        shares = DominanceMatrix(situation.alpha)
+        if are_chosen_by_user or shares.find_balancing_weights() is not None:
             return explanation
         return f"{explanation}, because the shares of the sites are not reversible"
 

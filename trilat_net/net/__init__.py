@@ -25,6 +25,7 @@ __all__ = [
     "ROUTER",
     "Bus",
     "Connection",
+    "DefaultEndpoints",
     "Endpoint",
     "Inbox",
     "Query",
@@ -33,18 +34,12 @@ __all__ = [
     "StampedInbox",
     "ZenohBus",
     "check_hosts",
-    "default_endpoint",
-    "default_endpoints",
     "describe_role",
-    "find_endpoint_addresses",
     "find_free_endpoints",
     "is_loopback",
     "make_site_known",
     "matches_key",
     "open_zenoh",
-    "read_zenoh_file",
-    "reserve_session_endpoints",
-    "run_router",
     "share_threads",
     "stop_at_once",
     # Keys of members
@@ -102,7 +97,7 @@ __all__ = [
     "join_states",
     "json_schema",
     "make_decoder",
-    "make_reader",
+    "make_sample_reader",
     "messages",
     "number_message",
     "skipped_numbers",
@@ -111,7 +106,6 @@ __all__ = [
     # Clocks and timing
     "PING_PACE_NS",
     "Clock",
-    "ClockNotice",
     "LinkTimingMonitor",
     "LoopStats",
     "OffsetEstimator",
@@ -123,21 +117,17 @@ __all__ = [
     "SiteStandIn",
     "answer_backfill",
     "find_turn_ns",
-    "make_system_clock",
     # Joining and finding a session
     "REPLY_TIMEOUT_S",
     "Epoch",
     "EventPublisher",
     "LateSites",
-    "MemberQuery",
     "SessionJoin",
     "connect_to_session",
     "describe_member",
     "SessionMembers",
     "new_boot",
-    "open_playback_bus",
     "read_messages",
-    "read_records",
     # Programs outside a session
     "ArmClient",
     "Hand",
@@ -149,25 +139,16 @@ if TYPE_CHECKING:
     from . import messages, topics
     from .arm_client import ArmClient, Hand, HandSender, SiteClient, SwitchClient
     from .bus import Bus, Inbox, Query, QueryInbox, StampedInbox, matches_key
-    from .clock import Clock, SystemClock, make_system_clock
+    from .clock import Clock, SystemClock
     from .connection import (
         ENCRYPTED,
         ENDS_SOON,
         Connection,
-        default_endpoint,
-        default_endpoints,
-        find_endpoint_addresses,
+        DefaultEndpoints,
         find_free_endpoints,
         is_loopback,
-        reserve_session_endpoints,
-        run_router,
     )
-    from .discovery import (
-        REPLY_TIMEOUT_S,
-        SessionMembers,
-        connect_to_session,
-        open_playback_bus,
-    )
+    from .discovery import connect_to_session
     from .host_names import check_hosts
     from .known_sites import make_site_known, stop_at_once
     from .member_keys import (
@@ -186,11 +167,9 @@ if TYPE_CHECKING:
         Epoch,
         EventPublisher,
         LateSites,
-        MemberQuery,
         describe_member,
         new_boot,
         read_messages,
-        read_records,
     )
     from .messages import (
         HALTED_MODES,
@@ -230,15 +209,9 @@ if TYPE_CHECKING:
         PeerSeen,
     )
     from .session import SessionJoin
+    from .session_members import REPLY_TIMEOUT_S, SessionMembers
     from .site_stand_in import SiteStandIn
-    from .timing import (
-        ClockNotice,
-        LinkTimingMonitor,
-        LoopStats,
-        PeerClock,
-        SiteTiming,
-        find_turn_ns,
-    )
+    from .timing import LinkTimingMonitor, LoopStats, PeerClock, SiteTiming, find_turn_ns
     from .topics import (
         RECORDER,
         STATS_PER_SECOND,
@@ -255,10 +228,10 @@ if TYPE_CHECKING:
         encode_state,
         join_states,
         make_decoder,
-        make_reader,
+        make_sample_reader,
         split_states,
     )
-    from .zenoh_bus import RouterSilent, ZenohBus, open_zenoh, read_zenoh_file, share_threads
+    from .zenoh_bus import RouterSilent, ZenohBus, open_zenoh, share_threads
     from .zenoh_config import BRIDGE, OPERATOR, ROLES, ROUTER, Endpoint, describe_role
 else:
     __getattr__ = import_on_use(
@@ -266,13 +239,12 @@ else:
         {
             "arm_client": "ArmClient Hand HandSender SiteClient SwitchClient",
             "bus": "Bus Inbox Query QueryInbox StampedInbox matches_key",
-            "clock": "Clock SystemClock make_system_clock",
+            "clock": "Clock SystemClock",
             "connection": (
-                "Connection ENCRYPTED ENDS_SOON default_endpoint default_endpoints "
-                "find_endpoint_addresses find_free_endpoints is_loopback "
-                "reserve_session_endpoints run_router"
+                "Connection DefaultEndpoints ENCRYPTED ENDS_SOON find_free_endpoints "
+                "is_loopback"
             ),
-            "discovery": "REPLY_TIMEOUT_S SessionMembers connect_to_session open_playback_bus",
+            "discovery": "connect_to_session",
             "host_names": "check_hosts",
             "known_sites": "make_site_known stop_at_once",
             "member_keys": (
@@ -280,8 +252,7 @@ else:
                 "create_keys read_member_keys renew_keys"
             ),
             "membership": (
-                "Epoch EventPublisher LateSites MemberQuery describe_member new_boot "
-                "read_messages read_records"
+                "Epoch EventPublisher LateSites describe_member new_boot read_messages"
             ),
             "messages": (
                 "Event HALTED_MODES Info LinkStats MODES MODE_WORDS ModeMeaning PeerSample "
@@ -296,19 +267,18 @@ else:
                 "OrderName PeerSeen"
             ),
             "session": "SessionJoin",
+            "session_members": "REPLY_TIMEOUT_S SessionMembers",
             "site_stand_in": "SiteStandIn",
-            "timing": (
-                "ClockNotice LinkTimingMonitor LoopStats PeerClock SiteTiming find_turn_ns"
-            ),
+            "timing": "LinkTimingMonitor LoopStats PeerClock SiteTiming find_turn_ns",
             "topics": (
                 "RECORDER STATS_PER_SECOND count_messages count_under_way number_message "
                 "skipped_numbers topics"
             ),
             "wire": (
                 "MAX_BYTES decode encode encode_sample encode_state join_states "
-                "make_decoder make_reader split_states"
+                "make_decoder make_sample_reader split_states"
             ),
-            "zenoh_bus": "RouterSilent ZenohBus open_zenoh read_zenoh_file share_threads",
+            "zenoh_bus": "RouterSilent ZenohBus open_zenoh share_threads",
             "zenoh_config": "BRIDGE Endpoint OPERATOR ROLES ROUTER describe_role",
         },
     )

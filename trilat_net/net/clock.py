@@ -89,6 +89,18 @@ class SystemClock:
             return f"{platform.node()}/{time.get_clock_info('perf_counter').implementation}"
         return f"{boot}/{namespace}"
 
+    @classmethod
+    def with_error(cls, offset_s: float, drift_ppm: float) -> Clock:
+        """Returns the clock of this machine, or for tests a clock with an offset and a drift.
+
+        Args:
+            offset_s: Offset relative to the machine's clock, in s.
+            drift_ppm: Drift relative to the machine's clock, in parts per million.
+        """
+        if not offset_s and not drift_ppm:
+            return cls()
+        return SkewedClock(cls(), round(offset_s * NS_PER_S), round(drift_ppm * 1000))
+
 
 class SkewedClock:
     """A clock with an offset and a drift relative to a base clock, for tests on one machine.
@@ -165,15 +177,3 @@ class SkewedClock:
             f"{self._clock.identity()}, skewed by {self._offset_ns} ns "
             f"and {self._drift_ppb} ns/s since {self._start_ns} ns"
         )
-
-
-def make_system_clock(offset_s: float = 0.0, drift_ppm: float = 0.0) -> Clock:
-    """Returns the clock of this machine, or for tests a clock with an offset and a drift.
-
-    Args:
-        offset_s: Offset relative to the machine's clock, in s.
-        drift_ppm: Drift relative to the machine's clock, in parts per million.
-    """
-    if not offset_s and not drift_ppm:
-        return SystemClock()
-    return SkewedClock(SystemClock(), round(offset_s * NS_PER_S), round(drift_ppm * 1000))

@@ -1,4 +1,4 @@
-"""Decides how a process connects to the network of a session, and runs the router process.
+"""Decides how a process connects to the network of a session.
 
 Two processes of a session on one machine find each other without any option. The process of
 each arm (the site) has a default port, which follows from the name of the session and the index
@@ -15,11 +15,9 @@ Invariant:
     - An endpoint that the user names replaces the default. If the command line and the file
       name different ones, they are united or refused, but the program never silently prefers
       one of them.
-    - A router forwards the messages of all sessions. It prints which processes join and leave.
 """
 
 import ipaddress
-import math
 import re
 import socket
 import zlib
@@ -31,11 +29,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ..errors import SessionError, UsageError
-from . import topics
-from .bus import Bus
 from .clock import Clock
-from .host_names import UnknownHost, check_hosts
-from .zenoh_bus import RouterSilent, ZenohBus
+from .host_names import UnknownHost, check_hosts, find_endpoint_addresses
+from .zenoh_bus import RouterSilent, ZenohBus, read_zenoh_file
 from .zenoh_config import Endpoint, ZenohFile, ZenohMode, merge_settings
 
 if TYPE_CHECKING:
@@ -49,71 +45,75 @@ _BLOCK = 64
 """Number of ports in a block."""
 
 
-def default_endpoint(session: str, index: int) -> str:
-    """Returns the network endpoint at which a site (arm controller) listens by default.
+@dataclass(frozen=True, slots=True)
+class DefaultEndpoints:
+    """The network addresses at which the sites of a session (arm controllers) listen.
 
-    The port is computed from the name of the session and the index, so that every process finds
-    the endpoint without any configuration.
+    They apply if the user names no endpoints. The ports are computed from the name of the
+    session and the index of the site, so that every process finds the endpoints without any
+    configuration.
 
-    Args:
+    Attributes:
         session: Name of the session.
-        index: Index of the site in the scenario, from 0.
-
-    Returns:
-        The endpoint on this machine, as in "tcp/127.0.0.1:10241".
     """
-    # A checksum of the name selects one of `_BLOCKS` blocks of consecutive ports, so that two
-    # sessions on one machine rarely get the same ports.
-    block = zlib.crc32(session.encode()) % _BLOCKS
-    port = _FIRST_PORT + block * _BLOCK + index % _BLOCK
-    return f"tcp/127.0.0.1:{port}"
 
+    session: str
 
-def default_endpoints(
-    session: str, sites: Sequence[str], *, encrypted: bool = False
-) -> dict[str, str]:
-    """Returns the network address that each site of a session has by default, by site.
+    def of_site(self, index: int) -> str:
+        """Returns the endpoint of one site.
 
-    Args:
-        session: Name of the session.
-        sites: Names of the sites (arm controllers), in the order of the scenario.
-        encrypted: True for endpoints of TLS instead of TCP.
-    """
-    endpoints = {}
-    for index, site in enumerate(sites):
-        endpoint = default_endpoint(session, index)
-        endpoints[site] = endpoint.replace("tcp/", "tls/") if encrypted else endpoint
-    return endpoints
+        Args:
+            index: Index of the site in the scenario, from 0.
 
+        Returns:
+            The endpoint on this machine, as in "tcp/127.0.0.1:10241".
+        """
+        # A checksum of the name selects one of `_BLOCKS` blocks of consecutive ports, so that
+        # two sessions on one machine rarely get the same ports.
+        block = zlib.crc32(self.session.encode()) % _BLOCKS
+        port = _FIRST_PORT + block * _BLOCK + index % _BLOCK
+        return f"tcp/127.0.0.1:{port}"
 
-@contextmanager
-def reserve_session_endpoints(session: str, sites: Sequence[str]) -> Iterator[list[str]]:
-    """Reserves a network endpoint for each site of a session, as a context manager.
+    def by_site(self, sites: Sequence[str], *, encrypted: bool = False) -> dict[str, str]:
+        """Returns the endpoint of each site, by the name of the site.
 
-    The default endpoints are used if they are free, and otherwise any free ports. Inside the
-    `with` block, other callers of this function get other endpoints, so that two sessions of
-    the same name can run at the same time.
+        Args:
+            sites: Names of the sites, in the order of the scenario.
+            encrypted: True for endpoints of TLS instead of TCP.
+        """
+        endpoints = {}
+        for index, site in enumerate(sites):
+            endpoint = self.of_site(index)
+            endpoints[site] = endpoint.replace("tcp/", "tls/") if encrypted else endpoint
+        return endpoints
 
-    Args:
-        session: Name of the session.
-        sites: Names of the sites (arm controllers), in the order of the scenario.
+    @contextmanager
+    def reserve(self, site_count: int) -> Iterator[list[str]]:
+        """Reserves a network endpoint for each site of the session, as a context manager.
 
-    Yields:
-        The endpoints, in the order of the sites.
-    """
-    default = list(default_endpoints(session, sites).values())
-    ports = [int(endpoint.rpartition(":")[2]) for endpoint in default]
-    # The last port of the block shows that the block is reserved. The ports themselves cannot
-    # show it, because they are shared with the sites that will listen at them.
-    first_port_of_block = ports[0] - ports[0] % _BLOCK
-    last_port_of_block = first_port_of_block + _BLOCK - 1
-    with ExitStack() as stack:
-        try:
-            _bind_ports(stack, [last_port_of_block], shared=False)
-            endpoints = _bind_ports(stack, ports, shared=True)
-        except OSError:
-            endpoints = _bind_ports(stack, [0] * len(sites), shared=True)
-        yield endpoints
+        The default endpoints are used if they are free, and otherwise any free ports. Inside
+        the `with` block, other callers of this method get other endpoints, so that two sessions
+        of the same name can run at the same time.
+
+        Args:
+            site_count: Number of sites.
+
+        Yields:
+            The endpoints, in the order of the sites.
+        """
+        default = [self.of_site(index) for index in range(site_count)]
+        ports = [int(endpoint.rpartition(":")[2]) for endpoint in default]
+        # The last port of the block shows that the block is reserved. The ports themselves
+        # cannot show it, because they are shared with the sites that will listen at them.
+        first_port_of_block = ports[0] - ports[0] % _BLOCK
+        last_port_of_block = first_port_of_block + _BLOCK - 1
+        with ExitStack() as stack:
+            try:
+                _bind_ports(stack, [last_port_of_block], shared=False)
+                endpoints = _bind_ports(stack, ports, shared=True)
+            except OSError:
+                endpoints = _bind_ports(stack, [0] * site_count, shared=True)
+            yield endpoints
 
 
 def find_free_endpoints(count: int) -> list[str]:
@@ -206,6 +206,19 @@ class Connection:
             encrypted.append(endpoint)
         return encrypted
 
+    @property
+    def listen_addresses(self) -> list[str]:
+        """Addresses at which the process listens, as text, encrypted if there are keys."""
+        return find_endpoint_addresses(self.reach(self.listen))
+
+    @property
+    def connect_addresses(self) -> list[str]:
+        """Addresses to which the process connects, as text, encrypted if there are keys.
+
+        The list is empty if the endpoints are not known yet.
+        """
+        return find_endpoint_addresses(self.reach(self.connect or ()))
+
     def open(self) -> ZenohBus:
         """Opens the network connection of this process, as the attributes describe it.
 
@@ -225,7 +238,7 @@ class Connection:
         listen_endpoints = self.reach(self.listen)
         # None means that the endpoints are not known yet. Then the process only listens.
         connect_endpoints = self.reach(self.connect or ())
-        check_hosts(find_endpoint_addresses([*listen_endpoints, *connect_endpoints]))
+        check_hosts([*listen_endpoints, *connect_endpoints])
         return ZenohBus(listen_endpoints, connect_endpoints, self.mode, self.settings)
 
     def require_keys_until(self, left_s: float) -> None:
@@ -292,7 +305,7 @@ class Connection:
         listen: Sequence[str] | None,
         connect: Sequence[str] | None,
         routers: Sequence[str] | None,
-        file: ZenohFile | None = None,
+        file: ZenohFile | Path | None = None,
         listen_else: Sequence[str] = (),
         connect_else: Sequence[str] | None = None,
         *,
@@ -307,7 +320,7 @@ class Connection:
             listen: Endpoints of the option --listen. None if the option is absent.
             connect: Endpoints of the option --connect. None if the option is absent.
             routers: Endpoints of the option --router. None if the option is absent.
-            file: The user's Zenoh file. None if there is none.
+            file: The user's Zenoh file, or its path. None if there is none.
             listen_else: Endpoints at which to listen if neither an option nor the file names
                 any.
             connect_else: Endpoints to which to connect if neither an option nor the file names
@@ -318,8 +331,11 @@ class Connection:
             The connection: endpoints and mode, without keys.
 
         Raises:
-            UsageError: The options and the file contradict each other.
+            UsageError: The file cannot be used, or the options and the file contradict each
+                other.
         """
+        if isinstance(file, Path):
+            file = read_zenoh_file(file)
         file = file or ZenohFile("")
         if routes:
             if file.mode not in ("", "router"):
@@ -542,28 +558,6 @@ ENCRYPTED = ("tls/", "quic/")
 """Beginnings of the endpoints whose transport is encrypted."""
 
 
-def find_endpoint_addresses(endpoints: Sequence[Endpoint]) -> list[str]:
-    """Returns the addresses of endpoints as text, including those of grouped endpoints.
-
-    A user's Zenoh file may group several addresses into one endpoint, which is then a table
-    with the key "locators".
-
-    Args:
-        endpoints: Endpoints as text, or such tables.
-
-    Returns:
-        All addresses, in the order of the endpoints.
-    """
-    addresses: list[str] = []
-    for endpoint in endpoints:
-        locators = endpoint.get("locators", ()) if isinstance(endpoint, Mapping) else [endpoint]
-        if isinstance(locators, str):
-            addresses.append(locators)
-        else:
-            addresses += map(str, locators)
-    return addresses
-
-
 def is_loopback(address: str) -> bool:
     """Returns True if an address can be reached from this machine only.
 
@@ -638,50 +632,3 @@ def _merge_endpoints(
         endpoint for endpoint in file_endpoints or () if endpoint not in endpoints
     ]
     return endpoints + further_endpoints
-
-
-ROUTER_POLL_NS = 50_000_000
-"""Time between two checks of the members by a router, in ns."""
-
-
-def run_router(
-    bus: Bus,
-    clock: Clock,
-    stopped: Callable[[], bool],
-    say: Callable[[str], None],
-    until_idle_s: float | None = None,
-) -> None:
-    """Runs a router until it is stopped, and prints which members join and leave.
-
-    Members that cannot reach each other directly communicate through a router.
-
-    Args:
-        bus: Network connection of the router, which forwards the messages by itself.
-        clock: Clock of this process.
-        stopped: Function that returns True to end the router.
-        say: Function that prints a line for the user.
-        until_idle_s: Time after which the router ends once the last member has left, in s. If
-            None, the router does not end by itself.
-    """
-    presence = bus.presence(topics.presence_key("*", "*"))
-    present: set[topics.KeyParts] = set()
-    idle_ns = math.inf if until_idle_s is None else until_idle_s * 1e9
-    empty_since_ns: int | None = None  # None before the first member
-
-    while not stopped():
-        for parts, is_alive in topics.read_presence(presence):
-            if is_alive == (parts in present):
-                continue
-            if is_alive:
-                present.add(parts)
-            else:
-                present.remove(parts)
-            change = "is here" if is_alive else "has left"
-            say(f"session {parts.session}: {parts.member} {change}")
-            empty_since_ns = None if present else clock.monotonic_ns()
-
-        now_ns = clock.monotonic_ns()
-        if empty_since_ns is not None and now_ns - empty_since_ns >= idle_ns:
-            say(f"no member for {until_idle_s:g} s")
-            return
-        clock.sleep_until(now_ns + ROUTER_POLL_NS)

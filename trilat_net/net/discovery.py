@@ -1,202 +1,27 @@
-"""Finds a running session from outside, connects to it, and sends requests to its arms.
+"""Finds a running session from outside, and connects to it.
 
-This module serves programs that are not part of a session: the commands that stop arms, change
-network delays or measure the network, and a playback of a log.
-
-Invariant:
-    - A change is requested only once, because a second request might apply it twice. The caller
-      receives either a reply, or an error that names the arm that did not reply.
-    - A log is not played back under the name of a session that is running, because programs
-      could not distinguish the messages of the log from those of the session.
+This module serves programs that are not part of a session: the recorder before it joins, and
+the commands that stop arms, change network delays or measure the network.
 """
 
-import math
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack, closing, contextmanager, suppress
+from contextlib import ExitStack, closing, contextmanager
 from dataclasses import replace
 
-import msgspec
-from msgspec import UNSET
-
-from ..errors import ScenarioError, SessionError, UsageError, WireError
+from ..errors import ScenarioError, SessionError
 from . import topics
 from .bus import Bus
 from .clock import Clock
-from .connection import Connection, default_endpoint, default_endpoints
+from .connection import Connection, DefaultEndpoints
 from .known_sites import find_known_endpoints
-from .membership import MemberQuery, liveliness_token
-from .messages import Event, Info
-from .requests import (
-    BACKFILL_MESSAGES,
-    Backfill,
-    BackfillRequest,
-    ChangeReply,
-    ChangeRequest,
-    DirectMessage,
-)
-from .wire import decode, encode
-
-POLL_NS = 5_000_000
-"""Time between two polls for replies, in ns."""
-REPLY_TIMEOUT_S = 3.0
-"""Longest wait for a reply, in s."""
-_NAME_CHECK_S = 0.7
-"""Time for which a playback looks for sites of a session with the same name, in s.
-
-Sites try to connect every half second.
-"""
+from .membership import liveliness_token
+from .session_members import SessionMembers
 
 SiteNamesOf = Callable[[str], tuple[str, ...]]
 """Function that returns the names of the sites in the text of a scenario, in their order.
 
 It raises `ScenarioError` if the text is not a scenario.
 """
-
-
-class SessionMembers:
-    """The members of a running session, which are queried over an open connection.
-
-    A member is a process of the session, for example a site (arm controller).
-
-    Args:
-        bus: Network connection that reaches the session.
-        clock: Clock of the caller.
-        session: Name of the session.
-    """
-
-    def __init__(self, bus: Bus, clock: Clock, session: str) -> None:
-        self._bus = bus
-        self._clock = clock
-        self._session = session
-
-    def find(
-        self,
-        *,
-        stopped: Callable[[], bool],
-        timeout_s: float | None,
-    ) -> Iterator[Info]:
-        """Queries the members of a session, and yields their identities as they arrive.
-
-        The query is repeated until the search ends, because a reply may be lost. The identity
-        of a member (process of a session) is therefore yielded repeatedly.
-
-        Args:
-            stopped: Function that returns True to end the search.
-            timeout_s: Duration of the search, in s. If None, there is no limit.
-
-        Yields:
-            The identity of a member, as soon as a reply has arrived.
-
-        Raises:
-            SessionError: The time is over, and none of the replies that arrived could be
-                decoded.
-        """
-        query = MemberQuery(self._bus, self._clock, self._session)
-        has_readable_reply = False
-        begun_ns = self._clock.monotonic_ns()
-        timeout_ns = math.inf if timeout_s is None else timeout_s * 1e9
-        while not stopped() and self._clock.monotonic_ns() - begun_ns < timeout_ns:
-            for info in query.poll():
-                has_readable_reply = True
-                yield info
-            self._clock.sleep_until(self._clock.monotonic_ns() + POLL_NS)
-        if query.unreadable and not has_readable_reply and not stopped():
-            member, reason = next(iter(query.unreadable.items()))
-            raise SessionError(f"the reply of {member} cannot be read: {reason}")
-
-    def send_change(
-        self,
-        site: str,
-        request: ChangeRequest,
-    ) -> ChangeReply:
-        """Sends a request to a site of a running session, and waits for the reply.
-
-        If the members of the session have keys, changes can be requested only with the keys of
-        the operator. Every member may send the order to stop.
-
-        Args:
-            site: Name of the site.
-            request: The requested change, or an order such as "stop".
-
-        Returns:
-            The reply of the site, accepted or refused.
-
-        Raises:
-            SessionError: The site does not reply.
-        """
-        channel = topics.STOP if request.order == "stop" else topics.SET
-        payload = self._query_once(topics.key(self._session, site, channel), request)
-        if payload is None:
-            hint = "; in a session with keys, only the operator may request changes"
-            raise SessionError(
-                f"{site} did not answer; the records of {site} show whether the change was made"
-                f"{'' if channel == topics.STOP else hint}"
-            )
-
-        try:
-            reply = decode(payload, ChangeReply)
-        except WireError as error:
-            raise SessionError(f"the reply of {site} cannot be read: {error}") from None
-
-        if request.order == "stop" and not reply.accepted and request.source is not UNSET:
-            # A site with an older version of this program does not know the field `source`, and
-            # refuses the whole request. Its arm must stop as well.
-            return self.send_change(site, msgspec.structs.replace(request, source=UNSET))
-        return reply
-
-    def list_past_events(
-        self,
-        site: str,
-    ) -> Iterator[Event]:
-        """Queries a site for the events that it has published, and yields them in order.
-
-        The first event is the oldest one that the site (arm controller) still stores. The
-        iteration ends early if the site does not reply.
-
-        Args:
-            site: Name of the site.
-        """
-        key = topics.key(self._session, site, topics.PAST)
-        first = 0
-        published = 1
-        with suppress(WireError):  # a reply of another program ends the iteration
-            while first < published:
-                request = BackfillRequest(
-                    channel="event", first=first, last=first + BACKFILL_MESSAGES - 1
-                )
-                reply = self._query_once(key, request)
-                backfill = None if reply is None else decode(reply, Backfill)
-                if backfill is None or not backfill.payloads:
-                    return
-
-                for payload in backfill.payloads:
-                    yield decode(payload, Event)
-                first = backfill.first + len(backfill.payloads)
-                published = backfill.made
-
-    def _query_once(
-        self,
-        key: str,
-        request: DirectMessage,
-    ) -> bytes | None:
-        """Sends a request to other processes once, and waits for the first reply.
-
-        Args:
-            key: Key under which the receiver accepts requests, see `topics.key`.
-            request: The request.
-
-        Returns:
-            The payload of the reply. None if no reply arrives within `REPLY_TIMEOUT_S`.
-        """
-        replies = self._bus.query(key, encode(request))
-        deadline_ns = self._clock.monotonic_ns() + int(REPLY_TIMEOUT_S * 1e9)
-        while self._clock.monotonic_ns() < deadline_ns:
-            self._clock.sleep_until(self._clock.monotonic_ns() + POLL_NS)
-            reply = replies.poll()
-            if reply is not None:
-                _key, payload = reply
-                return payload
-        return None
 
 
 @contextmanager
@@ -253,7 +78,8 @@ def connect_to_session(
         if connection.connect is None and recorder_boot is None:
             connection = replace(connection, connect=find_known_endpoints(session, connection))
         if connection.connect is None:
-            first_endpoint = default_endpoint(session, 0)
+            default_endpoints = DefaultEndpoints(session)
+            first_endpoint = default_endpoints.of_site(0)
             first_bus = connect(replace(connection, listen=(), connect=[first_endpoint]))
             sites = None
             if first_bus is not None:
@@ -271,7 +97,7 @@ def connect_to_session(
             if sites is None:  # the caller has stopped the search
                 yield None
                 return
-            endpoints = list(default_endpoints(session, sites).values()) or [first_endpoint]
+            endpoints = list(default_endpoints.by_site(sites).values()) or [first_endpoint]
             connection = replace(connection, connect=endpoints)
         yield connect(connection)
 
@@ -319,82 +145,7 @@ def _query_sites(
     if stopped():
         return None
     raise SessionError(
-        f"no site of session {session!r} answered at {default_endpoint(session, 0)} "
+        f"no site of session {session!r} answered at {DefaultEndpoints(session).of_site(0)} "
         f"within {timeout_s:g} s; check the name of the session, or name other endpoints with "
         "--connect"
     )
-
-
-def open_playback_bus(
-    connection: Connection,
-    clock: Clock,
-    session: str,
-    stopped: Callable[[], bool],
-    say: Callable[[str], None],
-) -> Bus | None:
-    """Opens the network connection of a playback, which publishes the messages of a log again.
-
-    If the port is in use, the error says whether a session of the same name uses it.
-
-    Args:
-        connection: Endpoints of the playback.
-        clock: Clock of the caller.
-        session: Name under which the log will be played back.
-        stopped: Function that returns True to give up.
-        say: Function that prints a line for the user.
-
-    Returns:
-        The connection. None if `stopped` returned True.
-
-    Raises:
-        SessionError: A session of the same name is running.
-        UsageError: An endpoint cannot be used.
-    """
-    try:
-        bus = connection.open_bus(clock=clock, stopped=stopped, timeout_s=None, say=say)
-    except UsageError:
-        if not connection.listen:
-            raise
-        # The port may be in use by a site of a session with the same name.
-        target = replace(connection, listen=(), connect=connection.listen)
-        session_bus = target.open_bus(clock=clock, stopped=stopped, timeout_s=1.0, say=say)
-        if session_bus is not None:
-            with closing(session_bus):
-                refuse_running_session(session_bus, clock, session, stopped)
-        raise
-    if bus is not None:
-        with ExitStack() as stack:
-            stack.enter_context(closing(bus))
-            refuse_running_session(bus, clock, session, stopped)
-            stack.pop_all()  # the connection stays open
-    return bus
-
-
-def refuse_running_session(
-    bus: Bus,
-    clock: Clock,
-    session: str,
-    stopped: Callable[[], bool],
-) -> None:
-    """Checks that no process of a session is present, before its name is used for a playback.
-
-    Args:
-        bus: Network connection that would reach the session.
-        clock: Clock of the caller.
-        session: Name of the session.
-        stopped: Function that returns True to end the check early.
-
-    Raises:
-        SessionError: A site (arm controller) of that session replies.
-    """
-    members = SessionMembers(bus, clock, session)
-    for info in members.find(stopped=stopped, timeout_s=_NAME_CHECK_S):
-        if info.member == topics.RECORDER:
-            continue
-        state = "is waiting to begin"
-        if info.running:
-            state = f"is running ({info.member} is at tick {info.ticks})"
-        raise SessionError(
-            f"session {session!r} already exists and {state}; replay the log under another "
-            "name with --prefix or --session"
-        )

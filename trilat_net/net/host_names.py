@@ -9,9 +9,10 @@ without a host name, such as numeric addresses and socket files, need no check.
 import ipaddress
 import re
 import socket
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 
 from ..errors import UsageError
+from .zenoh_config import Endpoint
 
 _ENDPOINT = re.compile(r"[a-z]+(?:/|://)(\[[^\]]*\]|[^/?#]*):\d+(?:[/?#].*)?")
 """Pattern of a Zenoh endpoint or a web address with a host and a port."""
@@ -24,7 +25,29 @@ class UnknownHost(UsageError):  # noqa: N818 - it names an outcome
     """
 
 
-def check_hosts(endpoints: Iterable[str]) -> None:
+def find_endpoint_addresses(endpoints: Iterable[Endpoint]) -> list[str]:
+    """Returns the addresses of endpoints as text, including those of grouped endpoints.
+
+    A user's Zenoh file may group several addresses into one endpoint, which is then a table
+    with the key "locators".
+
+    Args:
+        endpoints: Endpoints as text, or such tables.
+
+    Returns:
+        All addresses, in the order of the endpoints.
+    """
+    addresses: list[str] = []
+    for endpoint in endpoints:
+        locators = endpoint.get("locators", ()) if isinstance(endpoint, Mapping) else [endpoint]
+        if isinstance(locators, str):
+            addresses.append(locators)
+        else:
+            addresses += map(str, locators)
+    return addresses
+
+
+def check_hosts(endpoints: Iterable[Endpoint]) -> None:
     """Checks that the host names of all endpoints can be resolved to addresses.
 
     Zenoh would try to resolve an unknown name forever, so the names are checked before a
@@ -32,16 +55,16 @@ def check_hosts(endpoints: Iterable[str]) -> None:
 
     Args:
         endpoints: Endpoints such as tcp/arm.example:7447, or web addresses such as
-            tcp://arm.example:8786.
+            tcp://arm.example:8786, or tables that group several endpoints.
 
     Raises:
         UnknownHost: A host name cannot be resolved. The error is about the first such endpoint.
     """
-    for endpoint in endpoints:
-        match = _ENDPOINT.fullmatch(endpoint)
+    for address in find_endpoint_addresses(endpoints):
+        match = _ENDPOINT.fullmatch(address)
         host = "" if match is None else match[1].strip("[]")
         if host and not _is_address(host):
-            _resolve(host, endpoint)
+            _resolve(host, address)
 
 
 def _is_address(host: str) -> bool:

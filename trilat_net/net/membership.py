@@ -24,9 +24,9 @@ Invariant:
 import hashlib
 import platform
 import secrets
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import msgspec
 
@@ -36,8 +36,8 @@ from . import topics
 from .bus import Bus, Inbox
 from .clock import Clock
 from .messages import Event, Info, State
-from .pinging import RepeatedQuery
 from .scenario_difference import describe_scenario_difference
+from .session_members import SessionMembers
 from .wire import M, decode, encode, split_states
 
 
@@ -101,43 +101,29 @@ def liveliness_token(session: str, member: str, boot: int) -> str:
     return topics.key(session, member, topics.ALIVE) + f"/{boot}"
 
 
-def read_messages(inbox: Inbox, kind: type[M]) -> Iterator[M]:
+def read_messages(inbox: Inbox, kind: type[M], layout: Layout | None = None) -> Iterator[M]:
     """Removes all waiting messages from an inbox, and yields those of one type.
 
     Payloads that cannot be decoded as this type are skipped without an error, because any
-    program on the network can publish under the key of the inbox.
+    program on the network can publish under the key of the inbox. Sites (arm controllers)
+    publish their records in blocks. If a record of a block cannot be decoded, the rest of the
+    block is skipped as well.
 
     Args:
         inbox: Queue of the encoded messages that have arrived.
         kind: Expected type of the messages.
+        layout: Expected numbers of joints and peers (other sites). A message that differs
+            counts as undecodable. If None, all numbers are accepted.
 
     Yields:
         The decoded messages, in the order of their arrival.
     """
     while (message := inbox.poll()) is not None:
-        _key, payload = message
+        _key, block = message
         # Sites and recorders count the payloads that they cannot decode.
         with suppress(WireError):
-            yield decode(payload, kind)
-
-
-def read_records(inbox: Inbox, layout: Layout | None = None) -> Iterator[State]:
-    """Removes all waiting messages from an inbox, and yields the records that they contain.
-
-    A record is the result of one tick of a site's control loop. Sites (arm controllers) publish
-    their records in blocks. If a record of a block cannot be decoded, that record and the rest
-    of the block are skipped without an error.
-
-    Args:
-        inbox: Inbox of the records of one site.
-        layout: Expected numbers of joints and peers (other sites). A record that differs counts
-            as undecodable. If None, all numbers are accepted.
-    """
-    while (message := inbox.poll()) is not None:
-        _key, block = message
-        with suppress(WireError):
-            for payload in split_states(block):
-                yield decode(payload, State, layout=layout)
+            for payload in split_states(block) if kind is State else [block]:
+                yield decode(payload, kind, layout=layout)
 
 
 class EventPublisher:
@@ -198,6 +184,19 @@ class EventPublisher:
         self._publish(payload)
         return event
 
+    def publish_clocks(self, notices: Iterable[Mapping[str, Any]], t_ns: int) -> None:
+        """Publishes events about the offsets and faults of the peers' clocks.
+
+        Recorders store these events, so that a reader of the log knows how well the clocks
+        agreed.
+
+        Args:
+            notices: Fields of the events, by name.
+            t_ns: Time of the events, in ns since the epoch (the common start of the session).
+        """
+        for notice in notices:
+            self.publish(**notice, t_ns=t_ns)
+
     def update(self, **fields: object) -> None:
         """Changes fields of this process's identity, which other processes can query.
 
@@ -213,54 +212,6 @@ class EventPublisher:
         """
         while (query := self._queries.poll()) is not None:
             query.reply(encode(self.info))
-
-
-class MemberQuery:
-    """Queries the members of a session repeatedly for their identities.
-
-    A query may be lost, and members (processes of a session) may start at any time. Therefore
-    the query is repeated as long as the owner of this object calls `poll`.
-
-    Args:
-        bus: Network connection of the member that sends the query.
-        clock: Clock of that member.
-        session: Name of the session.
-        member: Name of the member to query. "*" queries all members.
-
-    Attributes:
-        unreadable: Reasons why replies cannot be decoded, by the name of the member that sent
-            the reply.
-    """
-
-    def __init__(
-        self,
-        bus: Bus,
-        clock: Clock,
-        session: str,
-        member: str = "*",
-    ) -> None:
-        self.unreadable: dict[str, str] = {}
-        self._query = RepeatedQuery(bus, clock, topics.key(session, member, topics.INFO))
-
-    def poll(self) -> Iterator[Info]:
-        """Yields the identities that have arrived, and repeats the query if it is due.
-
-        A reply is skipped if it cannot be decoded, or if the name in the identity differs from
-        the name in the key under which the reply arrived.
-        """
-        while (reply := self._query.poll()) is not None:
-            _, key, payload = reply
-            parts = topics.parse_key(key)
-            if parts is None:
-                continue
-            try:
-                info = decode(payload, Info)
-            except WireError as error:  # another version of this program, or another program
-                self.unreadable[parts.member] = str(error)
-                continue
-            if parts.member == info.member:
-                yield info
-        self._query.repeat()
 
 
 class LateSites(NamedTuple):
@@ -324,7 +275,7 @@ class Membership:
         # Liveliness tokens show which processes are present, and replies to queries identify
         # them.
         self._presence = bus.presence(topics.presence_key(session, "*"))
-        self._query = MemberQuery(bus, clock, session)
+        self._members = SessionMembers(bus, clock, session)
         self._refused_boots: set[int] = set()  # members whose refusal was published
         self._recorder_boots: set[str] = set()  # recorders that are present
 
@@ -352,7 +303,7 @@ class Membership:
         expected_members = (*self._sites, topics.RECORDER)
         return {
             name: reason
-            for name, reason in self._query.unreadable.items()
+            for name, reason in self._members.unreadable.items()
             if name in expected_members
         }
 
@@ -447,7 +398,7 @@ class Membership:
         Raises:
             SessionError: This member cannot be part of the session.
         """
-        for info in self._query.poll():
+        for info in self._members.poll():
             self.receive_identity(info, may_have_started=may_have_started)
         for parts, is_alive in topics.read_presence(self._presence):
             self._update_presence(parts.member, parts.boot, is_alive=is_alive)

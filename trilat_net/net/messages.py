@@ -23,7 +23,7 @@ from typing import Annotated, Any, NamedTuple
 import msgspec
 from msgspec import Meta
 
-from ..records import MAX_JOINTS, MAX_LAW_MEMORY, Layout, Mode
+from ..records import MAX_JOINTS, MAX_LAW_MEMORY, Layout, Mode, TickRecord
 
 VERSION = 4
 """Version of the schema of sent messages. Messages of other versions are not accepted."""
@@ -171,6 +171,51 @@ class State(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
     ch: list[float] = []
     hand: list[float] = []
     bodies: list[float] = []
+
+    def to_tick_record(self, peers: tuple[str, ...]) -> TickRecord:
+        """Converts the record to the object that an execution of the same tick returns.
+
+        A tick is one period of the control loop, and a record is its stored result. The object
+        can be compared with the result of executing the tick again by `Site.step`. Most fields
+        are the same in both forms, and are explained in `TickRecord`. Three fields differ:
+
+        - The mode is a word in the log. An unknown word, as in the log of another version,
+          becomes "diverged".
+        - `used`, the tick of the newest sample in use, is given by the name of the peer in the
+          log, and by the index of the peer in the object. -1 stands for no sample.
+        - `mem`, the memory of the site, is empty unless it is complete.
+
+        Args:
+            peers: Names of the other sites (processes that each run one arm), in the order of
+                the scenario.
+        """
+        mode = MODES.get(self.mode, MODES["diverged"]).mode
+        # The memory begins with a pose, which has as many numbers as `q_des`. A memory without
+        # further numbers is not complete.
+        has_complete_memory = len(self.mem) > len(self.q_des)
+        mem = self.mem if has_complete_memory else []
+        return TickRecord(
+            tick=self.tick,
+            t_ns=self.t_ns,
+            mode=mode,
+            q=self.q,
+            qd=self.qd,
+            q_des=self.q_des,
+            qd_des=self.qd_des,
+            tau=self.tau,
+            tau_x=self.tau_x,
+            theta_hat=self.theta_hat,
+            used=[self.used.get(peer, -1) for peer in peers],
+            rx_crc=self.rx_crc,
+            cmd=self.cmd,
+            mem=mem,
+            x=self.x,
+            xd=self.xd,
+            wrench=self.wrench,
+            ch=self.ch,
+            hand=self.hand,
+            bodies=self.bodies,
+        )
 
 
 class PeerSample(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):

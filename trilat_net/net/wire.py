@@ -436,22 +436,19 @@ def make_decoder(
     return decode_payload
 
 
-def make_reader(
-    kind: type[msgspec.Struct], layout: Layout
-) -> Callable[[bytes], Any | WireError]:
-    """Returns a function that decodes payloads, and returns errors instead of raising them.
+def make_sample_reader(layout: Layout) -> Callable[[bytes], PeerSample | WireError]:
+    """Returns a function that decodes samples, and returns errors instead of raising them.
 
-    The function returns the message, or a `WireError` if the payload is not valid. It is called
+    The function returns the sample, or a `WireError` if the payload is not valid. It is called
     in network threads, in which an exception would be lost.
 
     Args:
-        kind: Expected type of the messages.
         layout: Numbers of joints, peers and parameters of the sender.
     """
-    decoder = make_decoder(kind, layout=layout)
+    decoder: Callable[[bytes], PeerSample] = make_decoder(PeerSample, layout=layout)
 
-    def read(payload: bytes) -> Any | WireError:
-        """Returns the decoded network message, or a `WireError` if its bytes are not valid."""
+    def read(payload: bytes) -> PeerSample | WireError:
+        """Returns the decoded sample, or a `WireError` if its bytes are not valid."""
         try:
             return decoder(payload)
         except WireError as error:

@@ -36,7 +36,7 @@ from .bus import (
     StampedInbox,
     StampingRing,
 )
-from .zenoh_config import Endpoint, ZenohFile, ZenohMode, check_zenoh_file, make_zenoh_config
+from .zenoh_config import Endpoint, ZenohFile, ZenohMode, make_zenoh_config
 
 _QUERY_TIMEOUT_S = 3.0
 """Time after which Zenoh discards a query without replies, in s."""
@@ -463,7 +463,7 @@ def read_zenoh_file(path: Path) -> ZenohFile:
             text = stream.read().decode("utf-8-sig")
     except UnicodeDecodeError:
         raise UsageError(f"{path} is not UTF-8 text") from None
-    return check_zenoh_file(str(path), _parse_json5(str(path), text), _find_refusal)
+    return ZenohFile.check(str(path), _parse_json5(str(path), text), _find_refusal)
 
 
 def _parse_json5(source: str, text: str) -> object:

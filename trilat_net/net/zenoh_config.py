@@ -344,50 +344,52 @@ class ZenohFile:
             return None
         return list(endpoints) if isinstance(endpoints, list) else [endpoints]
 
+    @classmethod
+    def check(
+        cls, source: str, stated: object, refusal: Callable[[Mapping[str, Any]], str]
+    ) -> "ZenohFile":
+        """Checks a user's file of Zenoh settings, because a session needs some fixed values.
 
-def check_zenoh_file(
-    source: str, stated: object, refusal: Callable[[Mapping[str, Any]], str]
-) -> ZenohFile:
-    """Checks a user's file of Zenoh settings, because a session needs some fixed values.
+        Args:
+            source: Name of the file, for error messages.
+            stated: Parsed content of the file.
+            refusal: Function that returns Zenoh's reason for refusing settings, or an empty
+                text if Zenoh accepts them.
 
-    Args:
-        source: Name of the file, for error messages.
-        stated: Parsed content of the file.
-        refusal: Function that returns Zenoh's reason for refusing settings, or an empty text if
-            Zenoh accepts them.
+        Returns:
+            The content.
 
-    Returns:
-        The content.
+        Raises:
+            UsageError: The file is not a Zenoh configuration, or contradicts the requirements
+                of a session. The message lists all keys with such contradictions.
+        """
+        if not isinstance(stated, dict):
+            raise UsageError(
+                f"{source}: a Zenoh configuration must be a single object in braces"
+            )
+        settings = _remove_nulls(stated)
 
-    Raises:
-        UsageError: The file is not a Zenoh configuration, or contradicts the requirements of a
-            session. The message lists all keys with such contradictions.
-    """
-    if not isinstance(stated, dict):
-        raise UsageError(f"{source}: a Zenoh configuration must be a single object in braces")
-    settings = _remove_nulls(stated)
+        reason = refusal(settings)
+        if reason:
+            refused = list(_find_refused_keys(settings, refusal, ()))
+            problems = [f"{'/'.join(path)}: {_suggest_key(path, why)}" for path, why in refused]
+            raise UsageError(_list_problems(source, problems or [reason]))
 
-    reason = refusal(settings)
-    if reason:
-        refused = list(_find_refused_keys(settings, refusal, ()))
-        problems = [f"{'/'.join(path)}: {_suggest_key(path, why)}" for path, why in refused]
-        raise UsageError(_list_problems(source, problems or [reason]))
+        problems = list(_find_problems(settings))
+        if problems:
+            raise UsageError(_list_problems(source, problems))
 
-    problems = list(_find_problems(settings))
-    if problems:
-        raise UsageError(_list_problems(source, problems))
+        for path in (*_SET_BY_MODE, "low_pass_filter"):
+            # The check has shown that the session's own value is the same.
+            _drop_key(settings, path)
 
-    for path in (*_SET_BY_MODE, "low_pass_filter"):
-        # The check has shown that the session's own value is the same.
-        _drop_key(settings, path)
-
-    mode = settings.pop("mode", "")
-    endpoints = {
-        side: settings[side].pop("endpoints")
-        for side in ("listen", "connect")
-        if "endpoints" in settings.get(side, {})
-    }
-    return ZenohFile(source, mode, settings, endpoints)
+        mode = settings.pop("mode", "")
+        endpoints = {
+            side: settings[side].pop("endpoints")
+            for side in ("listen", "connect")
+            if "endpoints" in settings.get(side, {})
+        }
+        return cls(source, mode, settings, endpoints)
 
 
 def _list_problems(source: str, problems: Sequence[str]) -> str:

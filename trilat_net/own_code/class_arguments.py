@@ -10,8 +10,7 @@ import inspect
 from collections.abc import Mapping
 from typing import Any
 
-from ..errors import ScenarioError, suggest_nearest
-from ..laws import make_instance
+from ..errors import ScenarioError, describe_exception, suggest_nearest
 
 _TYPE_NAMES: dict[type, tuple[tuple[type, ...], str]] = {
     float: ((int, float), "a number"),
@@ -27,7 +26,8 @@ def make_own_instance(
     """Creates an object of a user's class, after a check of its arguments.
 
     A wrong argument is reported with its path in the scenario, like any other wrong key, and
-    not as an exception within the class.
+    not as an exception within the class. A class without a constructor receives neither the
+    facts nor the settings.
 
     Args:
         kind: The class.
@@ -38,10 +38,21 @@ def make_own_instance(
 
     Raises:
         ScenarioError: An argument is unknown, missing or of the wrong type, or the class raised
-            an exception.
+            an exception, of any kind.
     """
     check_arguments(kind, code, settings, path)
-    return make_instance(kind, code, context, settings, path)
+    has_init = kind.__init__ is not object.__init__
+    has_new = kind.__new__ is not object.__new__
+    takes_arguments = has_init or has_new
+    try:
+        return kind(context, **settings) if takes_arguments else kind()
+    except (Exception, SystemExit) as error:  # the user's code may raise any exception
+        arguments = ", ".join(f"{key} = {value!r}" for key, value in settings.items())
+        problem = (
+            f"{code} cannot be created with {arguments or 'no settings'}: "
+            f"{describe_exception(error)}"
+        )
+        raise ScenarioError(problem, path=path) from None
 
 
 def check_arguments(kind: Any, code: str, settings: Mapping[str, Any], path: str) -> None:

@@ -33,7 +33,7 @@ from msgspec import Meta, field
 from ..core import LawContext, UserLaw, UserLawFactory
 from ..errors import CodeWithheld, ScenarioError, describe_exception, suggest_nearest
 from ..files import find_page, open_regular
-from ..laws import LawSettings, SentVectorSpecs, check_law_class, convert_sends
+from ..laws import LawSettings, SentVectorSpecs, convert_sends
 from .class_arguments import make_own_instance
 from .sent_channel import parse_classes
 
@@ -380,7 +380,7 @@ class ImportedLaw(LawSettings, frozen=True, tag_field="law", tag="own"):
             path = f"sites.{context.site}.control"
             kind = CodeKey.of(self).import_class(f"{path}.law")
             # The class is checked before any of its code is called.
-            check_law_class(
+            self.check_class(
                 kind=kind, code=self.code, context=context, sites=sites, scheme=scheme
             )
             declared = convert_sends(getattr(kind, "sends", {}), self.code, path)

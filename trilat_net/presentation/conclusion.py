@@ -20,7 +20,7 @@ import numpy as np
 
 from ..analysis import JointError, certify_run
 from ..errors import CodeWithheld, LawFailed, RunFailed, ScenarioError, join_arguments
-from ..execution import check_log_files, simulate_without_operators
+from ..execution import LogCheckReport, SimulatedLog
 from ..log import MIN_COVERAGE, CheckReport, Finding, Log, Progress, SiteLog
 from ..own_code import allowed_code
 from ..scenario import END_WINDOW_S
@@ -157,7 +157,7 @@ def conclude(
     # Two processor cores are used: the log is executed while its figures are drawn.
     with worker_pool(1) as pool:
         allowed = dict(allowed_code)
-        check = pool.submit(check_log_files, log.sources, min_coverage, allowed)
+        check = pool.submit(LogCheckReport.check_files, log.sources, min_coverage, allowed)
         twin = _run_without_operators(log)
         own_laws = log.may_run_user_laws
         certificate = certify_run(log, min_coverage=min_coverage, own_laws=own_laws)
@@ -234,7 +234,7 @@ def _run_without_operators(log: Log) -> Log | None:
     if has_failed or log.scenario.external or not has_operators:
         return None
     try:
-        return simulate_without_operators(log)
+        return SimulatedLog.without_operators(log)
     except (ScenarioError, LawFailed):
         # The control law of a user failed or may not run. The check of the log reports this.
         return None

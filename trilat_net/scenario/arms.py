@@ -41,7 +41,6 @@ from ..core import (
     Three,
     Vector,
     rotation_matrix,
-    theta_from_links,
 )
 from ..errors import ScenarioError, count_nouns
 from .key_checks import VectorCounts, field_names
@@ -628,7 +627,7 @@ def _is_positive_definite(theta: Array) -> bool:
     check has a margin for rounding.
 
     Args:
-        theta: Dynamic parameters of the arm, shape (5,), see `theta_from_links`. The first
+        theta: Dynamic parameters of the arm, shape (5,), see `ArmLinks.theta`. The first
             three are inertias, kg m^2.
     """
     theta_1 = theta[0]
@@ -655,7 +654,7 @@ def build_arm(arm: Arm, task: Task, urdf_texts: Mapping[str, str], chains: bool)
     """
     if arm.urdf:
         return _build_chain_model(arm, task, arm.read_chain(urdf_texts))
-    theta = theta_from_links(arm.planar_links())
+    theta = arm.planar_links().theta()
     if not _is_positive_definite(theta):
         raise ScenarioError(
             "the inertia matrix is singular in some pose: give the links mass away from their "

@@ -8,28 +8,13 @@ Invariant:
       the same name as the file. There is no other list of laws.
 """
 
-import pkgutil
-from collections.abc import Iterator
-from importlib import import_module
 from typing import TYPE_CHECKING, Union
 
-from ..laws import ControlLaw, LawSettings, format_class_name
+from ..laws import ControlLaw, LawSettings
 from ..own_code import ImportedLaw
 
-_LAWS_PACKAGE = "trilat_net.laws"
-
-
-def _find_laws() -> Iterator[type[ControlLaw]]:
-    """Yields the control law of each Python file in the package of laws that has one."""
-    for file in pkgutil.iter_modules(import_module(_LAWS_PACKAGE).__path__):
-        module = import_module(f"{_LAWS_PACKAGE}.{file.name}")
-        kind = getattr(module, format_class_name(file.name), None)
-        if isinstance(kind, type) and issubclass(kind, ControlLaw):
-            yield kind
-
-
 BUILT_IN: dict[str, type[ControlLaw]] = {
-    str(law.Settings.__struct_config__.tag): law for law in _find_laws()
+    str(law.Settings.__struct_config__.tag): law for law in ControlLaw.find_built_in()
 }
 """Classes of the built-in laws, by name."""
 LAWS: dict[str, type[LawSettings]] = {

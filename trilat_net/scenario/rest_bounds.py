@@ -25,7 +25,6 @@ from ..core import (
     ChainDynamics,
     Law,
     SiteSetup,
-    theta_from_links,
 )
 from .arms import Arm, ArmModel
 from .scenario_types import Scenario
@@ -219,7 +218,7 @@ def _sample_planar_arm(arm: Arm, speed: Array) -> _ArmSamples:
         arm: Table of the arm.
         speed: Speed of each joint, in rad/s, shape (2,).
     """
-    a, b, c, first, second = theta_from_links(arm.planar_links())
+    a, b, c, first, second = arm.planar_links().theta()
     elbow = np.linspace(-math.pi, math.pi, _POSES + 1)
     coupling = c + b * np.cos(elbow)
     shoulder = a + 2.0 * b * np.cos(elbow)

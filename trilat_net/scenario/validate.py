@@ -25,8 +25,8 @@ from ..core import (
     MAX_LINKS_BYTES,
     ROW_SUM_TOLERANCE,
     Array,
-    is_irreducible,
-    links_bytes,
+    DominanceMatrix,
+    SiteArrays,
 )
 from ..errors import ScenarioError, count_nouns
 from ..fields import TomlTable
@@ -662,7 +662,7 @@ def check_links_memory(scenario: Scenario, site: str) -> None:
         ScenarioError: The limit is exceeded. The error contains the path of the site.
     """
     setup = scenario.setup(site)
-    size_bytes = links_bytes(setup)
+    size_bytes = SiteArrays.count_link_bytes(setup)
     if size_bytes > MAX_LINKS_BYTES:
         raise ScenarioError(
             f"the links of this site would need {size_bytes / 2**20:.0f} MiB, but at most "
@@ -757,7 +757,7 @@ def _can_lose_master(scenario: Scenario, name: str) -> bool:
         # the dominance matrix without the row and the column of this master
         remaining = np.delete(np.delete(alpha, n, 0), n, 1)
         follows_others = shares[n] > 0.0 and shares.sum() > shares[n]
-        if follows_others and is_irreducible(remaining):
+        if follows_others and DominanceMatrix(remaining).is_irreducible:
             return True
     return False
 

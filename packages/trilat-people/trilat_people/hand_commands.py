@@ -69,11 +69,12 @@ def hand_command(
         )
 
     from sites import run_hand
-    from trilat_net.net import OPERATOR, default_endpoints
+    from trilat_net.net import OPERATOR, DefaultEndpoints
 
     chosen = options.load_chosen_scenario(scenario, overrides, duration, seed)
     session_name = options.check_session_name(session or chosen.name)
-    endpoints = default_endpoints(session_name, chosen.names, encrypted=reach.keys is not None)
+    default_endpoints = DefaultEndpoints(session_name)
+    endpoints = default_endpoints.by_site(chosen.names, encrypted=reach.keys is not None)
     chosen.find_site(name)
     member = options.MemberOptions(None, *reach)
     connection = member.resolve((), [endpoints[name]]).require(OPERATOR)

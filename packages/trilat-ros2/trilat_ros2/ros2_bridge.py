@@ -55,9 +55,9 @@ from trilat_net.net import (
     LinkStats,
     RouterSilent,
     SessionMembers,
+    State,
     SystemClock,
     read_messages,
-    read_records,
     topics,
 )
 from trilat_net.net.ros2 import ROUTER_ADVICE, Attachment, Refusals, Ros2Graph, TopicPublisher
@@ -807,7 +807,7 @@ class _Bridge:
         Returns:
             True if another session has begun under the same name.
         """
-        for record in read_records(self._records):
+        for record in read_messages(self._records, State):
             if record.site in self._sites:
                 self._sites[record.site].publish(record, rate_hz)
 

@@ -37,10 +37,9 @@ from trilat_net.core import BUCKETS_PER_S, Array, Site, compute_fingerprint
 from trilat_net.errors import ScenarioError
 from trilat_net.execution import (
     FusedRun,
-    check_fusable,
+    SimulatedLog,
     execute_virtual,
     find_absent_samples,
-    simulate_scenario,
 )
 from trilat_net.fields import split_unit
 from trilat_net.log import Ints, Log, collect_provenance, compute_task_errors
@@ -390,9 +389,9 @@ def _finish_together(compiled: Sequence[_CompiledRun]) -> Iterator[tuple[int, st
         an empty text.
     """
     # A single run must not load the code of lanes.
-    from trilat_net.core import group_runs
+    from trilat_net.core import RunGroup
 
-    for group in group_runs([member.run for member in compiled], _RECORD_ROWS):
+    for group in RunGroup.divide([member.run for member in compiled], _RECORD_ROWS):
         members = [compiled[index] for index in group.members]
         while running := [member for member in members if not member.run.is_finished]:
             # Runs of a group have the same duration, and advance together.
@@ -837,7 +836,7 @@ class RunMetrics(msgspec.Struct, frozen=True, kw_only=True):
             scenario: Scenario to run: arms, control laws, links and duration.
         """
         if scenario.expect.metrics:
-            return RunMetrics.of_log(simulate_scenario(scenario))
+            return RunMetrics.of_log(SimulatedLog(scenario))
         measured = _MeasuredRun(scenario)
         if measured.compiled is None:
             return measured.measure_ticks()
@@ -1225,7 +1224,7 @@ class _MeasuredRun:
         self.compiled: _CompiledRun | None = None
         scenario.refuse_external_arms()
         try:
-            check_fusable(scenario)
+            FusedRun.check_scenario(scenario)
         except ScenarioError:
             self.obstacle = "tick rates that differ too much"
         else:

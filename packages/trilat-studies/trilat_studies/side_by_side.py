@@ -1,7 +1,7 @@
 """Decides which runs of a study are computed side by side, and reports the others.
 
 Runs that differ only in numbers are computed together with vector instructions, see
-`trilat_net.core.group_runs`. A study passes a scenario of each kind of run to `prepare_kinds`,
+`trilat_net.core.RunGroup`. A study passes a scenario of each kind of run to `prepare_kinds`,
 which compiles the code if there are enough runs to be worth it. After the runs,
 `describe_runs_alone` names those that were computed one by one.
 """
@@ -60,17 +60,19 @@ def prepare_kinds(kinds: Mapping[K, RunKind]) -> dict[K, str]:
     if not several:
         return {}
     # A study of single runs must not load the code of lanes.
-    from trilat_net.core import describe_structure, prepare_lanes
+    from trilat_net.core import RunGroup
     from trilat_net.execution import FusedRun
 
     prepared: dict[K, str] = {}
     obstacles: dict[K, str] = {}
     for key, kind in several.items():
         try:
-            if prepare_lanes(partial(FusedRun, kind.scenario), kind.runs, LANE_SITE_TICKS):
+            if RunGroup.prepare_lanes(
+                partial(FusedRun, kind.scenario), kind.runs, LANE_SITE_TICKS
+            ):
                 prepared[key] = ""
                 continue
-            structure = describe_structure(FusedRun(kind.scenario))
+            structure = RunGroup.describe_structure(FusedRun(kind.scenario))
         except TrilatError:
             continue  # the run itself reports the error
         if isinstance(structure, str):

@@ -20,7 +20,7 @@ from trilat_net.analysis.certificate.observed_energy import ObservedEnergy, Obse
 from trilat_net.analysis.certificate.stability_certificate import Certificate
 from trilat_net.analysis.run_end import Stability
 from trilat_net.errors import LogError
-from trilat_net.execution.virtual import simulate_scenario
+from trilat_net.execution.virtual import SimulatedLog
 from trilat_net.files import find_page
 from trilat_net.log.log_reader import Log
 from trilat_net.presentation.certificate_text import describe_certificate
@@ -64,7 +64,7 @@ damping_nm_s_rad = 10.0
 @cache
 def simulate_clamped_pair(**changes: Any) -> Log:
     """Returns the log of a master that a hand moves, a line, and a clamped slave."""
-    return simulate_scenario(make_scenario(load_scenario(PAIR), **changes))
+    return SimulatedLog(make_scenario(load_scenario(PAIR), **changes))
 
 
 def test_a_line_at_rest_is_a_spring() -> None:
@@ -117,7 +117,7 @@ def test_books_detect_a_law_sending_too_much() -> None:
 
 def test_a_silent_law_leaves_the_books_open() -> None:
     silent = {"sites.s.control.law": "tests.line_law:Silent", "duration_s": 0.1}
-    mixed = simulate_scenario(load_scenario(simulate_clamped_pair().scenario, silent))
+    mixed = SimulatedLog(load_scenario(simulate_clamped_pair().scenario, silent))
     assert ObservedEnergy.of_log(mixed, own_laws=True).text.endswith(
         "the law of s declares no energies"
     )
@@ -125,7 +125,7 @@ def test_a_silent_law_leaves_the_books_open() -> None:
 
 def test_own_laws_run_by_request_alone() -> None:
     """A certificate runs the code of a user's law only if its caller requests this."""
-    log = simulate_scenario(load_scenario(PAIR, {"duration_s": 0.01}))
+    log = SimulatedLog(load_scenario(PAIR, {"duration_s": 0.01}))
     assert ObservedEnergy.of_log(log) is None
     assert Certificate.of_log(log).observed is None
     assert Certificate.of_log(log, own_laws=True).observed is not None
@@ -148,7 +148,7 @@ def test_the_certificate_reports_it_in_text_and_json() -> None:
 @cache
 def simulate_law(law: str) -> Log:
     """Returns the log of a law with a clamped slave and delays of 200 ms each way."""
-    return simulate_scenario(make_energy_pair(LAWS[law], clamped=True, duration_s=3.0))
+    return SimulatedLog(make_energy_pair(LAWS[law], clamped=True, duration_s=3.0))
 
 
 @pytest.mark.long
@@ -189,10 +189,10 @@ def test_jolts_beyond_reserve_make_the_observer_negative() -> None:
         "sites.s.q0_rad": [0.8, 0.5],
     }
     changes |= {"sites.m.control.K": 0.0, "sites.m.control.B": 0.0}
-    covered = Certificate.of_log(simulate_scenario(load_scenario("two_sites", changes)))
+    covered = Certificate.of_log(SimulatedLog(load_scenario("two_sites", changes)))
     assert covered.observed.finding is ObservedFinding.PASSIVE
     certificate = Certificate.of_log(
-        simulate_scenario(load_scenario("two_sites", {**changes, "control.reserve_J": 0.0}))
+        SimulatedLog(load_scenario("two_sites", {**changes, "control.reserve_J": 0.0}))
     )
     assert certificate.observed.finding is ObservedFinding.NEGATIVE
     assert ("note", NEGATIVE_ENERGY_MEANING) in describe_certificate(certificate)
@@ -207,7 +207,7 @@ def test_jolts_beyond_reserve_make_the_observer_negative() -> None:
 def test_leaders_velocity_makes_energy_at_slower_followers() -> None:
     """As published, the follower's damper uses a velocity that is not the follower's own."""
     law = {**LAWS["tdpa"], "energy": "velocity", "reserve_J": 0.0, "acceleration_rad_s2": 0.0}
-    log = simulate_scenario(make_energy_pair(law, clamped=False, duration_s=4.0))
+    log = SimulatedLog(make_energy_pair(law, clamped=False, duration_s=4.0))
     energies = ObservedEnergy.of_log(log)
     taken = next(energy for energy in energies.least if energy.name == "taken by s")
     assert energies.finding is ObservedFinding.NEGATIVE
@@ -219,9 +219,7 @@ def test_leaders_velocity_makes_energy_at_slower_followers() -> None:
 def test_torque_cut_by_the_limit_is_booked(law: str) -> None:
     """The hand holds the master where its spring gives 1.5 N m."""
     limits = {"tau_limit_nm": 1.5, "qd_limit_rad_s": 1e3}
-    log = simulate_scenario(
-        make_energy_pair(LAWS[law], clamped=True, duration_s=6.0, limits=limits)
-    )
+    log = SimulatedLog(make_energy_pair(LAWS[law], clamped=True, duration_s=6.0, limits=limits))
     energies = ObservedEnergy.of_log(log)
     assert energies.finding is ObservedFinding.PASSIVE
     assert next(
@@ -254,7 +252,7 @@ def test_weighted_torques_keep_the_weighted_energy(law: str, link: dict[str, Any
     for name, beta in (("m2", 0.5), ("s", 1.5)):
         sites[name]["control"] = {**control, "beta": beta}
     scenario = make_unit_scenario(sites, control, duration_s=8.0, dominance=shares, link=link)
-    energies = ObservedEnergy.of_log(simulate_scenario(scenario))
+    energies = ObservedEnergy.of_log(SimulatedLog(scenario))
     assert energies.finding is ObservedFinding.PASSIVE
     assert all(premise.holds for premise in energies.premises)
 
@@ -288,7 +286,7 @@ def test_three_texts_explain_negative_energy_alike() -> None:
 
 def test_a_complete_brief_run_satisfies_all_premises() -> None:
     """No torque of the run is at its limit, so that no work is missing from the books."""
-    log = simulate_scenario(load_scenario(PAIR, {"duration_s": 0.05}))
+    log = SimulatedLog(load_scenario(PAIR, {"duration_s": 0.05}))
     energies = ObservedEnergy.of_log(log, own_laws=True)
     assert {premise.name: premise.holds for premise in energies.premises} == {
         "books": True,

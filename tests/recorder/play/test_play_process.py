@@ -28,11 +28,11 @@ from trilat_net.log.log_layout import ChannelFilter
 from trilat_net.log.message_identity import compute_virtual_boot
 from trilat_net.net import topics
 from trilat_net.net.bus import Bus, Inbox
-from trilat_net.net.discovery import refuse_running_session
 from trilat_net.net.membership import Epoch, EventPublisher, liveliness_token
 from trilat_net.net.messages import Event, Info, State
 from trilat_net.net.requests import Backfill, BackfillRequest, Pong
 from trilat_net.net.session import SessionJoin
+from trilat_net.net.session_members import SessionMembers
 from trilat_net.net.wire import decode, encode
 
 from .clocks import LookedAt
@@ -307,7 +307,8 @@ def test_existing_sessions_are_refused() -> None:
         topics.key(SESSION, "recorder", topics.INFO),
         lambda _: encode(answer_info("recorder", RECORDER_BOOT)),
     )
-    refuse_running_session(visitor, clock, SESSION, lambda: False)
+    members = SessionMembers(visitor, clock, SESSION)
+    members.require_absent(lambda: False)
     playing.respond(
         topics.key(SESSION, "m1", topics.INFO),
         lambda _: encode(answer_info("m1", RECORDER_BOOT)),
@@ -315,7 +316,7 @@ def test_existing_sessions_are_refused() -> None:
     with pytest.raises(
         SessionError, match="session 'replay-paper' already exists and is waiting to begin"
     ):
-        refuse_running_session(visitor, clock, SESSION, lambda: False)
+        members.require_absent(lambda: False)
 
 
 @pytest.mark.parametrize(

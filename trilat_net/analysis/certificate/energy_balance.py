@@ -31,7 +31,7 @@ from ...core import Array, Scheme
 from ...log import Log
 from ...scenario import Scenario
 from ..aligned import AlignedRecords, Bools, DelayedPeer, PeerTrajectory
-from ..dominance_history import DominanceHistory, DominanceMatrix
+from ..dominance_history import DominanceHistory, compute_lyapunov_weights
 from ..row_reductions import any_in_rows, sum_rows
 from ..torque_sources import TorqueSplit
 from .energy_terms import FunctionalParts, Increment, SiteConstants, SiteMotion
@@ -768,7 +768,7 @@ def _trace_weights(
             key = matrix.tobytes()
             if key not in beta_by_matrix:
                 square = matrix.reshape(len(Kd), -1)
-                beta_by_matrix[key] = DominanceMatrix(square).compute_lyapunov_weights(Kd).beta
+                beta_by_matrix[key] = compute_lyapunov_weights(square, Kd).beta
             betas.append(beta_by_matrix[key])
         beta = np.array(betas)[matrix_index.ravel()]
         if is_constant:

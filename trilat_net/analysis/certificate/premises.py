@@ -26,12 +26,13 @@ from typing import NamedTuple
 
 import numpy as np
 
+from ...core import DominanceMatrix
 from ...log import Coverage, Log, judge_integrity
 from ...net import HALTED_MODES
 from ..aligned import Bools
 from ..dominance_history import (
-    DominanceMatrix,
     PeerLoss,
+    compute_lyapunov_weights,
     find_kd_scales,
 )
 from ..following import TaskFollowing
@@ -332,7 +333,7 @@ def _check_dominance(run: FunctionalFacts) -> Premise:
         return Premise("shares", False, quantities)
 
     Kd = np.array([energy.motion.constants.weighing_Kd for energy in energies.values()])
-    weights = DominanceMatrix(run.log.scenario.alpha).compute_lyapunov_weights(Kd)
+    weights = compute_lyapunov_weights(run.log.scenario.alpha, Kd)
     groups = tuple(tuple(names[n] for n in group) for group in weights.groups)
     if len(groups) > 1:
         return Premise("shares", False, DominanceQuantities(groups=groups))

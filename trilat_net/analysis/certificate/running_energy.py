@@ -19,7 +19,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ...core import Array, CoreChange
+from ...core import Array, CoreChange, DominanceMatrix
 from ...net import RESTING_MODES, TASK_VECTORS, State
 from ...scenario import Scenario
 from ..aligned import (
@@ -28,7 +28,7 @@ from ..aligned import (
     AlignedRecords,
     PeerTrajectory,
 )
-from ..dominance_history import DominanceHistory, DominanceMatrix, DominancePlan
+from ..dominance_history import DominanceHistory, DominancePlan
 from .energy_balance import (
     EnergyBalance,
     SiteEnergy,

@@ -26,12 +26,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ...core import Array, Law, TorqueKind
+from ...core import Array, DominanceMatrix, Law, TorqueKind
 from ...log import Ints
 from ...scenario import Scenario
 from ..aligned import Bools
 from ..arm_rows import build_arm_rows
-from ..dominance_history import DominanceMatrix
 from ..row_reductions import any_in_rows, max_rows
 from ..run_end import STATIC_SPEED_RAD_S
 from ..run_view import RunView, SiteRun
@@ -574,7 +573,7 @@ def _compute_torque_weights(scenario: Scenario, alpha: Array) -> Array | str:
         if why:
             return f"{site}: {why}"
         stiffness.append(K)
-    pi = dominance.compute_perron_vector()
+    pi = dominance.find_pi()
     return pi[:, np.newaxis] / np.array(stiffness)
 
 

@@ -37,7 +37,7 @@ from ...results import finite_or_none
 from ...scenario import TASK_AXES, Scenario
 from ..arm_rows import build_arm_rows
 from ..blas_threads import limit_blas_threads
-from ..dominance_history import DominanceMatrix
+from ..dominance_history import compute_lyapunov_weights
 from . import frequency_search, port_response
 from .characteristic_roots import Complex, Spectrum
 from .linear_loop import LinearLoop, gather_site_arguments
@@ -160,10 +160,10 @@ def compute_proof_weights(conditions: OperatingConditions) -> Array:
         followed = [axis - 1 for axis in _list_followed_axes(site)]
         all_gains = np.broadcast_to(site.gains.Kd, site_Kd.shape)
         site_Kd[followed] = all_gains[followed]
-    return DominanceMatrix(conditions.alpha).compute_lyapunov_weights(Kd).beta
+    return compute_lyapunov_weights(conditions.alpha, Kd).beta
 
 
-class TwoPort(NamedTuple):
+class _TwoPort(NamedTuple):
     """Result of Llewellyn's stability criterion for one joint of two arms.
 
     The criterion says whether the arms are stable with every passive operator or wall at both
@@ -224,7 +224,7 @@ class PortAnalysis(NamedTuple):
     beta: Array
     estimates_true: bool
     absolute: frequency_search.Minima
-    two_ports: tuple[TwoPort, ...]
+    two_ports: tuple[_TwoPort, ...]
     transparency: tuple[Transparency, ...]
     clamped_verdict: str
     axes: Mapping[int, str] = MappingProxyType({})
@@ -251,7 +251,7 @@ class PortAnalysis(NamedTuple):
         """
         return "xd" if self.axes else "qd"
 
-    def group_failing_two_ports(self, *, by_joint: bool) -> list[list[TwoPort]]:
+    def group_failing_two_ports(self, *, by_joint: bool) -> list[list[_TwoPort]]:
         """Groups the two-ports for which Llewellyn's criterion fails.
 
         The two-ports of a group have the same sites, and the same third site clamped, or no
@@ -260,7 +260,7 @@ class PortAnalysis(NamedTuple):
         Args:
             by_joint: True to separate the joints too.
         """
-        groups: dict[tuple[object, ...], list[TwoPort]] = {}
+        groups: dict[tuple[object, ...], list[_TwoPort]] = {}
         for two_port in self.two_ports:
             if two_port.minima.below:
                 joint = two_port.joint if by_joint else ""
@@ -557,7 +557,7 @@ def _check_two_ports(
     loop: LinearLoop,
     Y: port_response.PortResponse,
     w_rad_s: Array,
-) -> tuple[TwoPort, ...]:
+) -> tuple[_TwoPort, ...]:
     """Checks for every pair of arms whether they are stable with every passive user and wall.
 
     Llewellyn's criterion is evaluated at each joint that both arms have. With three arms, the
@@ -576,7 +576,7 @@ def _check_two_ports(
                 pair_ports = [port for port in ports if site_of_port[port] in pair]
                 if len(pair_ports) == len(pair):
                     minima = _check_llewellyn(Y, pair_ports, clamped_ports, w_rad_s)
-                    two_ports.append(TwoPort(pair, joint, clamped, minima))
+                    two_ports.append(_TwoPort(pair, joint, clamped, minima))
     return tuple(two_ports)
 
 

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from ...errors import CodeWithheld, RunFailed, UsageError, count_nouns
-from ...net import Clock, SystemClock, make_system_clock
+from ...net import Clock, SystemClock
 from ...presentation import TextTable
 from ...presentation import terminal_output as terminal
 from ...signals import Interrupt
@@ -77,7 +77,7 @@ def site_command(
     """
     from sites import SiteOptions, run_site
 
-    from ...net import default_endpoints
+    from ...net import DefaultEndpoints
 
     chosen = options.load_chosen_scenario(scenario, overrides, duration, seed)
     chosen.find_site(name)
@@ -85,7 +85,8 @@ def site_command(
 
     # By default each site connects to the sites before it, so that each pair has one
     # connection.
-    endpoints = default_endpoints(session_name, chosen.names, encrypted=ways.keys is not None)
+    default_endpoints = DefaultEndpoints(session_name)
+    endpoints = default_endpoints.by_site(chosen.names, encrypted=ways.keys is not None)
     earlier_sites = chosen.names[: chosen.names.index(name)]
     earlier_endpoints = [endpoints[site] for site in earlier_sites]
     connection = ways.resolve([endpoints[name]], earlier_endpoints).require(name)
@@ -206,7 +207,7 @@ def record_command(
     page = path.parent / "report.html"
     if concluded:
         refuse_existing(page, force=force)
-    clock = make_system_clock(clock_offset, clock_drift)
+    clock = SystemClock.with_error(clock_offset, clock_drift)
 
     def warn_of_load() -> None:
         """Prints a note if other programs keep the processors of this machine busy.
@@ -355,7 +356,7 @@ def replay_command(
     from trilat_net.app.play.player import parse_rate
     from trilat_net.app.play.session_reader import PlaySelection, preload_messages
 
-    from ...net import default_endpoint
+    from ...net import DefaultEndpoints
 
     if preload < 0:
         raise UsageError(f"--preload must be a number of MiB, at least 0, not {preload}")
@@ -383,7 +384,7 @@ def replay_command(
         keys=None,
         insecure=insecure,
     )
-    connection = ways.resolve([default_endpoint(name, 0)], [])
+    connection = ways.resolve([DefaultEndpoints(name).of_site(0)], [])
 
     play_options = PlayOptions(
         session=name, rate=speed, loop=loop, low_cpu=low_cpu, needs_recorder=needs_recorder
@@ -651,15 +652,15 @@ def router_command(
     router is restarted. Routers that are connected to each other with --connect act as one
     router.
     """
-    from ...net import ROUTER, Connection, read_zenoh_file, run_router
+    from ...net import ROUTER, Connection
+    from ..router import run_router
 
-    file = None if zenoh_config is None else read_zenoh_file(zenoh_config)
     default_listen = [LOOPBACK if keys is None else ANY_ADDRESS]
     open_connection = Connection.of_member(
         listen=listen,
         connect=connect,
         routers=None,
-        file=file,
+        file=zenoh_config,
         listen_else=default_listen,
         connect_else=(),
         routes=True,

@@ -620,14 +620,13 @@ class MemberOptions(NamedTuple):
             listen_else: Addresses at which to listen if the options state no address.
             connect_else: Addresses to which to connect if the options state no address.
         """
-        from ...net import Connection, read_zenoh_file
+        from ...net import Connection
 
-        file = None if self.zenoh_config is None else read_zenoh_file(self.zenoh_config)
         return Connection.of_member(
             listen=self.listen,
             connect=self.connect,
             routers=self.router,
-            file=file,
+            file=self.zenoh_config,
             listen_else=listen_else,
             connect_else=connect_else,
         )

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Protocol
 import typer
 
 from ...errors import UsageError
-from ...net import SystemClock, make_system_clock
+from ...net import SystemClock
 from ...presentation import MARKS
 from ...presentation import terminal_output as terminal
 from ...signals import Interrupt
@@ -219,7 +219,7 @@ def ping_command(
     from trilat_net.app.session_ping import ping_session
 
     connection = reach.resolve(operates=False)
-    clock = make_system_clock(clock_offset, clock_drift)
+    clock = SystemClock.with_error(clock_offset, clock_drift)
     with Interrupt() as interrupt:
         measurement = ping_session(
             connection=connection,

@@ -13,15 +13,16 @@ import math
 import os
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack, closing, suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import NamedTuple
 
 from trilat_net import process
+from trilat_net.errors import UsageError
 from trilat_net.net import topics
 from trilat_net.records import NS_PER_S
 
-from ...net import Bus, Clock, Connection, open_playback_bus
+from ...net import Bus, Clock, Connection, SessionMembers
 from .batch import MessageBatch
 from .message_source import MessageSource
 from .player import LatenessSummary, Pace, Player, PlayProgress
@@ -295,7 +296,7 @@ def play_log(
 
     with ExitStack() as stack:
         stack.enter_context(process.pause_gc())
-        bus = open_playback_bus(
+        bus = _open_bus(
             connection=connection,
             clock=clock,
             session=options.session,
@@ -321,6 +322,51 @@ def play_log(
             show=show,
         )
         return playback.play(selection.start_ns)
+
+
+def _open_bus(
+    connection: Connection,
+    clock: Clock,
+    session: str,
+    stopped: Callable[[], bool],
+    say: Callable[[str], None],
+) -> Bus | None:
+    """Opens the network connection of a playback, which publishes the messages of a log again.
+
+    If the port is in use, the error says whether a session of the same name uses it.
+
+    Args:
+        connection: Endpoints of the playback.
+        clock: Clock of the caller.
+        session: Name under which the log will be played back.
+        stopped: Function that returns True to give up.
+        say: Function that prints a line for the user.
+
+    Returns:
+        The connection. None if `stopped` returned True.
+
+    Raises:
+        SessionError: A session of the same name is running.
+        UsageError: An endpoint cannot be used.
+    """
+    try:
+        bus = connection.open_bus(clock=clock, stopped=stopped, timeout_s=None, say=say)
+    except UsageError:
+        if not connection.listen:
+            raise
+        # The port may be in use by a site of a session with the same name.
+        target = replace(connection, listen=(), connect=connection.listen)
+        session_bus = target.open_bus(clock=clock, stopped=stopped, timeout_s=1.0, say=say)
+        if session_bus is not None:
+            with closing(session_bus):
+                SessionMembers(session_bus, clock, session).require_absent(stopped)
+        raise
+    if bus is not None:
+        with ExitStack() as stack:
+            stack.enter_context(closing(bus))
+            SessionMembers(bus, clock, session).require_absent(stopped)
+            stack.pop_all()  # the connection stays open
+    return bus
 
 
 def map_key_to_session(topic: str, recorded_session: str, session: str) -> str:

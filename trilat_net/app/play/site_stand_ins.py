@@ -36,7 +36,7 @@ from ...net import (
     Bus,
     Clock,
     Event,
-    MemberQuery,
+    SessionMembers,
     SiteStandIn,
     decode,
     read_messages,
@@ -213,7 +213,7 @@ class SiteStandIns:
         self._presence = bus.presence(topics.presence_key(session, topics.RECORDER))
         recorder_events = topics.key(session, topics.RECORDER, topics.EVENT)
         self._recorder_events = bus.inbox(recorder_events, _MAX_RECORDER_EVENTS)
-        self._recorder_query = MemberQuery(bus, clock, session, topics.RECORDER)
+        self._recorder_query = SessionMembers(bus, clock, session, topics.RECORDER)
         # Sites whose messages are stored completely, by the boot of the recorder.
         self._stored: dict[str, set[str]] = {}
         # Boots of the recorders that have sent their identity.

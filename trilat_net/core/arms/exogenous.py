@@ -23,7 +23,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ..plug.plugged import call_address, compile_to_address, list_numbers
+from ..plug.plugged import UserModel, call_address
 from ..step.jit import leaf
 from ..step.vectors import Array, Pair, Row, RowArray, Vector, count_started
 from .chain import Three, add_vectors, dot_product, place_end_effector, read_three, scale_vector
@@ -211,8 +211,9 @@ def torque_source_rows(
         content = actor.table
         if actor.kind in OWN_KINDS:
             # The parameters of the user's model are stored in rows of the table.
-            row.call = compile_to_address(actor.model, "act", rows.dtype)
-            numbers = list_numbers(actor.model)
+            model = UserModel(actor.model)
+            row.call = model.compile_to_address("act", rows.dtype)
+            numbers = model.numbers
             row_count = math.ceil(len(numbers) / width)
             content = np.resize(numbers, (row_count, width))
         if content is None:

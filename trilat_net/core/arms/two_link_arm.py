@@ -30,8 +30,8 @@ from .elementary import sincos
 class ArmLinks(NamedTuple):
     """Lengths, masses and inertias of the two links of a planar arm.
 
-    These are the quantities that one measures on a real arm. `theta_from_links` converts them
-    to the five parameters in which the equations of motion are linear.
+    These are the quantities that one measures on a real arm. `theta` converts them to the five
+    parameters in which the equations of motion are linear.
 
     Attributes:
         l1_m: Length of the first link, m.
@@ -53,28 +53,24 @@ class ArmLinks(NamedTuple):
     lc2_m: float
     I2_kg_m2: float
 
+    def theta(self) -> Array:
+        """Returns the parameters theta on which the dynamics of the arm depend, Eq. (24).
 
-def theta_from_links(links: ArmLinks) -> Array:
-    """Returns the parameters theta on which the dynamics of the planar arm depend, Eq. (24).
+        The torque of the arm is linear in theta. The first three entries are inertial, in kg
+        m^2; the last two belong to gravity, in kg m.
 
-    The torque of the arm is linear in theta. The first three entries are inertial, in kg m^2;
-    the last two belong to gravity, in kg m.
-
-    Args:
-        links: Lengths, masses and inertias of the two links.
-
-    Returns:
-        The parameters, shape (5,).
-    """
-    l1, m1, lc1, I1, _, m2, lc2, I2 = links
-    inner_inertia = m1 * lc1**2
-    outer_inertia = m2 * (l1**2 + lc2**2)
-    theta_1 = inner_inertia + outer_inertia + I1 + I2
-    theta_2 = m2 * l1 * lc2
-    theta_3 = m2 * lc2**2 + I2
-    theta_4 = m1 * lc1 + m2 * l1
-    theta_5 = m2 * lc2
-    return np.array([theta_1, theta_2, theta_3, theta_4, theta_5])
+        Returns:
+            The parameters, shape (5,).
+        """
+        l1, m1, lc1, I1, _, m2, lc2, I2 = self
+        inner_inertia = m1 * lc1**2
+        outer_inertia = m2 * (l1**2 + lc2**2)
+        theta_1 = inner_inertia + outer_inertia + I1 + I2
+        theta_2 = m2 * l1 * lc2
+        theta_3 = m2 * lc2**2 + I2
+        theta_4 = m1 * lc1 + m2 * l1
+        theta_5 = m2 * lc2
+        return np.array([theta_1, theta_2, theta_3, theta_4, theta_5])
 
 
 @leaf
@@ -123,7 +119,7 @@ def regressor(g: float, q: Vector, qd: Vector, v: Vector, a: Vector) -> tuple[Fi
 
         Y theta = M(q) a + C(q, qd) v + G(q)
 
-    The vector theta has five parameters, see `theta_from_links`: three of the inertia and two
+    The vector theta has five parameters, see `ArmLinks.theta`: three of the inertia and two
     of gravity. With qi the angle of joint i, the equation of motion in these parameters is
 
         M = | theta_1 + 2 theta_2 cos(q2)    theta_3 + theta_2 cos(q2) |

@@ -22,7 +22,6 @@ from ..links.channel import (
     LOST,
     advance_losses,
     delay_sample,
-    find_delay_us,
     find_due_ns,
     loses_samples,
     select_model,
@@ -34,12 +33,13 @@ from ..links.delay import (
     DelayKind,
     clamp_delay_us,
     draw_delay_us,
+    find_delay_us,
 )
 from ..links.link import ChannelArrays, LinkArrays, accept_sample, release_sample
 from ..links.philox import DrawKey, uniforms
 from ..plug.plugged import call_address
 from ..step.fused_run import ReplayedInputs
-from ..step.jit import find_lane_address, lane_leaf, leaf
+from ..step.jit import LaneCode, lane_leaf, leaf
 from ..step.kernel import channel_of
 from ..step.row_fields import LinkRow
 from ..step.site_arrays import SiteArrays
@@ -102,59 +102,57 @@ class LinkStates(NamedTuple):
     times_ns: IntArray
     sample_counts: IntArray
 
+    @classmethod
+    def copy_from(cls, tables: Sequence[SiteArrays]) -> "LinkStates":
+        """Copies the states of the network links of several runs to common arrays.
 
-def copy_link_states(tables: Sequence[SiteArrays]) -> LinkStates:
-    """Copies the states of the network links of several runs to common arrays.
+        The runs are simulated together, each in one lane. This method is called before their
+        first tick (control period).
 
-    The runs are simulated together, each in one lane. This function is called before their
-    first tick (control period).
+        Args:
+            tables: Arrays of all sites (arm controllers) of each run. They are not changed.
+        """
+        sites, peers, _ = tables[0].calendars.shape
+        pages = max(arrays.calendars.shape[2] for arrays in tables)
+        # A sample that is sent in a block waits at most as long as the calendar has pages.
+        kept = 1 << (pages + BLOCK_TICKS).bit_length()
+        most_models = max(arrays.models.shape[2] for arrays in tables)
+        most_points = max(len(arrays.points) for arrays in tables)
+        models = np.zeros((len(tables), sites, peers, most_models), LINK_MODEL_DTYPE)
+        points = np.zeros((len(tables), most_points, 2), np.int64)
+        for lane, arrays in enumerate(tables):
+            models[lane, :, :, : arrays.models.shape[2]] = arrays.models
+            points[lane, : len(arrays.points)] = arrays.points
+        return cls(
+            links=np.stack([arrays.links for arrays in tables]),
+            models=models,
+            points=points,
+            releases=np.full((len(tables), sites, peers, kept), -1),
+            newest=np.full((len(tables), sites, peers), -1),
+            uniforms=np.zeros((2, _MOST_SAMPLES)),
+            delays_us=np.zeros(_MOST_SAMPLES, np.int64),
+            stamps_ns=np.zeros(_MOST_SAMPLES, np.int64),
+            times_ns=np.zeros(BLOCK_TICKS, np.int64),
+            sample_counts=np.zeros(BLOCK_TICKS, np.int64),
+        )
 
-    Args:
-        tables: Arrays of all sites (arm controllers) of each run. They are not changed.
-    """
-    sites, peers, _ = tables[0].calendars.shape
-    pages = max(arrays.calendars.shape[2] for arrays in tables)
-    # A sample that is sent in a block waits at most as long as the calendar has pages.
-    kept = 1 << (pages + BLOCK_TICKS).bit_length()
-    most_models = max(arrays.models.shape[2] for arrays in tables)
-    most_points = max(len(arrays.points) for arrays in tables)
-    models = np.zeros((len(tables), sites, peers, most_models), LINK_MODEL_DTYPE)
-    points = np.zeros((len(tables), most_points, 2), np.int64)
-    for lane, arrays in enumerate(tables):
-        models[lane, :, :, : arrays.models.shape[2]] = arrays.models
-        points[lane, : len(arrays.points)] = arrays.points
-    return LinkStates(
-        links=np.stack([arrays.links for arrays in tables]),
-        models=models,
-        points=points,
-        releases=np.full((len(tables), sites, peers, kept), -1),
-        newest=np.full((len(tables), sites, peers), -1),
-        uniforms=np.zeros((2, _MOST_SAMPLES)),
-        delays_us=np.zeros(_MOST_SAMPLES, np.int64),
-        stamps_ns=np.zeros(_MOST_SAMPLES, np.int64),
-        times_ns=np.zeros(BLOCK_TICKS, np.int64),
-        sample_counts=np.zeros(BLOCK_TICKS, np.int64),
-    )
+    def keep(self, lanes: Sequence[int]) -> "LinkStates":
+        """Returns the states of the simulated network links of those runs that continue.
 
+        Several runs are simulated side by side, each at one index (lane). A search drops runs
+        that it no longer needs, so that no time is spent on these runs.
 
-def keep_link_states(states: LinkStates, lanes: Sequence[int]) -> LinkStates:
-    """Returns the states of the simulated network links of those runs that continue.
-
-    Several runs are simulated side by side, each at one index (lane). A search drops runs that
-    it no longer needs, so that no time is spent on these runs.
-
-    Args:
-        states: State of all runs that have been simulated together.
-        lanes: Indices (lanes) of the runs that continue.
-    """
-    chosen = list(lanes)
-    return states._replace(
-        links=states.links[chosen],
-        models=states.models[chosen],
-        points=states.points[chosen],
-        releases=states.releases[chosen],
-        newest=states.newest[chosen],
-    )
+        Args:
+            lanes: Indices (lanes) of the runs that continue.
+        """
+        chosen = list(lanes)
+        return self._replace(
+            links=self.links[chosen],
+            models=self.models[chosen],
+            points=self.points[chosen],
+            releases=self.releases[chosen],
+            newest=self.newest[chosen],
+        )
 
 
 @leaf
@@ -252,24 +250,23 @@ class DrawAddresses(NamedTuple):
     delays: int
     losses: int
 
+    @classmethod
+    def find(cls) -> "DrawAddresses":
+        """Returns the addresses of compiled functions that draw network delays and losses.
 
-def find_draw_addresses() -> DrawAddresses:
-    """Returns the addresses of compiled functions that draw random network delays and losses.
-
-    Each call draws the numbers of many messages, which is faster than one call per message. The
-    functions are compiled if their machine code is not stored on disk.
-    """
-    integer = types.int64
-    number = types.float64
-    delays = types.Array(integer, 1, "C")
-    uniform_numbers = types.Array(number, 2, "C")
-    delay_types = (integer, integer, types.uint64, number, number, delays)
-    return DrawAddresses(
-        delays=find_lane_address(_draw_uniform_delays, delay_types),
-        losses=find_lane_address(
-            _draw_losses, (integer, integer, types.uint64, uniform_numbers)
-        ),
-    )
+        Each call draws the numbers of many messages, which is faster than one call per message.
+        The functions are compiled if their machine code is not stored on disk.
+        """
+        integer = types.int64
+        number = types.float64
+        delays = types.Array(integer, 1, "C")
+        uniform_numbers = types.Array(number, 2, "C")
+        delay_types = (integer, integer, types.uint64, number, number, delays)
+        loss_types = (integer, integer, types.uint64, uniform_numbers)
+        return cls(
+            delays=LaneCode(_draw_uniform_delays, delay_types).find_address(),
+            losses=LaneCode(_draw_losses, loss_types).find_address(),
+        )
 
 
 @leaf

@@ -28,7 +28,7 @@ from .lane_deliveries import BLOCK_TICKS, DrawAddresses, LinkStates, use_samples
 from .lane_rows import LANES, LaneNumbers, Words, allocate_words, pointer_to, read_words
 from .lane_run import LaneRun, explain_uncompilable, find_words, put_rows, view_rows
 from .lane_stages import EndedRuns, call_site, copy_lane, keep_ended_runs
-from .lane_structure import RunStructure, find_obstacle, find_structure
+from .lane_structure import RunStructure, find_obstacle
 from .run_groups import LEAST_RUNS
 
 _CLOCK = LaneNumbers()
@@ -231,7 +231,7 @@ class LaneEpisodes(LaneRun):
     Attributes:
         ticks: Number of ticks that each run has executed, shape (LANES,).
         hands: The program's hand in each lane.
-        structure: The structure, see `find_structure`.
+        structure: The structure, see `RunStructure`.
         most_runs: Largest number of lanes with a run.
         least_runs: Number of runs from which lanes are faster than one run after the other.
     """
@@ -275,7 +275,7 @@ class LaneEpisodes(LaneRun):
         Examples are the number of joints and the control laws. Durations may differ, because an
         episode (simulated run) that ends is replaced by a new episode.
         """
-        return find_structure(run)._replace(duration_s=0.0)
+        return RunStructure.find(run)._replace(duration_s=0.0)
 
     @staticmethod
     def explain_hand(rules: HandRules, period_ticks: int, largest_action: float) -> str:

@@ -60,6 +60,38 @@ class LaneLaw(NamedTuple):
     constants: Constants
     columns: tuple[tuple[int, ...], ...]
 
+    @classmethod
+    def describe(cls, law: CompiledLaw | None, columns: Any) -> "LaneLaw":
+        """Returns the properties of a control law on which the code of a simulation depends.
+
+        Several runs can be simulated side by side by the same code only if these properties are
+        equal.
+
+        Args:
+            law: The law. None if the law of the site (arm controller) is a part of the kernel.
+            columns: Indices of the C values that the law receives from each of P peers (other
+                sites), shape (P, C).
+        """
+        if law is None:
+            return cls(NO_LAW, is_stored=True, size=0, constants=(), columns=())
+        form = law.form
+        name, is_stored = _name_law(law.torque, form)
+        size = form.law.itemsize // 8
+        row = law.row[:size].view(form.law)[0]
+        constants = []
+        for field, (dtype, *_) in (form.law.fields or {}).items():
+            # Other integers are not constants, because a study may vary them within one
+            # structure.
+            if dtype.kind == "i" and not dtype.shape and row[field] in (0, 1):
+                constants.append((field, int(row[field])))
+        return cls(
+            name=name,
+            is_stored=is_stored,
+            size=size,
+            constants=tuple(constants),
+            columns=tuple(tuple(peer) for peer in columns.tolist()),
+        )
+
 
 class _LawMethod(NamedTuple):
     """Method `torque` of a control law, and the data types of its arrays."""
@@ -87,37 +119,6 @@ def _name_law(torque: Callable[..., Any], form: LawForm) -> tuple[str, bool]:
         name = f"user{next(_user_law_numbers)}"
     _METHODS[name] = _LawMethod(torque, form)
     return name, bool(sources)
-
-
-def describe_lane_law(law: CompiledLaw | None, columns: Any) -> LaneLaw:
-    """Returns the properties of a control law on which compiled code of a simulation depends.
-
-    Several runs can be simulated side by side by the same code only if these properties are
-    equal.
-
-    Args:
-        law: The law. None if the law of the site (arm controller) is a part of the kernel.
-        columns: Indices of the C values that the law receives from each of P peers (other
-            sites), shape (P, C).
-    """
-    if law is None:
-        return LaneLaw(NO_LAW, is_stored=True, size=0, constants=(), columns=())
-    form = law.form
-    name, is_stored = _name_law(law.torque, form)
-    size = form.law.itemsize // 8
-    row = law.row[:size].view(form.law)[0]
-    constants = []
-    for field, (dtype, *_) in (form.law.fields or {}).items():
-        # Other integers are not constants, because a study may vary them within one structure.
-        if dtype.kind == "i" and not dtype.shape and row[field] in (0, 1):
-            constants.append((field, int(row[field])))
-    return LaneLaw(
-        name=name,
-        is_stored=is_stored,
-        size=size,
-        constants=tuple(constants),
-        columns=tuple(tuple(peer) for peer in columns.tolist()),
-    )
 
 
 class LawCode(types.Type):

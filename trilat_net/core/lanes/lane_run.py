@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from ...records import NS_PER_S, Mode
 from ..step.compiled_run import CompiledRun
 from ..step.fused_run import NEVER_NS, ReplayedInputs
-from ..step.jit import find_lane_address, is_lane_code_stored, leaf, read_lane_assembly
+from ..step.jit import LaneCode, leaf
 from ..step.run_state import RunMemory
 from ..step.site_arrays import SiteArrays
 from ..step.ticks import BUCKETS_PER_S, first_tick_at, tick_ns
@@ -31,9 +31,8 @@ from ..step.vectors import Array, IntArray
 from .chain_lane_stages import advance_chain_site
 from .lane_deliveries import (
     BLOCK_TICKS,
-    copy_link_states,
-    find_draw_addresses,
-    keep_link_states,
+    DrawAddresses,
+    LinkStates,
     repeat_deliveries,
     use_samples,
     use_samples_of_rates,
@@ -41,7 +40,7 @@ from .lane_deliveries import (
 from .lane_laws import LawCode
 from .lane_rows import LANES, LaneTable, Words, allocate_words, read_words
 from .lane_stages import STAGES_DTYPE, EndedRuns, RecordedHands, advance_site, run_block
-from .lane_structure import RunStructure, SiteStructure, find_structure
+from .lane_structure import RunStructure, SiteStructure
 
 _FIRST_PAGES = 256
 """Initial number of ticks whose states are kept, a power of two."""
@@ -236,7 +235,7 @@ def _find_addresses(run: CompiledRun, structure: RunStructure, clock: types.Type
 
     Args:
         run: One of the runs.
-        structure: The structure that all these runs have, see `find_structure`.
+        structure: The structure that all these runs have, see `RunStructure`.
         clock: Numba's type of the ticks, see `_list_argument_types`.
 
     Raises:
@@ -246,7 +245,7 @@ def _find_addresses(run: CompiledRun, structure: RunStructure, clock: types.Type
     addresses = []
     for site in structure.sites:
         arguments = _list_argument_types(layout, structure, site, clock)
-        addresses.append(find_lane_address(_choose_code(layout), arguments))
+        addresses.append(LaneCode(_choose_code(layout), arguments).find_address())
     return np.array(addresses)
 
 
@@ -265,7 +264,7 @@ def explain_uncompilable(run: CompiledRun, clock: types.Type = types.int64) -> s
         The reason. Empty if all laws can be compiled.
     """
     try:
-        _find_addresses(run, find_structure(run), clock)
+        _find_addresses(run, RunStructure.find(run), clock)
     except NumbaError:
         return "control laws that cannot be compiled side by side"
     return ""
@@ -281,10 +280,10 @@ def read_assembly(run: CompiledRun, i: int) -> str:
         run: The run.
         i: Index of the site.
     """
-    structure = find_structure(run)
+    structure = RunStructure.find(run)
     layout = _find_layout(run)
     arguments = _list_argument_types(layout, structure, structure.sites[i])
-    return read_lane_assembly(_choose_code(layout), arguments)
+    return LaneCode(_choose_code(layout), arguments).read_assembly()
 
 
 @leaf
@@ -315,10 +314,12 @@ def has_lane_code(run: CompiledRun) -> bool:
     Args:
         run: The run. `find_obstacle` must find no reason against computing it in a lane.
     """
-    structure = find_structure(run)
+    structure = RunStructure.find(run)
     layout = _find_layout(run)
     return all(
-        is_lane_code_stored(_choose_code(layout), _list_argument_types(layout, structure, site))
+        LaneCode(
+            _choose_code(layout), _list_argument_types(layout, structure, site)
+        ).is_stored()
         for site in structure.sites
     )
 
@@ -409,7 +410,7 @@ class LaneRun:
 
     Args:
         runs: The runs before their first tick (control period), at most `LANES`. They must have
-            the same structure, see `find_structure`, and no obstacle, see `find_obstacle`.
+            the same structure, see `RunStructure`, and no obstacle, see `find_obstacle`.
         record_rows: Number of latest records of each site (arm controller) that are kept, a
             power of two.
 
@@ -422,8 +423,8 @@ class LaneRun:
 
     def __init__(self, runs: Sequence[CompiledRun], record_rows: int = 1) -> None:
         assert 0 < len(runs) <= LANES
-        structure = find_structure(runs[0])
-        assert all(find_structure(run) == structure for run in runs)
+        structure = RunStructure.find(runs[0])
+        assert all(RunStructure.find(run) == structure for run in runs)
         assert all(run.ran_s == 0.0 for run in runs)
         self.runs = list(runs)
         self._structure = structure
@@ -439,8 +440,8 @@ class LaneRun:
         self._next_ns = np.zeros(self._sites, np.int64)
         self._latest = np.zeros((3, self._sites), np.int64)
         self._next_samples = np.zeros((self._sites, structure.peers), np.int64)
-        self._deliveries = copy_link_states(tables)
-        self._draws = find_draw_addresses()
+        self._deliveries = LinkStates.copy_from(tables)
+        self._draws = DrawAddresses.find()
         self._links_of_runs = [_LinksOfRun(run) for run in runs]
 
         self._pages = _FIRST_PAGES
@@ -746,7 +747,7 @@ class LaneRun:
             lane_table[..., : len(lanes)] = lane_table[..., lanes]
         self._states[:, :, : len(lanes)] = self._states[:, :, lanes]
         self._ended.ticks[:] = -1
-        self._deliveries = keep_link_states(self._deliveries, lanes)
+        self._deliveries = self._deliveries.keep(lanes)
         self._links_of_runs = [self._links_of_runs[lane] for lane in lanes]
         self.runs = [self.runs[lane] for lane in lanes]
 

@@ -9,7 +9,6 @@ Invariant:
     - Two runs with the same structure use the same compiled code and the same number tables.
 """
 
-from collections.abc import Hashable
 from typing import Any, NamedTuple
 
 import numba
@@ -18,7 +17,7 @@ import numpy as np
 from ..arms.exogenous import OWN_KINDS
 from ..step.compiled_run import CompiledRun
 from ..step.site_setup import StaleAction
-from .lane_laws import LaneLaw, describe_lane_law
+from .lane_laws import LaneLaw
 from .lane_rows import Constants
 
 SITE_CONSTANTS: tuple[str, ...] = (
@@ -74,6 +73,43 @@ class RunStructure(NamedTuple):
     duration_s: float
     settled_rad: float
 
+    @classmethod
+    def find(cls, run: CompiledRun) -> "RunStructure":
+        """Returns the properties of a run that decide with which other runs it can be computed.
+
+        For example, two runs with the same control laws but different gains have the same
+        result.
+
+        Args:
+            run: The run. `find_obstacle` must find no reason against computing it in a lane.
+        """
+        memory = run.memory
+        tables = memory.tables
+        sites = []
+        pairs = zip(tables.site, tables.actors, memory.sums, strict=True)
+        for i, (site, actors, sums) in enumerate(pairs):
+            rows = _list_actors(actors)
+            columns = None if tables.channel is None else tables.channel.columns[i]
+            names = SITE_CONSTANTS
+            if site[0]["on_stale"] == StaleAction.GLIDE:
+                names = tuple(name for name in names if name not in _CHANGED_BY_GLIDE)
+            structure = SiteStructure(
+                constants=_read_constants(site[0], names),
+                actors=tuple(_read_constants(row, _ACTOR_CONSTANTS) for row in rows),
+                first_environment=int(sums["first_environment"]),
+                law=LaneLaw.describe(memory.compiled_laws.get(i), columns),
+                prismatic=_list_prismatic(tables.chain, i, int(site[0]["joints"])),
+            )
+            sites.append(structure)
+        return cls(
+            sites=tuple(sites),
+            peers=tables.links.shape[1],
+            ramps=tables.ramps.shape[1],
+            table=(tables.table.shape, tables.table.tobytes()),
+            duration_s=run.duration_s,
+            settled_rad=memory.settled_rad,
+        )
+
 
 def _read_constants(row: np.void, names: tuple[str, ...]) -> Constants:
     """Returns the values of integer fields of a row, with their names."""
@@ -114,53 +150,3 @@ def find_obstacle(run: CompiledRun, *, hand_site: int = -1) -> str:
 def _list_prismatic(chain: Any, i: int, joints: int) -> tuple[int, ...]:
     """Returns 1 for each prismatic joint of a site and 0 for others; () for planar arms."""
     return () if chain is None else tuple(chain["prismatic"][i, :joints].tolist())
-
-
-def find_structure(run: CompiledRun) -> RunStructure:
-    """Returns the properties of a run that decide with which other runs it can be computed.
-
-    For example, two runs with the same control laws but different gains have the same result.
-
-    Args:
-        run: The run. `find_obstacle` must find no reason against computing it in a lane.
-    """
-    memory = run.memory
-    tables = memory.tables
-    sites = []
-    pairs = zip(tables.site, tables.actors, memory.sums, strict=True)
-    for i, (site, actors, sums) in enumerate(pairs):
-        rows = _list_actors(actors)
-        columns = None if tables.channel is None else tables.channel.columns[i]
-        names = SITE_CONSTANTS
-        if site[0]["on_stale"] == StaleAction.GLIDE:
-            names = tuple(name for name in names if name not in _CHANGED_BY_GLIDE)
-        structure = SiteStructure(
-            constants=_read_constants(site[0], names),
-            actors=tuple(_read_constants(row, _ACTOR_CONSTANTS) for row in rows),
-            first_environment=int(sums["first_environment"]),
-            law=describe_lane_law(memory.compiled_laws.get(i), columns),
-            prismatic=_list_prismatic(tables.chain, i, int(site[0]["joints"])),
-        )
-        sites.append(structure)
-    return RunStructure(
-        sites=tuple(sites),
-        peers=tables.links.shape[1],
-        ramps=tables.ramps.shape[1],
-        table=(tables.table.shape, tables.table.tobytes()),
-        duration_s=run.duration_s,
-        settled_rad=memory.settled_rad,
-    )
-
-
-def describe_structure(run: CompiledRun) -> Hashable:
-    """Returns a key for sorting runs into groups that can be simulated side by side.
-
-    The key is equal for runs that differ in numbers only, such as gains.
-
-    Args:
-        run: The run before its first tick.
-
-    Returns:
-        The structure of the run. If the run must be computed alone, the reason for this.
-    """
-    return find_obstacle(run) or find_structure(run)

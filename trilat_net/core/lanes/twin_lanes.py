@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from ...records import NS_PER_S
 from ..step.compiled_run import CompiledRun
 from ..step.fused_run import ReplayedInputs
-from ..step.run_state import mark_floats, scale_differences
+from ..step.run_state import RunState
 from ..step.ticks import first_tick_at
 from ..step.vectors import Array, IntArray
 from .lane_deliveries import use_recorded_samples
@@ -95,8 +95,8 @@ class TwinLanes(LaneRun):
         self._planned_ticks = np.array(ticks)
         self._last_ticks = self._ticks.copy()
         floats: list[tuple[Words, NDArray[np.bool_]]] = [
-            (self._site, mark_floats(self._layout.site)),
-            (self._links, mark_floats(self._layout.link)),
+            (self._site, RunState.mark_floats(self._layout.site)),
+            (self._links, RunState.mark_floats(self._layout.link)),
         ]
         of_laws = (self._laws, self._sent, self._received)
         floats += [(table, np.full(table.shape[1], True)) for table in of_laws]
@@ -268,4 +268,4 @@ def _scale(mine: Words, others: Words, is_float: NDArray[np.bool_], factor: floa
     changed = (bits != others) & is_float
     x = bits[changed].view(np.float64)
     y = others[changed].view(np.float64)
-    mine[changed] = scale_differences(x, y, factor).view(np.int64)
+    mine[changed] = RunState.scale_differences(x, y, factor).view(np.int64)

@@ -134,7 +134,7 @@ class HandRules(NamedTuple):
 
     def start(self) -> "HandStep":
         """Returns the state and the action while nobody has moved the arm yet."""
-        return HandStep(HandMemory(), empty_hand_vector(self.size))
+        return HandStep(HandMemory(), HandInForce.list_empty(self.size))
 
     def advance(
         self,
@@ -179,7 +179,9 @@ class HandRules(NamedTuple):
             state = _release(state, state.number - 1)
 
         if not state.target:
-            return HandStep(state, empty_hand_vector(self.size), tuple(refused), tuple(changes))
+            return HandStep(
+                state, HandInForce.list_empty(self.size), tuple(refused), tuple(changes)
+            )
 
         is_held = state.source != 0
         rate = _find_rate(self, state, t_ns) if is_held else _find_fading_rate(self, state)
@@ -282,6 +284,27 @@ class HandInForce(NamedTuple):
             rate=tuple(numbers[size:]),
         )
 
+    @staticmethod
+    def count_numbers(size: int) -> int:
+        """Returns how many values the log stores about a person or program that moves the arm.
+
+        They are the fields of a `HandInForce` for one control period, written one after another
+        into the field `hand` of a record. Vectors such as the goal have `size` numbers.
+
+        Args:
+            size: Number of coordinates of the target to which the arm is pulled.
+        """
+        return 3 + 2 * size
+
+    @staticmethod
+    def list_empty(size: int) -> list[float]:
+        """Returns the field `hand` of a record while no person or program moves the arm.
+
+        Args:
+            size: Number of coordinates of the target to which a holder would pull the arm.
+        """
+        return [0.0, -1.0, 0.0, *[0.0] * (2 * size)]
+
 
 class HandStep(NamedTuple):
     """Result of one control period for the person or program that moves an arm.
@@ -301,27 +324,6 @@ class HandStep(NamedTuple):
     vector: list[float]
     refused: tuple[str, ...] = ()
     changes: tuple[tuple[int, str], ...] = ()
-
-
-def count_hand_numbers(size: int) -> int:
-    """Returns how many values the log stores about a person or program that moves the arm.
-
-    They are the fields of a `HandInForce` for one control period, written one after another
-    into the field `hand` of a record. Vectors such as the goal have `size` numbers.
-
-    Args:
-        size: Number of coordinates of the target to which the arm is pulled.
-    """
-    return 3 + 2 * size
-
-
-def empty_hand_vector(size: int) -> list[float]:
-    """Returns what the log stores in its field `hand` while no person or program moves the arm.
-
-    Args:
-        size: Number of coordinates of the target to which a holder would pull the arm.
-    """
-    return [0.0, -1.0, 0.0, *[0.0] * (2 * size)]
 
 
 def _move_target(rules: HandRules, memory: HandMemory) -> HandMemory:

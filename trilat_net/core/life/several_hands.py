@@ -27,7 +27,7 @@ ACTION_NUMBERS = 1 + 2 * AXES
 """
 
 
-class HandArrays(NamedTuple):
+class _HandArrays(NamedTuple):
     """State and limits of the programs that pull the arms, in L simulations side by side.
 
     Each row belongs to one simulation. `HandMemory` and `HandRules` explain the same quantities
@@ -66,7 +66,7 @@ class HandArrays(NamedTuple):
 
 
 @leaf
-def _put_nearest_goal(lane: int, goal: Array, hands: HandArrays) -> None:
+def _put_nearest_goal(lane: int, goal: Array, hands: _HandArrays) -> None:
     """Stores the goal to which a program pulls its arm, moved to the nearest point in reach.
 
     The point is first moved into a box, and then into a spherical shell, exactly as
@@ -112,7 +112,7 @@ def _advance_hands(
     acts: IntArray,
     goals: Array,
     poses: Array,
-    hands: HandArrays,
+    hands: _HandArrays,
     rows: Array,
     actions: Array,
 ) -> None:
@@ -218,7 +218,7 @@ class SeveralHands:
         def integers() -> IntArray:
             return np.zeros(count, np.int64)
 
-        self.arrays = HandArrays(
+        self.arrays = _HandArrays(
             holds=integers(),
             grip=numbers(),
             target=pairs(),

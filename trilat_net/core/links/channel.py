@@ -19,27 +19,19 @@ from ..step.ticks import tick_ns
 from ..step.vectors import IntArray, Points, Row, RowArray
 from .delay import (
     COPY,
-    DELAY,
     DUPLICATE,
     LOSS,
     DelayKind,
     clamp_delay_us,
-    custom_delay_us,
     draw_delay_us,
-    next_ar1_value,
-    sine_delay_us,
-    trace_delay_us,
+    find_delay_us,
 )
-from .philox import DrawKey, uniforms
+from .philox import uniforms
 
 LOST = -1
 """Used in place of a due time for a sample that the network loses."""
 
 _AR1 = int(DelayKind.AR1)
-_SINE = int(DelayKind.SINE)
-_TRACE = int(DelayKind.TRACE)
-_MEASURED = int(DelayKind.MEASURED)
-_CUSTOM = int(DelayKind.CUSTOM)
 
 
 @leaf
@@ -113,45 +105,6 @@ def _draw_loss(sample: int, fresh: bool, link: LinkRow, model: Row) -> bool:
         return False
     u, v = uniforms(link.key, sample, LOSS, 0)
     return advance_losses(u, v, fresh, link, model)
-
-
-@leaf
-def find_delay_us(
-    sample: int, stamp_ns: int, fresh: bool, link: LinkRow, model: Row, points: Points
-) -> int:
-    """Returns the delay of a message on a simulated network link, us.
-
-    The delay may follow a distribution, a function of time, or a recorded trace, see
-    `DelayKind`. The result is LOST if the trace says that the message is lost. A message
-    (sample) is the state that another arm sends in one control period.
-
-    Args:
-        sample: Index of the sample.
-        stamp_ns: Time at which the sample was sent, ns since the start of the session.
-        fresh: True for the first sample of the model, with which the model's state starts.
-        link: State of the link, with the seed of its random numbers.
-        model: Delay model in force, a row of LINK_MODEL_DTYPE.
-        points: Delay traces and outages of all links of the receiver.
-    """
-    key: DrawKey = link.key
-    if model.kind == _MEASURED:
-        return 0
-    if model.kind == _TRACE:
-        return trace_delay_us(stamp_ns, model, points)
-    if model.kind == _SINE:
-        return clamp_delay_us(sine_delay_us(stamp_ns, model))
-    if model.kind == _AR1:
-        link.memory = next_ar1_value(
-            key=key, sample=sample, correlation=model.weight, before=link.memory, fresh=fresh
-        )
-        return clamp_delay_us(model.location + model.scale * link.memory)
-    if model.kind == _CUSTOM:
-        custom_us = custom_delay_us(
-            key=key, sample=sample, stamp_ns=stamp_ns, model=model, points=points
-        )
-        return clamp_delay_us(custom_us)
-    drawn_us = draw_delay_us(key, sample, DELAY, model)
-    return clamp_delay_us(drawn_us)
 
 
 @leaf

@@ -21,6 +21,7 @@ import numpy as np
 
 from ..plug.plugged import call_address
 from ..step.jit import leaf
+from ..step.row_fields import LinkRow
 from ..step.vectors import Points, Row, count_started
 from .philox import DrawKey, standard_gamma, standard_normal, uniforms
 
@@ -120,6 +121,21 @@ class LinkModel(NamedTuple):
     sample: int = 0
     stamp_ns: int = 0
     drawn_us: float = 0.0
+
+    @classmethod
+    def follow_trace(cls, at_end: str) -> "LinkModel":
+        """Creates a model whose delays are those of a recorded trace.
+
+        Args:
+            at_end: How the trace continues after its last entry: "hold" or "loop", see
+                `TraceEnd`.
+        """
+        return cls(kind=DelayKind.TRACE, at_end=TraceEnd[at_end.upper()])
+
+    @property
+    def has_ending_trace(self) -> bool:
+        """True if the delays are those of a trace that does not start again at its end."""
+        return self.kind == DelayKind.TRACE and self.at_end == TraceEnd.HOLD
 
 
 LINK_MODEL_DTYPE = np.dtype(
@@ -274,7 +290,7 @@ def draw_delay_us(key: DrawKey, sample: int, purpose: int, model: Row) -> float:
 
 
 @leaf
-def next_ar1_value(
+def _next_ar1_value(
     key: DrawKey, sample: int, correlation: float, before: float, fresh: bool
 ) -> float:
     """Returns the next number of a random sequence in which neighbours are correlated.
@@ -298,7 +314,7 @@ def next_ar1_value(
 
 
 @leaf
-def sine_delay_us(stamp_ns: int, model: Row) -> float:
+def _sine_delay_us(stamp_ns: int, model: Row) -> float:
     """Computes the delay of a sample (message) on a link whose delay is a sine of time.
 
         delay(t) = mean + amplitude sin(2 pi t / period + phase)
@@ -368,7 +384,7 @@ def draw_pair(now: Row, index: int, attempt: int) -> tuple[float, float]:
 
 
 @leaf
-def custom_delay_us(
+def _custom_delay_us(
     key: DrawKey, sample: int, stamp_ns: int, model: Row, points: Points
 ) -> float:
     """Computes the delay of a message by the compiled function of a user's model, us.
@@ -411,3 +427,49 @@ def clamp_delay_us(delay_us: float) -> int:
     """
     rounded_us = math.floor(delay_us + 0.5)
     return int(min(max(rounded_us, 0.0), float(MAX_DELAY_US)))
+
+
+_AR1 = int(DelayKind.AR1)
+_SINE = int(DelayKind.SINE)
+_TRACE = int(DelayKind.TRACE)
+_MEASURED = int(DelayKind.MEASURED)
+_CUSTOM = int(DelayKind.CUSTOM)
+
+
+@leaf
+def find_delay_us(
+    sample: int, stamp_ns: int, fresh: bool, link: LinkRow, model: Row, points: Points
+) -> int:
+    """Returns the delay of a message on a simulated network link, us.
+
+    The delay may follow a distribution, a function of time, or a recorded trace, see
+    `DelayKind`. The result is `channel.LOST` if the trace says that the message is lost. A
+    message (sample) is the state that another arm sends in one control period.
+
+    Args:
+        sample: Index of the sample.
+        stamp_ns: Time at which the sample was sent, ns since the start of the session.
+        fresh: True for the first sample of the model, with which the model's state starts.
+        link: State of the link, with the seed of its random numbers.
+        model: Delay model in force, a row of LINK_MODEL_DTYPE.
+        points: Delay traces and outages of all links of the receiver.
+    """
+    key: DrawKey = link.key
+    if model.kind == _MEASURED:
+        return 0
+    if model.kind == _TRACE:
+        return trace_delay_us(stamp_ns, model, points)
+    if model.kind == _SINE:
+        return clamp_delay_us(_sine_delay_us(stamp_ns, model))
+    if model.kind == _AR1:
+        link.memory = _next_ar1_value(
+            key=key, sample=sample, correlation=model.weight, before=link.memory, fresh=fresh
+        )
+        return clamp_delay_us(model.location + model.scale * link.memory)
+    if model.kind == _CUSTOM:
+        custom_us = _custom_delay_us(
+            key=key, sample=sample, stamp_ns=stamp_ns, model=model, points=points
+        )
+        return clamp_delay_us(custom_us)
+    drawn_us = draw_delay_us(key, sample, DELAY, model)
+    return clamp_delay_us(drawn_us)

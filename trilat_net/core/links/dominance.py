@@ -35,111 +35,157 @@ from .lost_peers import regroup
 ROW_SUM_TOLERANCE = 1e-9
 
 
-def find_reach(alpha: Array) -> NDArray[np.bool_]:
-    """Finds which arms each arm follows, directly or through other arms.
+class DominanceMatrix:
+    """Matrix of the dominance factors alpha_ij, with which N sites follow each other.
 
-    Arm i follows arm j if the weight alpha_ij (dominance factor) is above 0.
-
-    Args:
-        alpha: Dominance matrix, shape (N, N): row i contains the weights with which site i
-            follows the other sites.
-
-    Returns:
-        Shape (N, N): true at [i, j] if site i follows site j, directly or through others.
-    """
-    reach: NDArray[np.bool_] = (alpha > 0.0) | np.eye(len(alpha), dtype=bool)
-    # Each squaring doubles the length of the paths.
-    for _ in range(len(alpha).bit_length()):
-        reach = reach @ reach
-    return reach
-
-
-def is_irreducible(alpha: Array) -> bool:
-    """Returns True if every arm follows every other arm, directly or through others.
-
-    The stability theorem needs this property of the matrix of weights (dominance matrix).
+    Site i follows site j, with the weight alpha_ij, if alpha_ij is above 0.
 
     Args:
-        alpha: Dominance matrix, shape (N, N): row i contains the weights with which site i
-            follows the other sites.
+        alpha: The factors, shape (N, N): row i contains the weights with which site i follows
+            the other sites.
+
+    Attributes:
+        alpha: The value of the argument.
+        reach: Shape (N, N): true at [i, j] if i = j, or if site i follows site j, directly or
+            through other sites.
     """
-    return bool(find_reach(alpha).all())
 
+    def __init__(self, alpha: Array) -> None:
+        self.alpha = alpha
+        reach: NDArray[np.bool_] = (alpha > 0.0) | np.eye(len(alpha), dtype=bool)
+        # Each squaring doubles the length of the paths.
+        for _ in range(len(alpha).bit_length()):
+            reach = reach @ reach
+        self.reach = reach
 
-def find_balancing_weights(alpha: Array) -> Array | None:
-    """Returns weights D > 0 with D_i alpha_ij = D_j alpha_ji, if the matrix is reversible.
+    @property
+    def is_irreducible(self) -> bool:
+        """True if every site follows every other site, directly or through others.
 
-    With such weights the matrix is similar to a symmetric one, so that its eigenvalues are
-    real. Some stability conditions hold only then. The equation is called detailed balance. It
-    has a solution if the products of the dominance factors around each cycle of sites are equal
-    in both directions (Kolmogorov), as in alpha12 alpha23 alpha31 = alpha13 alpha32 alpha21 for
-    three sites. Links that leave a group of sites that all reach each other are part of no
-    cycle, and are ignored.
+        The stability theorem needs this property.
+        """
+        return bool(self.reach.all())
 
-    Args:
-        alpha: Dominance matrix, shape (N, N): row i contains the weights with which site i
-            follows the other sites.
+    def find_closed_groups(self) -> tuple[tuple[int, ...], ...]:
+        """Finds the groups of sites that follow each other, and no site outside the group.
 
-    Returns:
-        D, shape (N,), with D = 1 at the first site of each group. None if no D exists.
-    """
-    reach = find_reach(alpha)
-    is_on_circle = reach & reach.T & (alpha > 0.0)
-    D = np.zeros(len(alpha))  # 0: not known yet
-    for first in range(len(alpha)):
-        if D[first]:
-            continue
-        # The first site of a group: the balance with its neighbours gives their weights.
-        D[first] = 1.0
-        unvisited = [first]
-        while unvisited:
-            i = unvisited.pop()
-            for j in np.flatnonzero(is_on_circle[i]).tolist():
-                forward = D[i] * alpha[i, j]
-                alpha_back = alpha[j, i]
-                imbalance = abs(forward - D[j] * alpha_back)
-                if not D[j] and alpha_back:
-                    D[j] = forward / alpha_back
-                    unvisited.append(j)
-                elif imbalance > ROW_SUM_TOLERANCE * forward:
-                    return None
-    return D
+        If there are several groups, the weights of the sites in the energy function V are not
+        unique.
 
+        Returns:
+            Indices of the sites of each group.
+        """
+        reach = self.reach
+        groups = []
+        for site in range(len(reach)):
+            is_mutual = reach[site] & reach[:, site]
+            group = tuple(np.flatnonzero(is_mutual).tolist())
+            # The first site of a group stands for the group.
+            is_first = group[0] == site
+            is_closed = reach[site].sum() == len(group)
+            if is_first and is_closed:
+                groups.append(group)
+        return tuple(groups)
 
-def perron_vector(alpha: Array) -> Array:
-    """Returns the weights beta of the arms (sites) in the energy function of the proof.
+    def find_balancing_weights(self) -> Array | None:
+        """Returns weights D > 0 with D_i alpha_ij = D_j alpha_ji, if the matrix is reversible.
 
-    They are the positive solution of beta' = beta' alpha with the sum 1, which the paper writes
-    as beta' Upsilon = 0. The method is the elimination of Grassmann, Taksar and Heyman (1985).
-    It contains no subtraction. Therefore each entry is accurate to a few units in the last
-    place even if the dominance factors differ by many orders of magnitude.
+        With such weights the matrix is similar to a symmetric one, so that its eigenvalues are
+        real. Some stability conditions hold only then. The equation is called detailed balance.
+        It has a solution if the products of the dominance factors around each cycle of sites
+        are equal in both directions (Kolmogorov), as in alpha12 alpha23 alpha31 = alpha13
+        alpha32 alpha21 for three sites. Links that leave a group of sites that all reach each
+        other are part of no cycle, and are ignored.
 
-    Args:
-        alpha: Irreducible dominance matrix, shape (N, N), see `is_irreducible`.
+        Returns:
+            D, shape (N,), with D = 1 at the first site of each group. None if no D exists.
+        """
+        alpha = self.alpha
+        is_on_circle = self.reach & self.reach.T & (alpha > 0.0)
+        D = np.zeros(len(alpha))  # 0: not known yet
+        for first in range(len(alpha)):
+            if D[first]:
+                continue
+            # The first site of a group: the balance with its neighbours gives their weights.
+            D[first] = 1.0
+            unvisited = [first]
+            while unvisited:
+                i = unvisited.pop()
+                for j in np.flatnonzero(is_on_circle[i]).tolist():
+                    forward = D[i] * alpha[i, j]
+                    alpha_back = alpha[j, i]
+                    imbalance = abs(forward - D[j] * alpha_back)
+                    if not D[j] and alpha_back:
+                        D[j] = forward / alpha_back
+                        unvisited.append(j)
+                    elif imbalance > ROW_SUM_TOLERANCE * forward:
+                        return None
+        return D
 
-    Returns:
-        The weights, shape (N,).
+    def find_least_eigenvalue(self) -> float | None:
+        """Returns the least eigenvalue of the matrix, or None if the matrix is not reversible.
 
-    Raises:
-        ValueError: alpha is reducible: the weight of some site is zero, or beta is not unique.
-    """
-    if not is_irreducible(alpha):
-        raise ValueError("alpha is reducible: beta has a zero entry or is not unique")
-    a = alpha.copy()
-    size = len(a)
-    # Eliminate the last site: its followers follow its peers instead.
-    for last in range(size - 1, 0, -1):
-        row = a[last, :last]
-        a[:last, last] /= row.sum()
-        column = a[:last, last]
-        a[:last, :last] += np.outer(column, row)
-    # Substitute back, starting with the weight 1 for the first site.
-    beta = np.zeros(size)
-    beta[0] = 1.0
-    for site in range(1, size):
-        beta[site] = beta[:site] @ a[:site, site]
-    normalised: Array = beta / beta.sum()
-    return normalised
+        All eigenvalues of a reversible matrix are real, see `find_balancing_weights`. The
+        negative of the least eigenvalue is a lower bound on d / (K T), where d is the damping,
+        K the stiffness and T the delay (docs/theory/damping-conditions.md).
+        """
+        if self.find_balancing_weights() is None:
+            return None
+        eigenvalues = np.linalg.eigvals(self.alpha)
+        return float(eigenvalues.real.min())
+
+    def find_beta(self) -> Array:
+        """Returns the weights beta of the sites in the energy function of the proof.
+
+        They are the positive solution of beta' = beta' alpha with the sum 1, which the paper
+        writes as beta' Upsilon = 0. The method is the elimination of Grassmann, Taksar and
+        Heyman (1985). It contains no subtraction. Therefore each entry is accurate to a few
+        units in the last place even if the dominance factors differ by many orders of
+        magnitude.
+
+        Returns:
+            The weights, shape (N,).
+
+        Raises:
+            ValueError: The matrix is reducible: the weight of some site is zero, or beta is not
+                unique.
+        """
+        if not self.is_irreducible:
+            raise ValueError("alpha is reducible: beta has a zero entry or is not unique")
+        a = self.alpha.copy()
+        size = len(a)
+        # Eliminate the last site: its followers follow its peers instead.
+        for last in range(size - 1, 0, -1):
+            row = a[last, :last]
+            a[:last, last] /= row.sum()
+            column = a[:last, last]
+            a[:last, :last] += np.outer(column, row)
+        # Substitute back, starting with the weight 1 for the first site.
+        beta = np.zeros(size)
+        beta[0] = 1.0
+        for site in range(1, size):
+            beta[site] = beta[:site] @ a[:site, site]
+        normalised: Array = beta / beta.sum()
+        return normalised
+
+    def find_pi(self) -> Array:
+        """Returns the left eigenvector pi for the eigenvalue 1, also of a reducible matrix.
+
+        The vector satisfies pi >= 0 and pi' alpha = pi', and its sum is 1. pi is 0 for sites
+        outside closed groups, see `find_closed_groups`. With several closed groups pi is not
+        unique: the sum of its entries in each group is then chosen proportional to the number
+        of sites in the group.
+
+        Returns:
+            The vector, shape (N,).
+        """
+        pi = np.zeros(len(self.alpha))
+        groups = self.find_closed_groups()
+        total = sum(map(len, groups))
+        for group in groups:
+            group_pi = DominanceMatrix(self.alpha[np.ix_(group, group)]).find_beta()
+            pi[list(group)] = group_pi * len(group) / total
+        return pi
 
 
 RAMP_COLUMNS = 2

@@ -112,7 +112,7 @@ class LinkSchedule:
         due_ns = self.draw(end)
         stamp_ns = samples * NS_PER_S // int(self.row.rate_hz)
         # A sample never comes into use at its own sending time.
-        ticks = first_ticks(np.maximum(due_ns, stamp_ns + 1), receiver_hz)
+        ticks = self.first_ticks(np.maximum(due_ns, stamp_ns + 1), receiver_hz)
         is_delivered = due_ns != LOST
         return samples[is_delivered], ticks[is_delivered]
 
@@ -147,17 +147,17 @@ class LinkSchedule:
         ticks = max(2, round(duration_s * receiver_hz))
         return self.draw_used(sent, receiver_hz, ticks)
 
+    @staticmethod
+    def first_ticks(due_ns: IntArray, rate_hz: int) -> IntArray:
+        """Returns the first control period of the receiver at or after each delivery time.
 
-def first_ticks(due_ns: IntArray, rate_hz: int) -> IntArray:
-    """Returns the first control period of the receiver at or after each delivery time.
+        It is `first_tick_at` for an array of times.
 
-    It is `first_tick_at` for an array of times.
+        Args:
+            due_ns: Times in ns after the epoch (the common start time).
+            rate_hz: Tick rate, in Hz.
 
-    Args:
-        due_ns: Times in ns after the epoch (the common start time).
-        rate_hz: Tick rate, in Hz.
-
-    Returns:
-        Numbers of the ticks, one per time.
-    """
-    return -(-due_ns * rate_hz // NS_PER_S)
+        Returns:
+            Numbers of the ticks, one per time.
+        """
+        return -(-due_ns * rate_hz // NS_PER_S)

@@ -41,11 +41,7 @@ from .user_law import (
     LawInput,
     LawResults,
     PeerView,
-    check_results,
-    describe_failure,
-    law_name,
-    list_remembered,
-    name_memory,
+    SiteLaw,
 )
 
 CHECKED: Any = {"_nrt": False, "boundscheck": True}
@@ -322,7 +318,7 @@ def _compile_law(torque: Callable[..., Any], form: LawForm) -> Any:
     return function
 
 
-def _read_numbers(law: Any) -> dict[str, np.ndarray[Any, Any]]:
+def _read_numbers(law: Any, remembered: Sequence[str]) -> dict[str, np.ndarray[Any, Any]]:
     """Collects the gains and the memory of a law, which its compiled form keeps in an array.
 
     These are the attributes of the instance, and the attributes of its class whose names occur
@@ -336,6 +332,7 @@ def _read_numbers(law: Any) -> dict[str, np.ndarray[Any, Any]]:
 
     Args:
         law: An instance of the law's class.
+        remembered: Names of the attributes that the law keeps from tick to tick.
 
     Returns:
         Arrays by attribute name: first the numbers that the law remembers, in their order, then
@@ -350,7 +347,6 @@ def _read_numbers(law: Any) -> dict[str, np.ndarray[Any, Any]]:
     # Functions that `torque` calls may use any attribute of the instance.
     used |= vars(law).keys()
 
-    remembered = list_remembered(law)
     others = sorted(name for name in used if hasattr(law, name))
     numbers_by_name = {}
     for name in dict.fromkeys([*remembered, *others]):
@@ -508,12 +504,13 @@ class CompiledLaw:
 
     def __init__(self, law: Any, setup: SiteSetup, arrays: SiteArrays, sent: Array) -> None:
         path = f"sites.{setup.name}.control.law"
-        numbers = _read_numbers(law)
-        remembered = list_remembered(law)
+        site_law = SiteLaw(law, setup.name)
+        remembered = site_law.remembered
+        numbers = _read_numbers(law, remembered)
         missing = [name for name in remembered if name not in numbers]
         if missing:
             raise ScenarioError(
-                f"{law_name(law)}: the attribute {missing[0]}, which the law keeps from tick "
+                f"{site_law.name}: the attribute {missing[0]}, which the law keeps from tick "
                 "to tick, must be a number or a list of numbers",
                 path=path,
             )
@@ -535,7 +532,7 @@ class CompiledLaw:
             self._function = _compile_law(self.torque, form)
         except (NumbaError, KeyError) as error:
             raise ScenarioError(
-                f"{law_name(law)} cannot be compiled: {_explain(error, law)}", path=path
+                f"{site_law.name} cannot be compiled: {_explain(error, law)}", path=path
             ) from None
 
         self.address = find_address(self._function)
@@ -543,8 +540,7 @@ class CompiledLaw:
         for name, value in numbers.items():
             row[0][name] = value
         self.row: Array = row.view(np.float64)
-        self._law = law
-        self._name = setup.name
+        self._law = site_law
         self._arrays = arrays
         self._sent = sent
         self._stage = law_stage
@@ -624,7 +620,7 @@ class CompiledLaw:
     @property
     def memory_names(self) -> tuple[str, ...]:
         """A name for each number of `memory`, as "error[1]"."""
-        return name_memory(self._law)
+        return self._law.memory_names
 
     def restore(self, memory: Sequence[float]) -> None:
         """Restores the control law to its state after a recorded control period.
@@ -662,10 +658,10 @@ class CompiledLaw:
                 sent=self._sent.tolist(),
             )
             try:
-                check_results(self._law, self._name, s.k, results)
+                self._law.check_results(s.k, results)
             except LawFailed as failure:
                 return failure
-        return describe_failure(self._law, self._name, int(s.k), error)
+        return self._law.describe_failure(int(s.k), error)
 
 
 def plug_law(

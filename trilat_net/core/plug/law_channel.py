@@ -192,24 +192,24 @@ class LawChannel(NamedTuple):
         start = to_all + peer_index * to_each
         return [*sent[:to_all], *sent[start : start + to_each]]
 
+    @staticmethod
+    def join_received(channels: "Sequence[LawChannel]") -> tuple[SentVector, ...]:
+        """Returns all vectors that the control law of an arm may receive from the other laws.
 
-def join_received(channels: Sequence[LawChannel]) -> tuple[SentVector, ...]:
-    """Returns all vectors that the control law of an arm may receive from the other laws.
+        A vector that several laws send, such as the energy E, appears once.
 
-    A vector that several laws send, such as the energy E, appears once.
+        Args:
+            channels: Vectors that each of the other laws sends.
 
-    Args:
-        channels: Vectors that each of the other laws sends.
-
-    Raises:
-        ValueError: Two peers send vectors with the same name and different lengths.
-    """
-    by_name: dict[str, SentVector] = {}
-    for channel in channels:
-        for vector in channel.vectors:
-            first = by_name.setdefault(vector.name, vector)
-            if first.length != vector.length:
-                count = count_nouns(vector.length, "number")
-                problem = f"peers send {vector.name} with different lengths"
-                raise ValueError(f"{problem}, {first.length} and {count}")
-    return tuple(by_name.values())
+        Raises:
+            ValueError: Two peers send vectors with the same name and different lengths.
+        """
+        by_name: dict[str, SentVector] = {}
+        for channel in channels:
+            for vector in channel.vectors:
+                first = by_name.setdefault(vector.name, vector)
+                if first.length != vector.length:
+                    count = count_nouns(vector.length, "number")
+                    problem = f"peers send {vector.name} with different lengths"
+                    raise ValueError(f"{problem}, {first.length} and {count}")
+        return tuple(by_name.values())

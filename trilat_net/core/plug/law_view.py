@@ -27,11 +27,8 @@ from .user_law import (
     LawInput,
     LawVector,
     PeerView,
+    SiteLaw,
     UserLaw,
-    call_law,
-    name_memory,
-    read_memory,
-    restore_law,
 )
 
 
@@ -128,7 +125,7 @@ class PlainLaw:
         layout = setup.layout
         joints = layout.joints
         shared = layout.shared
-        self._law = law
+        self._law = SiteLaw(law, setup.name)
         self._setup = setup
         self._arrays = arrays
         self._sent = sent
@@ -188,9 +185,9 @@ class PlainLaw:
         # Write the input of the law into the arrays, and read it from there as lists.
         self._update(k, t_ns, arrays.site, arrays.links, arrays.chain)
         law_input = self._read(k)
-        results = call_law(self._law, self._setup.name, law_input, self._collect_sent)
+        results = self._law.call(law_input, self._collect_sent)
 
-        # `call_law` has checked that the results are finite and of the right length.
+        # `SiteLaw.call` has checked that the results are finite and of the right length.
         limit = self._limit
         self._views["tau"][:] = np.clip(results.torque, -limit, limit)
         self._views["theta_hat"][:] = results.theta_hat
@@ -204,12 +201,12 @@ class PlainLaw:
         They are stored with the results of each period. `restore` can continue the run from
         them.
         """
-        return read_memory(self._law)
+        return self._law.memory
 
     @property
     def memory_names(self) -> tuple[str, ...]:
         """A name for each number of `memory`, as "error[1]"."""
-        return name_memory(self._law)
+        return self._law.memory_names
 
     def restore(self, memory: Sequence[float]) -> None:
         """Restores the control law to its state after a recorded control period.
@@ -217,7 +214,7 @@ class PlainLaw:
         Args:
             memory: Numbers that `memory` returned after the tick.
         """
-        restore_law(self._law, self._setup.name, memory)
+        self._law.restore(memory)
 
     def _read(self, k: int) -> LawInput:
         """Collects the input of the control law for one tick, a period of the control loop.

@@ -93,8 +93,8 @@ def _call_compiled(_context: Any, address: Any, arguments: Any) -> Any:
 def _call_plain(address: int, arguments: tuple[Any, ...]) -> None:
     """Calls a Python function by its number in `_PLAIN`, when Numba is disabled.
 
-    Without Numba there is no machine code and so no address. `compile_to_address` then
-    registers the Python function under a number and returns this number in place of the
+    Without Numba there is no machine code and so no address. `UserModel` then registers
+    the Python function under a number and returns this number in place of the
     address.
 
     Args:
@@ -138,39 +138,6 @@ def find_address(compiled: Any) -> int:
     """
     result = compiled.get_compile_result(compiled.nopython_signatures[0])
     return int(result.library.get_pointer_to_function(result.fndesc.llvm_func_name))
-
-
-def _find_numbers(model: Any) -> dict[str, Array]:
-    """Returns the numerical fields of a user's model as arrays. They are its parameters.
-
-    The compiled function of the model receives them as a row with these field names. Fields of
-    other types, such as texts, are left out. Example: a field `stiffness_n_m = 200` becomes
-    {"stiffness_n_m": array(200.0)}.
-    """
-    numbers = {}
-    for name in model.__struct_fields__:
-        value = np.asarray(getattr(model, name))
-        is_number = value.dtype.kind in "fiub"
-        if is_number:
-            numbers[name] = value.astype(np.float64)
-    return numbers
-
-
-def list_numbers(model: Any) -> Array:
-    """Returns all numerical parameters of a user's model as one flat array of floats.
-
-    The compiled simulation stores the parameters of all models in this form.
-
-    Args:
-        model: A model of an operator, an environment or network delays.
-
-    Returns:
-        The numbers. The array is empty if the model has no parameters.
-    """
-    values = _find_numbers(model).values()
-    fields = [value.ravel() for value in values]
-    # A model without numbers gives an empty array.
-    return np.concatenate([np.zeros(0), *fields])
 
 
 @cache
@@ -225,30 +192,65 @@ def _compile(
     return numba.njit(signature, **_OPTIONS)(call)
 
 
-def compile_to_address(model: Any, name: str, row: np.dtype[np.void]) -> int:
-    """Compiles a function of a user's model, and returns the address of its machine code.
-
-    The compiled simulation then calls the function by this address, without Python.
+class UserModel:
+    """A user's model in the form that the compiled simulation needs: numbers and machine code.
 
     Args:
-        model: A model of an operator, an environment or network delays. The compiled function
-            is called with the parameters of the model and with a row of an array.
-        name: Name of the function in the class of the model.
-        row: Data type of the row.
-
-    Returns:
-        The address. If Numba is disabled, a number under which the Python function is
-        registered.
+        model: A model of an operator, an environment or network delays.
     """
-    fields: Any = []
-    for field, value in _find_numbers(model).items():
-        fields.append((field, value.dtype, value.shape))
-    if not fields:
-        fields.append(("nothing", "f8"))
-    function = getattr(type(model), name)
-    form = np.dtype((np.record, fields))
-    call = _compile(function, form, row)
-    if _config.DISABLE_JIT:
-        _PLAIN[id(call)] = call
-        return id(call)
-    return find_address(call)
+
+    def __init__(self, model: Any) -> None:
+        self._model = model
+
+    @property
+    def numbers(self) -> Array:
+        """All numerical parameters of the model, one after another.
+
+        The compiled simulation stores the parameters of all models in this form. The array is
+        empty if the model has no parameters.
+        """
+        fields = [value.ravel() for value in self._find_parameters().values()]
+        # A model without numbers gives an empty array.
+        return np.concatenate([np.zeros(0), *fields])
+
+    def compile_to_address(self, name: str, row: np.dtype[np.void]) -> int:
+        """Compiles a function of the model, and returns the address of its machine code.
+
+        The compiled simulation then calls the function by this address, without Python. The
+        function is called with the parameters of the model and with a row of an array.
+
+        Args:
+            name: Name of the function in the class of the model.
+            row: Data type of the row.
+
+        Returns:
+            The address. If Numba is disabled, a number under which the Python function is
+            registered.
+        """
+        fields: Any = []
+        for field, value in self._find_parameters().items():
+            fields.append((field, value.dtype, value.shape))
+        if not fields:
+            fields.append(("nothing", "f8"))
+        function = getattr(type(self._model), name)
+        form = np.dtype((np.record, fields))
+        call = _compile(function, form, row)
+        if _config.DISABLE_JIT:
+            _PLAIN[id(call)] = call
+            return id(call)
+        return find_address(call)
+
+    def _find_parameters(self) -> dict[str, Array]:
+        """Returns the numerical fields of the model as arrays, by name.
+
+        The compiled function of the model receives them as a row with these field names. Fields
+        of other types, such as texts, are left out. Example: a field `stiffness_n_m = 200`
+        becomes {"stiffness_n_m": array(200.0)}.
+        """
+        parameters = {}
+        for name in self._model.__struct_fields__:
+            value = np.asarray(getattr(self._model, name))
+            is_number = value.dtype.kind in "fiub"
+            if is_number:
+                parameters[name] = value.astype(np.float64)
+        return parameters

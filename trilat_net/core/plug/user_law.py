@@ -232,49 +232,174 @@ class UserLaw(Protocol):
 UserLawFactory = Callable[[LawContext], UserLaw]
 
 
-def call_law(
-    law: UserLaw, site: str, now: LawInput, collect_sent: Callable[[LawInput], list[float]]
-) -> "LawResults":
-    """Calls a user's control law for one control period, and checks its results.
+class SiteLaw:
+    """A user's control law at one site: its calls, its memory, and its errors.
 
-    If the law raises an exception or returns an unusable result, the error names the class, the
-    arm and the period.
+    A site is the process that runs one arm.
 
     Args:
-        law: The law.
-        site: Name of the site.
-        now: Input of the law in this control period.
-        collect_sent: Function that returns the numbers that the law sends to other arms.
-
-    Raises:
-        LawFailed: The law raised an exception, or its results are not finite or have the wrong
-            length.
+        law: An instance of the law's class.
+        site: Name of the site, for errors.
     """
-    try:
-        returned = law.torque(now)
-        # `now.tau` is NaN before the call.
-        if returned is None and all(map(math.isnan, now.tau)):
-            raise TypeError("torque returned None and did not write now.tau")
-        torque_numbers = now.tau if returned is None else returned
-        estimate_numbers = getattr(law, "theta_hat", now.theta_hat)
-        torque = [float(value) for value in torque_numbers]
-        estimate = [float(value) for value in estimate_numbers]
-        results = LawResults(torque, estimate, read_memory(law), collect_sent(now))
-    except LawFailed:  # the watchdog has stopped the law
-        raise
-    except (Exception, SystemExit) as error:
-        raise describe_failure(law, site, now.k, error) from error
 
-    required_lengths = (
-        ("torque", torque, now.joints),
-        ("theta_hat", estimate, len(now.theta_hat)),
-    )
-    for name, values, length in required_lengths:
-        if len(values) != length:
-            problem = f"{name} has {count_nouns(len(values), 'number')}, not {length}"
-            raise _law_error(law, site, now.k, problem)
-    check_results(law, site, now.k, results)
-    return results
+    def __init__(self, law: UserLaw, site: str) -> None:
+        self._law: Any = law
+        self._site = site
+
+    @property
+    def name(self) -> str:
+        """Name by which a scenario selects the law, as in "mylaws:Spring"."""
+        kind = type(self._law)
+        return f"{kind.__module__}:{kind.__qualname__}"
+
+    @property
+    def remembered(self) -> tuple[str, ...]:
+        """Names of the attributes that the law keeps from one control period to the next.
+
+        The law's class lists them in `remembers`, for example `remembers = ("x",)`. The log
+        contains their values, so that a run can be repeated. Empty for a law without memory.
+        """
+        return tuple(getattr(self._law, "remembers", ()))
+
+    @property
+    def memory(self) -> list[float]:
+        """Numbers that the law keeps from one control period to the next.
+
+        They come from the law's method `memory` if it has one, otherwise from the attributes
+        that its class lists in `remembers`.
+        """
+        if callable(getattr(self._law, "memory", None)):
+            return [float(value) for value in self._law.memory()]
+        numbers: list[float] = []
+        for name in self.remembered:
+            numbers += _flatten(getattr(self._law, name))
+        return numbers
+
+    @property
+    def memory_names(self) -> tuple[str, ...]:
+        """A name for each number of `memory`, as "error[1]" or "memory[1]"."""
+        if callable(getattr(self._law, "memory", None)):
+            return tuple(f"memory[{n + 1}]" for n in range(len(self._law.memory())))
+        names = []
+        for attribute in self.remembered:
+            value = getattr(self._law, attribute)
+            numbers = range(1, np.size(value) + 1)
+            names += [f"{attribute}[{number}]" for number in numbers]
+        return tuple(names)
+
+    def restore(self, memory: Sequence[float]) -> None:
+        """Restores the state that the law had after a recorded control period.
+
+        A recorded run can then be continued or checked from that period. If the law has a
+        method `recall`, the numbers are passed to this method. Otherwise they are written into
+        the attributes that the class of the law lists in `remembers`.
+
+        Args:
+            memory: Numbers that the law remembered, from the record of the period.
+
+        Raises:
+            LawFailed: The law raised an exception.
+        """
+        try:
+            if callable(getattr(self._law, "recall", None)):
+                self._law.recall(memory)
+                return
+            numbers = iter(memory)
+            for name in self.remembered:
+                setattr(self._law, name, _fill(getattr(self._law, name), numbers))
+        except (Exception, SystemExit) as error:
+            raise self.describe_failure(None, error) from error
+
+    def call(
+        self, now: LawInput, collect_sent: Callable[[LawInput], list[float]]
+    ) -> "LawResults":
+        """Calls the law for one control period, and checks its results.
+
+        If the law raises an exception or returns an unusable result, the error names the class,
+        the arm and the period.
+
+        Args:
+            now: Input of the law in this control period.
+            collect_sent: Function that returns the numbers that the law sends to other arms.
+
+        Raises:
+            LawFailed: The law raised an exception, or its results are not finite or have the
+                wrong length.
+        """
+        try:
+            returned = self._law.torque(now)
+            # `now.tau` is NaN before the call.
+            if returned is None and all(map(math.isnan, now.tau)):
+                raise TypeError("torque returned None and did not write now.tau")
+            torque_numbers = now.tau if returned is None else returned
+            estimate_numbers = getattr(self._law, "theta_hat", now.theta_hat)
+            torque = [float(value) for value in torque_numbers]
+            estimate = [float(value) for value in estimate_numbers]
+            results = LawResults(torque, estimate, self.memory, collect_sent(now))
+        except LawFailed:  # the watchdog has stopped the law
+            raise
+        except (Exception, SystemExit) as error:
+            raise self.describe_failure(now.k, error) from error
+
+        required_lengths = (
+            ("torque", torque, now.joints),
+            ("theta_hat", estimate, len(now.theta_hat)),
+        )
+        for name, values, length in required_lengths:
+            if len(values) != length:
+                problem = f"{name} has {count_nouns(len(values), 'number')}, not {length}"
+                raise self._make_error(now.k, problem)
+        self.check_results(now.k, results)
+        return results
+
+    def check_results(self, tick: int, results: "LawResults") -> None:
+        """Checks that the results of the law are finite, and its memory not too large.
+
+        A torque that is NaN would make the simulation useless, and a large memory would fill
+        the log.
+
+        Args:
+            tick: Number of the tick (control period), for the error.
+            results: Results of the law.
+
+        Raises:
+            LawFailed: A check fails. The error states the first problem.
+        """
+        count = len(results.memory)
+        if count > MAX_LAW_MEMORY:
+            numbers = count_nouns(count, "number")
+            problem = f"memory has {numbers}, but at most {MAX_LAW_MEMORY} are allowed"
+            raise self._make_error(tick, problem)
+        for name, values in zip(results._fields, results, strict=True):
+            if all(map(math.isfinite, values)):
+                continue
+            for n, value in enumerate(values):
+                if not math.isfinite(value):
+                    problem = f"{name}[{n}] must be a finite number, but is {value}"
+                    raise self._make_error(tick, problem)
+
+    def describe_failure(self, tick: int | None, error: BaseException) -> LawFailed:
+        """Converts an exception in the law to an error with the class and the arm.
+
+        The message contains the line of the user's file.
+
+        Args:
+            tick: Number of the tick (control period). None if the law failed outside a tick.
+            error: The exception.
+        """
+        problem = describe_exception(error)
+        if "LawVector" in problem:
+            problem += "; for more than + - * / make it an array, as in numpy.asarray(now.q)"
+        return self._make_error(tick, problem)
+
+    def _make_error(self, tick: int | None, problem: str) -> LawFailed:
+        """Returns the error for a problem with the law, which names the arm and the class.
+
+        Args:
+            tick: Number of the tick (control period). None outside a tick.
+            problem: The problem, a sentence for the user.
+        """
+        return LawFailed(problem, site=self._site, code=self.name, tick=tick)
 
 
 class LawResults(NamedTuple):
@@ -288,54 +413,6 @@ class LawResults(NamedTuple):
     theta_hat: list[float]
     memory: list[float]
     sent: list[float]
-
-
-def check_results(law: UserLaw, site: str, tick: int, results: LawResults) -> None:
-    """Checks that the results of a user's control law are finite, and its memory not too large.
-
-    A torque that is NaN would make the simulation useless, and a large memory would fill the
-    log.
-
-    Args:
-        law: The law, for the error.
-        site: Name of the site (the process that runs the arm), for the error.
-        tick: Number of the tick (control period), for the error.
-        results: Results of the law.
-
-    Raises:
-        LawFailed: A check fails. The error states the first problem.
-    """
-    count = len(results.memory)
-    if count > MAX_LAW_MEMORY:
-        numbers = count_nouns(count, "number")
-        problem = f"memory has {numbers}, but at most {MAX_LAW_MEMORY} are allowed"
-        raise _law_error(law, site, tick, problem)
-    for name, values in zip(results._fields, results, strict=True):
-        if all(map(math.isfinite, values)):
-            continue
-        for n, value in enumerate(values):
-            if not math.isfinite(value):
-                problem = f"{name}[{n}] must be a finite number, but is {value}"
-                raise _law_error(law, site, tick, problem)
-
-
-def describe_failure(
-    law: UserLaw, site: str, tick: int | None, error: BaseException
-) -> LawFailed:
-    """Converts an exception in a user's control law to an error with the class and the arm.
-
-    The message contains the line of the user's file.
-
-    Args:
-        law: The law.
-        site: Name of the site.
-        tick: Number of the tick (control period). None if the law failed outside a tick.
-        error: The exception.
-    """
-    problem = describe_exception(error)
-    if "LawVector" in problem:
-        problem += "; for more than + - * / make it an array, as in numpy.asarray(now.q)"
-    return _law_error(law, site, tick, problem)
 
 
 def _flatten(value: Any) -> Iterator[float]:
@@ -371,95 +448,3 @@ def _fill(value: Any, numbers: Iterator[float]) -> Any:
         entries = [next(numbers) for _ in range(value.size)]
         return np.array(entries, value.dtype).reshape(value.shape)
     return type(value)(_fill(entry, numbers) for entry in value)
-
-
-def list_remembered(law: Any) -> tuple[str, ...]:
-    """Returns the names of the attributes that a law keeps from one control period to the next.
-
-    The law's class lists them in `remembers`, for example `remembers = ("x",)`. The log
-    contains their values, so that a run can be repeated. The result is empty for a law without
-    memory.
-    """
-    return tuple(getattr(law, "remembers", ()))
-
-
-def read_memory(law: Any) -> list[float]:
-    """Returns the numbers that a control law keeps from one control period to the next.
-
-    They come from the law's method `memory` if it has one, otherwise from the attributes that
-    its class lists in `remembers`.
-    """
-    if callable(getattr(law, "memory", None)):
-        return [float(value) for value in law.memory()]
-    numbers: list[float] = []
-    for name in list_remembered(law):
-        numbers += _flatten(getattr(law, name))
-    return numbers
-
-
-def name_memory(law: Any) -> tuple[str, ...]:
-    """Returns a name for each number that a law remembers, as "error[1]" or "memory[1]"."""
-    if callable(getattr(law, "memory", None)):
-        return tuple(f"memory[{n + 1}]" for n in range(len(law.memory())))
-    names = []
-    for attribute in list_remembered(law):
-        value = getattr(law, attribute)
-        numbers = range(1, np.size(value) + 1)
-        names += [f"{attribute}[{number}]" for number in numbers]
-    return tuple(names)
-
-
-def write_memory(law: Any, memory: Sequence[float]) -> None:
-    """Gives a control law the numbers that it remembered from earlier control periods.
-
-    If the law has a method `recall`, the numbers are passed to this method. Otherwise they are
-    written into the attributes that the class of the law lists in `remembers`.
-
-    Args:
-        law: The law, which is changed.
-        memory: Numbers that `read_memory` returned.
-    """
-    if callable(getattr(law, "recall", None)):
-        law.recall(memory)
-        return
-    numbers = iter(memory)
-    for name in list_remembered(law):
-        setattr(law, name, _fill(getattr(law, name), numbers))
-
-
-def restore_law(law: UserLaw, site: str, memory: Sequence[float]) -> None:
-    """Restores the state that a control law had after a recorded control period.
-
-    A recorded run can then be continued or checked from that period.
-
-    Args:
-        law: The law, which is changed.
-        site: Name of the process that runs the arm, for the text of the exception.
-        memory: Numbers that the law remembered, from the record of the period.
-
-    Raises:
-        LawFailed: The law raised an exception.
-    """
-    try:
-        write_memory(law, memory)
-    except (Exception, SystemExit) as error:
-        raise describe_failure(law, site, None, error) from error
-
-
-def law_name(law: UserLaw) -> str:
-    """Returns the name by which a scenario selects a user's law, as in "mylaws:Spring"."""
-    return f"{type(law).__module__}:{type(law).__qualname__}"
-
-
-def _law_error(law: UserLaw, site: str, tick: int | None, problem: str) -> LawFailed:
-    """Returns the error for a problem with the results of a user's control law.
-
-    The error names the arm, the class and the control period.
-
-    Args:
-        law: The law.
-        site: Name of the site.
-        tick: Number of the tick (control period). None outside a tick.
-        problem: The problem, a sentence for the user.
-    """
-    return LawFailed(problem, site=site, code=law_name(law), tick=tick)

@@ -29,14 +29,13 @@ from .fused_run import (
     LawArrays,
     RecentRecords,
     finish_site,
-    max_over_joints,
     run_until,
     sense_site,
     sums_dtype,
 )
 from .run_inputs import RunInputs
 from .run_state import RunMemory, RunState
-from .site_arrays import SiteArrays, apply_change
+from .site_arrays import SiteArrays
 from .site_setup import SiteSetup
 from .ticks import BUCKETS_PER_S, PlantState, tick_ns
 from .vectors import Array, IntArray, Row, RowArray
@@ -305,7 +304,7 @@ class CompiledRun:
             if t_ns > last_ns:
                 break
             self._step_until(t_ns - 1)
-            apply_change(self.arrays(i), change, t_ns)
+            self.arrays(i).apply_change(change, t_ns)
             self._changes.popleft()
         if self.diverged_s is None:
             self._step_until(last_ns)
@@ -699,7 +698,7 @@ class CompiledRun:
         synchronisation error |e| of any joint in rad, and the largest joint speed |qd| in
         rad/s.
         """
-        return tuple(map(max_over_joints, self.buckets))
+        return tuple(map(_max_over_joints, self.buckets))
 
     @property
     def totals(self) -> RunTotals:
@@ -855,3 +854,25 @@ class CompiledRun:
         last_tick = int(self._progress[i]["tick"]) - 1
         row: Array = self._sent.rows[i, last_tick % pages]
         return row
+
+
+def _max_over_joints(buckets: Array) -> Array:
+    """Returns the largest position error and joint speed of an arm in each interval of time.
+
+    The largest values are kept per joint during the simulation, and combined here for a figure
+    or table.
+
+    Args:
+        buckets: Statistics of an arm with n joints in K intervals of time, which are called
+            buckets, shape (K, 3 n). `run_until` writes them. Each row consists of three groups
+            of n columns, one column per joint: the largest position error |e| in rad, the
+            largest joint speed |qd| in rad/s, and the last joint angle q in rad.
+
+    Returns:
+        The largest |e| in rad and the largest |qd| in rad/s over all joints, shape (K, 2).
+    """
+    joints = buckets.shape[1] // 3
+    errors_and_speeds = buckets[:, : 2 * joints]
+    by_quantity_and_joint = errors_and_speeds.reshape(-1, 2, joints)
+    peaks: Array = by_quantity_and_joint.max(axis=2)
+    return peaks

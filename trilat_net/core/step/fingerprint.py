@@ -16,7 +16,7 @@ import numpy as np
 
 from ..arms.elementary import sincos
 from ..arms.exogenous import TorqueKind, TorqueSource
-from ..arms.two_link_arm import PARAMETERS, ArmLinks, theta_from_links
+from ..arms.two_link_arm import PARAMETERS, ArmLinks
 from ..links.delay import DelayKind, LinkModel
 from .jit import leaf
 from .site_setup import Gains, Law, LinkSetup, Scheme, SiteSetup
@@ -53,18 +53,17 @@ def _build_setup(name: str, peer: str, q0: tuple[float, float]) -> SiteSetup:
         peer: Name of its only peer.
         q0: Start pose, rad.
     """
-    theta = theta_from_links(
-        ArmLinks(
-            l1_m=1.0,
-            m1_kg=1.1,
-            lc1_m=0.5,
-            I1_kg_m2=0.09,
-            l2_m=0.9,
-            m2_kg=0.8,
-            lc2_m=0.4,
-            I2_kg_m2=0.05,
-        )
+    links = ArmLinks(
+        l1_m=1.0,
+        m1_kg=1.1,
+        lc1_m=0.5,
+        I1_kg_m2=0.09,
+        l2_m=0.9,
+        m2_kg=0.8,
+        lc2_m=0.4,
+        I2_kg_m2=0.05,
     )
+    theta = links.theta()
     return SiteSetup(
         name=name,
         rate_hz=1000,

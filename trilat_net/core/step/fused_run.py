@@ -68,28 +68,6 @@ def sums_dtype(joints: int) -> np.dtype[np.void]:
 _DIVERGED = int(Mode.DIVERGED)
 
 
-def max_over_joints(buckets: Array) -> Array:
-    """Returns the largest position error and joint speed of an arm in each interval of time.
-
-    The largest values are kept per joint during the simulation, and combined here for a figure
-    or table.
-
-    Args:
-        buckets: Statistics of an arm with n joints in K intervals of time, which are called
-            buckets, shape (K, 3 n). `run_until` writes them. Each row consists of three groups
-            of n columns, one column per joint: the largest position error |e| in rad, the
-            largest joint speed |qd| in rad/s, and the last joint angle q in rad.
-
-    Returns:
-        The largest |e| in rad and the largest |qd| in rad/s over all joints, shape (K, 2).
-    """
-    joints = buckets.shape[1] // 3
-    errors_and_speeds = buckets[:, : 2 * joints]
-    by_quantity_and_joint = errors_and_speeds.reshape(-1, 2, joints)
-    peaks: Array = by_quantity_and_joint.max(axis=2)
-    return peaks
-
-
 @leaf
 def first_sent_column(s: SiteRow) -> int:
     """Returns the first column of a record with values that the control law sends.

@@ -809,7 +809,7 @@ def lane_leaf(function: Callable[P, R]) -> Callable[P, R]:
     needs two guarantees, which apply to the marked function only: all functions that it calls
     become part of its code, and no two of its arguments overlap in memory. The caller has to
     make sure that no arguments overlap. Such a function is called from compiled code by its
-    address (`find_lane_address`).
+    address (`LaneCode`).
     """
     return _make_leaf(function, _LaneCompiler)
 
@@ -825,57 +825,54 @@ def _make_unstored(function: Callable[..., Any]) -> Any:
     return dispatcher
 
 
-def find_lane_address(function: Callable[..., Any], argument_types: tuple[Any, ...]) -> int:
-    """Returns the memory address of a function that computes several simulations side by side.
-
-    Other compiled code calls the function by this address. The function is compiled if needed.
-    Its code is not stored on disk if the attribute `is_stored` of some argument type is False.
+class LaneCode:
+    """Machine code of a function that computes several simulations side by side.
 
     Args:
         function: A function with the decorator `lane_leaf`.
         argument_types: Numba's types of its arguments.
     """
-    dispatcher: Any = function
-    is_stored = all(getattr(kind, "is_stored", True) for kind in argument_types)
-    if not is_stored:
-        dispatcher = _make_unstored(dispatcher.py_func)
-    dispatcher.compile(argument_types)
-    result = dispatcher.overloads[argument_types]
-    return int(result.library.get_pointer_to_function(result.fndesc.llvm_func_name))
 
+    def __init__(self, function: Callable[..., Any], argument_types: tuple[Any, ...]) -> None:
+        self._dispatcher: Any = function
+        self._argument_types = argument_types
 
-def is_lane_code_stored(function: Callable[..., Any], argument_types: tuple[Any, ...]) -> bool:
-    """Returns True if the machine code for several simulations side by side is on disk already.
+    def find_address(self) -> int:
+        """Returns the memory address of the code, by which other compiled code calls it.
 
-    If not, the first use of the function takes long, because it has to be compiled.
+        The function is compiled if needed. Its code is not stored on disk if the attribute
+        `is_stored` of some argument type is False.
+        """
+        dispatcher = self._dispatcher
+        is_stored = all(getattr(kind, "is_stored", True) for kind in self._argument_types)
+        if not is_stored:
+            dispatcher = _make_unstored(dispatcher.py_func)
+        dispatcher.compile(self._argument_types)
+        result = dispatcher.overloads[self._argument_types]
+        return int(result.library.get_pointer_to_function(result.fndesc.llvm_func_name))
 
-    Args:
-        function: A function with the decorator `lane_leaf`.
-        argument_types: Numba's types of its arguments.
-    """
-    dispatcher: Any = function
-    if argument_types in dispatcher.overloads:
-        return True
-    stored = dispatcher._cache
-    key = stored._index_key(argument_types, dispatcher.targetctx.codegen())
-    return key in stored._cache_file._load_index()
+    def is_stored(self) -> bool:
+        """Returns True if the machine code is on disk already.
 
+        If not, the first use of the function takes long, because it has to be compiled.
+        """
+        dispatcher = self._dispatcher
+        if self._argument_types in dispatcher.overloads:
+            return True
+        stored = dispatcher._cache
+        key = stored._index_key(self._argument_types, dispatcher.targetctx.codegen())
+        return key in stored._cache_file._load_index()
 
-def read_lane_assembly(function: Callable[..., Any], argument_types: tuple[Any, ...]) -> str:
-    """Returns the assembly code of a function that computes several simulations side by side.
+    def read_assembly(self) -> str:
+        """Returns the assembly code of the function.
 
-    A test checks that it contains vector instructions, without which the function would be
-    slow.
-
-    Args:
-        function: A function with the decorator `lane_leaf`.
-        argument_types: Numba's types of its arguments.
-    """
-    dispatcher: Any = function
-    # Numba has no assembly text for code from the cache.
-    compiled = _make_unstored(dispatcher.py_func)
-    compiled.compile(argument_types)
-    return str(compiled.overloads[argument_types].library.get_asm_str())
+        A test checks that it contains vector instructions, without which the function would be
+        slow.
+        """
+        # Numba has no assembly text for code from the cache.
+        compiled = _make_unstored(self._dispatcher.py_func)
+        compiled.compile(self._argument_types)
+        return str(compiled.overloads[self._argument_types].library.get_asm_str())
 
 
 def set_lane_form(

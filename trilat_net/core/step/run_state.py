@@ -53,40 +53,6 @@ class RunMemory(NamedTuple):
     feed: ReplayedInputs
 
 
-def mark_floats(dtype: np.dtype[np.generic]) -> NDArray[np.bool_]:
-    """Marks which of the 8-byte numbers in an element of an array are floats.
-
-    For a structured type with the fields x (two float64) and count (int64), the result is
-    [True, True, False]. A small disturbance of a run scales only the floats
-    (`scale_differences`). The size of every field of the kernel is a multiple of eight bytes.
-
-    Args:
-        dtype: Data type of the element. It may have fields, which may have fields themselves.
-    """
-    if dtype.fields is None:
-        return np.full(max(1, dtype.itemsize // 8), dtype.base.kind == "f")
-    is_float = np.zeros(dtype.itemsize // 8, dtype=bool)
-    for field_dtype, offset, *_ in dtype.fields.values():
-        start = offset // 8
-        stop = (offset + field_dtype.itemsize) // 8
-        is_float[start:stop] = mark_floats(field_dtype)
-    return is_float
-
-
-def scale_differences(x: Array, y: Array, factor: float) -> Array:
-    """Scales the difference between the states of two simulations: y + factor (x - y).
-
-    With a factor below 1, for example, the first state moves closer to the second.
-
-    Args:
-        x: Numbers of a run.
-        y: The same numbers of another run. They replace results that would not be finite.
-        factor: The factor.
-    """
-    mixed: Array = y + factor * (x - y)
-    return np.where(np.isfinite(mixed), mixed, y)
-
-
 class RunState:
     """The complete state of a simulated run: all arrays that change, viewed as 64-bit integers.
 
@@ -108,7 +74,7 @@ class RunState:
             # If `reshape` had made a copy, changes would not reach the run.
             assert np.shares_memory(flat, array)
             self._bits.append(flat)
-            self._floats.append(np.tile(mark_floats(array.dtype), array.size))
+            self._floats.append(np.tile(self.mark_floats(array.dtype), array.size))
 
     def scale_difference(self, other: "RunState", factor: float) -> None:
         """Multiplies the difference between this state and another state by a factor.
@@ -132,4 +98,40 @@ class RunState:
             x = bits.view(np.float64)[changed]
             y = other_bits.view(np.float64)[changed]
             bits[:] = other_bits
-            bits.view(np.float64)[changed] = scale_differences(x, y, factor)
+            bits.view(np.float64)[changed] = self.scale_differences(x, y, factor)
+
+    @staticmethod
+    def mark_floats(dtype: np.dtype[np.generic]) -> NDArray[np.bool_]:
+        """Marks which of the 8-byte numbers in an element of an array are floats.
+
+        For a structured type with the fields x (two float64) and count (int64), the result is
+        [True, True, False]. A small disturbance of a run scales only the floats
+        (`scale_differences`). The size of every field of the kernel is a multiple of eight
+        bytes.
+
+        Args:
+            dtype: Data type of the element. It may have fields, which may have fields
+                themselves.
+        """
+        if dtype.fields is None:
+            return np.full(max(1, dtype.itemsize // 8), dtype.base.kind == "f")
+        is_float = np.zeros(dtype.itemsize // 8, dtype=bool)
+        for field_dtype, offset, *_ in dtype.fields.values():
+            start = offset // 8
+            stop = (offset + field_dtype.itemsize) // 8
+            is_float[start:stop] = RunState.mark_floats(field_dtype)
+        return is_float
+
+    @staticmethod
+    def scale_differences(x: Array, y: Array, factor: float) -> Array:
+        """Scales the difference between the states of two simulations: y + factor (x - y).
+
+        With a factor below 1, for example, the first state moves closer to the second.
+
+        Args:
+            x: Numbers of a run.
+            y: The same numbers of another run. They replace results that would not be finite.
+            factor: The factor.
+        """
+        mixed: Array = y + factor * (x - y)
+        return np.where(np.isfinite(mixed), mixed, y)

@@ -135,7 +135,7 @@ class SiteArrays(NamedTuple):
         peers = len(links)
         spare_models, spare_ramps = spare
         kept_dues = pages or _count_kept_dues(setup)
-        pages = pages or needed_pages(setup)
+        pages = pages or cls.count_pages(setup)
         calendars = np.zeros((peers, pages), sample_dtype(layout.shared))
         calendars["tick"] = -1  # no sample waits
         rows, models, points = _build_links(links, spare_models, layout.shared)
@@ -256,6 +256,117 @@ class SiteArrays(NamedTuple):
             channel=channel,
         )
 
+    def widen_calendars(self, k: int, pages: int) -> "SiteArrays":
+        """Enlarges the ring buffers in which messages wait for their simulated delay to pass.
+
+        All waiting messages are kept. The buffers are called calendars.
+
+        Args:
+            k: The next control period of the site.
+            pages: New number of entries of each buffer, a power of two.
+
+        Returns:
+            New arrays with the larger buffers.
+        """
+        old_count = self.calendars.shape[1]
+        ticks = np.arange(k, k + old_count)
+        # A tick's page is its lowest bits, as the number of pages is a power of two.
+        old_pages = ticks & (old_count - 1)
+        new_pages = ticks & (pages - 1)
+        calendars = np.zeros((len(self.links), pages), self.calendars.dtype)
+        calendars["tick"] = -1
+        calendars[:, new_pages] = self.calendars[:, old_pages]
+        channel = self.channel
+        if channel is not None:
+            waiting = np.zeros((*calendars.shape, channel.waiting.shape[2]))
+            waiting[:, new_pages] = channel.waiting[:, old_pages]
+            channel = channel._replace(waiting=waiting)
+        return self._replace(calendars=calendars, channel=channel)
+
+    def apply_change(self, change: CoreChange, t_ns: int) -> None:
+        """Applies a change from outside to a running site, the process that runs one arm.
+
+        There are four kinds of changes:
+
+        - The message that the site missed ticks, the periods of its control loop. Their number
+          is stored until the next tick.
+        - An order, for example to stop the arm. The next tick carries it out. If several orders
+          arrive before this tick, the order with the highest number counts, see `LifeOrder`.
+        - A new model of the delay and loss of a link. It is added to the table of the link's
+          models, and applies from its start time.
+        - A ramp of the dominance factors, the weights with which the arm follows the other
+          arms. It is added to the table of ramps, after old ramps have been removed.
+
+        Args:
+            change: The change.
+            t_ns: Present time in ns since the start of the session. The site computes no more
+                control periods before this time.
+
+        Raises:
+            ValueError: A table has no free row for the change.
+        """
+        s: Row = self.site[0]
+        if change.order is LifeOrder.OVERRUN:
+            s.skipped = change.skipped
+        elif change.order is not None:
+            s.order = max(s.order, change.order)
+        if change.model is not None:
+            link: Row = self.links[change.peer]
+            largest_count = self.models.shape[1]
+            if link.models >= largest_count:
+                raise ValueError(f"a run can have at most {MAX_CHANGES} changes to a link")
+            _add_model(self, change.peer, change.model)
+        if change.ramp is not None:
+            # Remove the ramps that are over, to make room for the new ramp.
+            s.ramps = fold_ramps(t_ns, int(s.ramps), self.ramps)
+            if s.ramps >= len(self.ramps):
+                raise ValueError(
+                    f"at most {MAX_RAMPS} changes to the shares of a site can be pending "
+                    "at once"
+                )
+            _add_ramp(self, change.ramp)
+
+    @staticmethod
+    def count_pages(setup: SiteSetup) -> int:
+        """Computes how many messages must be able to wait on each network link of an arm.
+
+        A message (the state of another arm) waits until its simulated delay has passed. The
+        result follows from the longest delay, and from the time `_NEAR_NS` by which the clock
+        of a sender may be ahead.
+
+        Args:
+            setup: Setup of the site.
+
+        Returns:
+            The number of entries of the ring buffer of a link, a power of two.
+        """
+        delays_us = [max_delay_us(link.models, link.traces) for link in setup.links]
+        longest_us = max(delays_us)
+        return calendar_pages(setup.rate_hz, longest_us, _NEAR_NS)
+
+    @staticmethod
+    def count_link_bytes(setup: SiteSetup, pages: int | None = None) -> int:
+        """Returns the memory that the network links of an arm take, in bytes.
+
+        The ring buffers in which delayed messages wait take most of the memory. `CalendarSizer`
+        uses the result to limit their length.
+
+        Args:
+            setup: Setup of the arm.
+            pages: Number of samples that can wait in the ring buffer of each link. By default
+                it is the number that the delays need.
+        """
+        if pages is None:
+            pages = SiteArrays.count_pages(setup)
+        number_bytes = 8
+        law_numbers = 0  # count of values that a user's law receives with each sample
+        if setup.law_factory is not None:
+            law_numbers = sum(vector.length for vector in setup.received_vectors)
+        page_bytes = sample_dtype(setup.layout.shared).itemsize + number_bytes * law_numbers
+        dues_bytes = number_bytes * _count_kept_dues(setup)
+        link_bytes = pages * page_bytes + dues_bytes
+        return len(setup.links) * link_bytes
+
 
 class TickBuffers(NamedTuple):
     """Arrays for the input and output of one control period: received messages and results.
@@ -278,66 +389,25 @@ class TickBuffers(NamedTuple):
     sent: Array
     record: Array
 
+    @classmethod
+    def build(cls, setup: SiteSetup) -> "TickBuffers":
+        """Creates the arrays for the received messages and the results of a control period.
 
-def build_tick_buffers(setup: SiteSetup) -> TickBuffers:
-    """Creates the arrays for the received messages and the results of a control period.
+        An arm's process creates them once and reuses them in every period.
 
-    An arm's process creates them once and reuses them in every period.
-
-    Args:
-        setup: Setup of the site, which determines the lengths of vectors.
-    """
-    layout = setup.layout
-    largest_received = 0
-    if setup.law_factory is not None:
-        largest_received = max(link.channel.received_size for link in setup.links)
-    return TickBuffers(
-        arrivals=np.zeros(MAX_ARRIVALS, arrival_dtype(layout.shared)),
-        forces=np.zeros((MAX_ARRIVALS, layout.shared)),
-        sent=np.zeros((MAX_ARRIVALS, largest_received)),
-        record=np.zeros(layout.floats),
-    )
-
-
-def needed_pages(setup: SiteSetup) -> int:
-    """Computes how many messages must be able to wait on each network link of an arm.
-
-    A message (the state of another arm) waits until its simulated delay has passed. The result
-    follows from the longest delay, and from the time `_NEAR_NS` by which the clock of a sender
-    may be ahead.
-
-    Args:
-        setup: Setup of the site.
-
-    Returns:
-        The number of entries of the ring buffer of a link, a power of two.
-    """
-    delays_us = [max_delay_us(link.models, link.traces) for link in setup.links]
-    longest_us = max(delays_us)
-    return calendar_pages(setup.rate_hz, longest_us, _NEAR_NS)
-
-
-def links_bytes(setup: SiteSetup, pages: int | None = None) -> int:
-    """Returns the memory that the network links of an arm take, in bytes.
-
-    The ring buffers in which delayed messages wait take most of the memory. `CalendarSizer`
-    uses the result to limit their length.
-
-    Args:
-        setup: Setup of the arm.
-        pages: Number of samples that can wait in the ring buffer of each link. By default it is
-            the number that the delays need.
-    """
-    if pages is None:
-        pages = needed_pages(setup)
-    number_bytes = 8
-    law_numbers = 0  # count of values that a user's law receives with each sample
-    if setup.law_factory is not None:
-        law_numbers = sum(vector.length for vector in setup.received_vectors)
-    page_bytes = sample_dtype(setup.layout.shared).itemsize + number_bytes * law_numbers
-    dues_bytes = number_bytes * _count_kept_dues(setup)
-    link_bytes = pages * page_bytes + dues_bytes
-    return len(setup.links) * link_bytes
+        Args:
+            setup: Setup of the site, which determines the lengths of vectors.
+        """
+        layout = setup.layout
+        largest_received = 0
+        if setup.law_factory is not None:
+            largest_received = max(link.channel.received_size for link in setup.links)
+        return cls(
+            arrivals=np.zeros(MAX_ARRIVALS, arrival_dtype(layout.shared)),
+            forces=np.zeros((MAX_ARRIVALS, layout.shared)),
+            sent=np.zeros((MAX_ARRIVALS, largest_received)),
+            record=np.zeros(layout.floats),
+        )
 
 
 def _count_kept_dues(setup: SiteSetup) -> int:
@@ -354,35 +424,6 @@ def _count_kept_dues(setup: SiteSetup) -> int:
     fastest_hz = max(setup.rate_hz, *peer_rates_hz)
     span_ns = MAX_DELAY_US * 1000 + AHEAD_LIMIT_NS
     return span_ticks(span_ns, fastest_hz) + _SLACK
-
-
-def widen_calendars(arrays: SiteArrays, k: int, pages: int) -> SiteArrays:
-    """Enlarges the ring buffers in which messages wait for their simulated delay to pass.
-
-    All waiting messages are kept. The buffers are called calendars.
-
-    Args:
-        arrays: Arrays of the site, the process that runs the arm.
-        k: The next control period of the site.
-        pages: New number of entries of each buffer, a power of two.
-
-    Returns:
-        New arrays with the larger buffers.
-    """
-    old_count = arrays.calendars.shape[1]
-    ticks = np.arange(k, k + old_count)
-    # A tick's page is its lowest bits, as the number of pages is a power of two.
-    old_pages = ticks & (old_count - 1)
-    new_pages = ticks & (pages - 1)
-    calendars = np.zeros((len(arrays.links), pages), arrays.calendars.dtype)
-    calendars["tick"] = -1
-    calendars[:, new_pages] = arrays.calendars[:, old_pages]
-    channel = arrays.channel
-    if channel is not None:
-        waiting = np.zeros((*calendars.shape, channel.waiting.shape[2]))
-        waiting[:, new_pages] = channel.waiting[:, old_pages]
-        channel = channel._replace(waiting=waiting)
-    return arrays._replace(calendars=calendars, channel=channel)
 
 
 class CalendarSizer:
@@ -404,10 +445,10 @@ class CalendarSizer:
         self._peer_hz = [link.rate_hz for link in setup.links]
         self._delay_us = [max_delay_us(link.models, link.traces) for link in setup.links]
         self.newest = [-1] * len(setup.links)
-        self.most_pages = needed_pages(setup)
+        self.most_pages = SiteArrays.count_pages(setup)
         limit = calendar_pages(setup.rate_hz)
         while self.most_pages < limit:
-            if links_bytes(setup, 2 * self.most_pages) > MAX_LINKS_BYTES:
+            if SiteArrays.count_link_bytes(setup, 2 * self.most_pages) > MAX_LINKS_BYTES:
                 break
             self.most_pages *= 2
 
@@ -486,7 +527,7 @@ class CalendarSizer:
             pages = min(next_power_of_two, self.most_pages)
             # Samples of missed ticks still wait in the pages of those ticks.
             first_waiting_tick = k - int(arrays.site["skipped"][0])
-            arrays = widen_calendars(arrays, first_waiting_tick, pages)
+            arrays = arrays.widen_calendars(first_waiting_tick, pages)
         newest_fitting_tick = k + pages - longest_wait
         self.newest[peer] = newest_fitting_tick * peer_hz // rate_hz
         return arrays
@@ -549,50 +590,6 @@ MAX_RAMPS = 256
 A run may have any number of changes, because changes that have begun are removed, see
 `fold_ramps`.
 """
-
-
-def apply_change(arrays: SiteArrays, change: CoreChange, t_ns: int) -> None:
-    """Applies a change from outside to a running site, the process that runs one arm.
-
-    There are four kinds of changes:
-
-    - The message that the site missed ticks, the periods of its control loop. Their number is
-      stored until the next tick.
-    - An order, for example to stop the arm. The next tick carries it out. If several orders
-      arrive before this tick, the order with the highest number counts, see `LifeOrder`.
-    - A new model of the delay and loss of a link. It is added to the table of the link's
-      models, and applies from its start time.
-    - A ramp of the dominance factors, the weights with which the arm follows the other arms. It
-      is added to the table of ramps, after old ramps have been removed.
-
-    Args:
-        arrays: Arrays of the site; changed.
-        change: The change.
-        t_ns: Present time in ns since the start of the session. The site computes no more
-            control periods before this time.
-
-    Raises:
-        ValueError: A table has no free row for the change.
-    """
-    s: Row = arrays.site[0]
-    if change.order is LifeOrder.OVERRUN:
-        s.skipped = change.skipped
-    elif change.order is not None:
-        s.order = max(s.order, change.order)
-    if change.model is not None:
-        link: Row = arrays.links[change.peer]
-        largest_count = arrays.models.shape[1]
-        if link.models >= largest_count:
-            raise ValueError(f"a run can have at most {MAX_CHANGES} changes to a link")
-        _add_model(arrays, change.peer, change.model)
-    if change.ramp is not None:
-        # Remove the ramps that are over, to make room for the new ramp.
-        s.ramps = fold_ramps(t_ns, int(s.ramps), arrays.ramps)
-        if s.ramps >= len(arrays.ramps):
-            raise ValueError(
-                f"at most {MAX_RAMPS} changes to the shares of a site can be pending at once"
-            )
-        _add_ramp(arrays, change.ramp)
 
 
 _NEAR_NS = NS_PER_S // 4

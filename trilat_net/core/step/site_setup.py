@@ -20,9 +20,9 @@ from ...records import Layout as Layout
 from ..arms.chain import LINK_PARAMETERS, ChainJoint, Matrix, Three
 from ..arms.exogenous import LIVE_KINDS, TorqueKind, TorqueSource
 from ..arms.two_link_arm import JOINTS
-from ..life.live_hand import count_hand_numbers
+from ..life.live_hand import HandInForce
 from ..links.delay import LinkModel
-from ..plug.law_channel import LawChannel, SentVector, join_received
+from ..plug.law_channel import LawChannel, SentVector
 from ..plug.user_law import LawContext, UserLawFactory
 from .ticks import DominanceRamp
 from .vectors import Array, Points, Vector
@@ -210,45 +210,6 @@ class LinkSetup(NamedTuple):
     dispensable: bool = False
 
 
-def make_layout(
-    chain: "ChainSetup | None", sent: int = 0, actors: Sequence[TorqueSource] = ()
-) -> Layout:
-    """Returns the lengths of all vectors of an arm, such as joint angles and torques.
-
-    Args:
-        chain: The arm if it is a chain of joints. None for the planar two-link arm.
-        sent: Number of values that the control law sends to other arms in each period.
-        actors: Operators and environments of the arm. At most one of them is a person or
-            program that moves the arm during the run.
-    """
-    joints = JOINTS if chain is None else len(chain.joints)
-
-    # A person or program that moves the arm (live hand) pulls at its joints, or at its end
-    # effector in the plane or in space.
-    hand_numbers = 0
-    for actor in actors:
-        if actor.kind not in LIVE_KINDS:
-            continue
-        coordinates = 2 if chain is None else 3
-        if actor.kind is TorqueKind.LIVE_JOINT:
-            coordinates = joints
-        hand_numbers = count_hand_numbers(coordinates)
-        break
-
-    if chain is None:
-        return Layout(sent=sent, hand=hand_numbers)
-    task = chain.task
-    return Layout(
-        joints=joints,
-        shared=joints if task is None else len(task.axes),
-        parameters=LINK_PARAMETERS * joints,
-        chain=True,
-        task=task is not None,
-        sent=sent,
-        hand=hand_numbers,
-    )
-
-
 class TaskSetup(NamedTuple):
     """Settings of an arm whose end effector follows other end effectors (task space).
 
@@ -395,13 +356,52 @@ class SiteSetup(NamedTuple):
     bit: int = 0
     bodies: int = 0
 
+    @staticmethod
+    def make_layout(
+        chain: ChainSetup | None, sent: int = 0, actors: Sequence[TorqueSource] = ()
+    ) -> Layout:
+        """Returns the lengths of all vectors of an arm, such as joint angles and torques.
+
+        Args:
+            chain: The arm if it is a chain of joints. None for the planar two-link arm.
+            sent: Number of values that the control law sends to other arms in each period.
+            actors: Operators and environments of the arm. At most one of them is a person or
+                program that moves the arm during the run.
+        """
+        joints = JOINTS if chain is None else len(chain.joints)
+
+        # A person or program that moves the arm (live hand) pulls at its joints, or at its end
+        # effector in the plane or in space.
+        hand_numbers = 0
+        for actor in actors:
+            if actor.kind not in LIVE_KINDS:
+                continue
+            coordinates = 2 if chain is None else 3
+            if actor.kind is TorqueKind.LIVE_JOINT:
+                coordinates = joints
+            hand_numbers = HandInForce.count_numbers(coordinates)
+            break
+
+        if chain is None:
+            return Layout(sent=sent, hand=hand_numbers)
+        task = chain.task
+        return Layout(
+            joints=joints,
+            shared=joints if task is None else len(task.axes),
+            parameters=LINK_PARAMETERS * joints,
+            chain=True,
+            task=task is not None,
+            sent=sent,
+            hand=hand_numbers,
+        )
+
     @property
     def layout(self) -> Layout:
         """Lengths of the vectors in the state of this arm, for example one number per joint.
 
         Each body of the simulated scene adds seven numbers, its pose.
         """
-        layout = make_layout(self.chain, self.channel.record_size, self.actors)
+        layout = self.make_layout(self.chain, self.channel.record_size, self.actors)
         return layout._replace(bodies=7 * self.bodies)
 
     @property
@@ -426,7 +426,7 @@ class SiteSetup(NamedTuple):
             A description of each vector, in the order in which the law receives the vectors.
         """
         channels = [link.channel for link in self.links]
-        return join_received([*channels, self.channel])
+        return LawChannel.join_received([*channels, self.channel])
 
     def law_context(self) -> LawContext:
         """Returns the facts about the arm and its peers with which a user's law is created.

@@ -23,7 +23,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ...errors import LawFailed
-from ..life.live_hand import HandInForce, empty_hand_vector
+from ..life.live_hand import HandInForce
 from ..links.channel import LOST
 from ..links.delay import DelayKind
 from ..plug.compiled_law import plug_law
@@ -42,8 +42,6 @@ from .site_arrays import (
     CalendarSizer,
     SiteArrays,
     TickBuffers,
-    apply_change,
-    build_tick_buffers,
 )
 from .site_setup import SiteSetup, StaleAction
 from .ticks import (
@@ -66,7 +64,7 @@ _DIVERGED = int(Mode.DIVERGED)
 _NO_SHARED: tuple[tuple[float, ...], ...] = ((), (), ())
 
 
-class TickParts(NamedTuple):
+class _TickParts(NamedTuple):
     """Internal parts of a `Site` that compute many recorded control periods in one call.
 
     Attributes:
@@ -123,7 +121,7 @@ class Site:
         slices = tuple(columns.values())
         self._state_columns = slices[:7]
         self._shared_columns = slices[7:]
-        self._buffers = build_tick_buffers(setup)
+        self._buffers = TickBuffers.build(setup)
         arrival = struct.Struct(f"<qq{2 * self.layout.shared}d")
         self._pack_arrival = arrival.pack_into
         self._arrival_size = arrival.size
@@ -241,7 +239,7 @@ class Site:
         Raises:
             ValueError: There are too many planned changes.
         """
-        apply_change(self._arrays, command, t_ns)
+        self._arrays.apply_change(command, t_ns)
         if command.model is not None:
             self._sizer.add_model(command.peer, command.model)
 
@@ -448,9 +446,9 @@ class Site:
         return self._arrays
 
     @property
-    def parts(self) -> "TickParts":
+    def parts(self) -> "_TickParts":
         """Internal parts with which `recorded_ticks` computes many control periods at once."""
-        return TickParts(
+        return _TickParts(
             buffers=self._buffers,
             calendar_sizer=self._sizer,
             has_user_law=self._law is not None,
@@ -486,7 +484,7 @@ class Site:
             return ()
         # Views of the row: the assignments change its numbers.
         grip, target, target_ahead = self._hand
-        action = list(vector) or empty_hand_vector(len(target))
+        action = list(vector) or HandInForce.list_empty(len(target))
         hand = HandInForce.read(action)
         grip[0] = hand.grip
         target[:] = hand.target

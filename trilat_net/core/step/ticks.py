@@ -166,6 +166,17 @@ class CoreChange(NamedTuple):
     order: LifeOrder | None = None
     skipped: int = 0
 
+    @classmethod
+    def give_order(cls, text: str, order: str, skipped: int) -> "CoreChange":
+        """Creates the change by which a site receives an order.
+
+        Args:
+            text: Text in the record.
+            order: Name of the order in a log, such as "stop", see `LifeOrder`.
+            skipped: With "overrun", the number of ticks before this one that the site missed.
+        """
+        return cls(text, order=LifeOrder[order.upper()], skipped=skipped)
+
 
 class PlantState(NamedTuple):
     """Measured state of an arm that the program does not simulate itself, such as a real arm.

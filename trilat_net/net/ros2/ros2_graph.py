@@ -37,7 +37,7 @@ import zenoh
 from zenoh import CongestionControl, Reliability, handlers
 
 from ...errors import TrilatError, UsageError
-from .. import Clock, Endpoint, check_hosts, find_endpoint_addresses, open_zenoh
+from .. import Clock, Endpoint, check_hosts, open_zenoh
 
 TYPE_HASHES = {
     "diagnostic_msgs/msg/DiagnosticArray": (
@@ -182,23 +182,6 @@ def _name_dds_type(kind: str) -> str:
     return f"{package}::{group}::dds_::{name}_"
 
 
-def topic_key(
-    domain: int,
-    name: str,
-    kind: str,
-    type_hash: str,
-) -> str:
-    """Returns the Zenoh key under which the messages of a ROS topic or service are sent.
-
-    Args:
-        domain: Number of the ROS domain (ROS_DOMAIN_ID). Nodes of other domains are invisible.
-        name: Name of the topic or service.
-        kind: Name of its type, such as "std_msgs/msg/String".
-        type_hash: Hash of the type, which differs between versions of the type.
-    """
-    return f"{domain}/{name}/{_name_dds_type(kind)}/{type_hash}"
-
-
 class Ros2Member(NamedTuple):
     """Address of a ROS 2 node, from which its liveliness tokens are composed.
 
@@ -247,6 +230,35 @@ class Ros2Member(NamedTuple):
         node = f"@ros2_lv/{self.domain}/{self.zid}/0/{number}/{end}/{self._path()}"
         return f"{node}/{_mangle('/' + name)}/{_name_dds_type(kind)}/{type_hash}/{qos.encode()}"
 
+    def topic_key(self, name: str, kind: str, type_hash: str) -> str:
+        """Returns the Zenoh key under which the messages of a ROS topic or service are sent.
+
+        Args:
+            name: Name of the topic or service.
+            kind: Name of its type, such as "std_msgs/msg/String".
+            type_hash: Hash of the type, which differs between versions of the type.
+        """
+        return f"{self.domain}/{name}/{_name_dds_type(kind)}/{type_hash}"
+
+    def describe_mismatch(self, token: str, kind: str) -> str:
+        """Describes why messages of a publisher do not arrive at a subscription of the node.
+
+        Args:
+            token: Liveliness token of the publisher.
+            kind: Message type of the subscription.
+
+        Returns:
+            The end of a sentence that names the difference. Empty if the publisher matches.
+        """
+        _, token_domain, *_, token_type, token_hash, _ = token.split("/")
+        if token_domain != str(self.domain):
+            return f"in domain {token_domain}, but this subscription is in domain {self.domain}"
+        if token_type != _name_dds_type(kind):
+            return f"as {token_type}, but this subscription expects {_name_dds_type(kind)}"
+        if token_hash not in (find_type_hash(kind, "jazzy"), _NO_HASH):
+            return f"with another definition of {kind}, {token_hash}"
+        return ""
+
     def _path(self) -> str:
         """Returns the part of liveliness tokens that names the node, "%/NAMESPACE/NAME".
 
@@ -263,27 +275,6 @@ def _mangle(name: str) -> str:
     A token is itself a path whose parts are divided by slashes.
     """
     return name.replace("/", "%")
-
-
-def describe_mismatch(token: str, domain: int, kind: str) -> str:
-    """Describes why messages of a publisher do not arrive at a subscription.
-
-    Args:
-        token: Liveliness token of the publisher.
-        domain: Number of the ROS domain of the subscription.
-        kind: Message type of the subscription.
-
-    Returns:
-        The end of a sentence that names the difference. Empty if the publisher matches.
-    """
-    _, token_domain, *_, token_type, token_hash, _ = token.split("/")
-    if token_domain != str(domain):
-        return f"in domain {token_domain}, but this subscription is in domain {domain}"
-    if token_type != _name_dds_type(kind):
-        return f"as {token_type}, but this subscription expects {_name_dds_type(kind)}"
-    if token_hash not in (find_type_hash(kind, "jazzy"), _NO_HASH):
-        return f"with another definition of {kind}, {token_hash}"
-    return ""
 
 
 def make_gid(token: str) -> bytes:
@@ -459,7 +450,7 @@ class Ros2Graph:
         distro: str = "jazzy",
     ) -> None:
         """Connects to a Zenoh router of ROS 2, and announces a node to ROS 2 programs."""
-        check_hosts(find_endpoint_addresses(routers))
+        check_hosts(routers)
         self._session = open_zenoh(
             listen=[],
             connect=routers,
@@ -562,7 +553,7 @@ class Ros2Graph:
         newer_hash = find_type_hash(kind, "jazzy")
         humble_hash = _NO_HASH
         for type_hash in (newer_hash, humble_hash):
-            key = topic_key(self._node.domain, topic, kind, type_hash)
+            key = self._node.topic_key(topic, kind, type_hash)
             self._declare_subscriber(key, topic, receive_sample)
 
     def _report_mismatches(self, topic: str, kind: str) -> None:
@@ -584,7 +575,7 @@ class Ros2Graph:
             mismatch is, for example, another message type under the name of the topic.
             """
             has_appeared = token.kind == zenoh.SampleKind.PUT
-            mismatch = describe_mismatch(str(token.key_expr), self._node.domain, kind)
+            mismatch = self._node.describe_mismatch(str(token.key_expr), kind)
             if has_appeared and mismatch:
                 self.refusals.add(f"{topic} is published {mismatch}")
 
@@ -691,4 +682,4 @@ class Ros2Graph:
             number=self._endpoints, end=end, name=name, kind=kind, type_hash=type_hash, qos=qos
         )
         self._declarations.append(self._session.liveliness().declare_token(token))
-        return topic_key(self._node.domain, name, kind, type_hash), make_gid(token)
+        return self._node.topic_key(name, kind, type_hash), make_gid(token)

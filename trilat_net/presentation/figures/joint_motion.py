@@ -31,7 +31,7 @@ from ...analysis import (
     site_signals,
 )
 from ...core import LINK_PARAMETERS, Array
-from ...execution import simulate_without_operators
+from ...execution import SimulatedLog
 from ...log import Log
 from ...own_code import find_user_laws
 from .. import plot_signals, style
@@ -119,7 +119,7 @@ def draw_operator_displacement(
         form: Width, type sizes and resolution of the figure.
         twin: The run without operators. `None` to simulate it.
     """
-    run_without_operators = simulate_without_operators(log) if twin is None else twin
+    run_without_operators = SimulatedLog.without_operators(log) if twin is None else twin
     return _draw_joints(
         log=log,
         form=form,

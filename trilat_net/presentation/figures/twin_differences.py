@@ -33,7 +33,7 @@ from ...analysis import (
     TwinGrowth,
 )
 from ...core import BUCKETS_PER_S, Array
-from ...execution import SMALLEST, TwinPath, Twins, explain_not_repeatable
+from ...execution import SMALLEST, FusedRun, TwinPath, Twins
 from ...log import Log
 from .. import style
 from ..appearance import REPORT_SIZE, FigureSize
@@ -129,7 +129,7 @@ def draw_twins(pushed: PushedTwins, form: FigureSize = REPORT_SIZE) -> Figure:
 
 def _explain_absent_twins(log: Log) -> str:
     """Returns the reason why a log has no twins. Empty if it has twins."""
-    return explain_not_repeatable(log, own_laws=log.may_run_user_laws)
+    return FusedRun.explain_not_repeatable(log, own_laws=log.may_run_user_laws)
 
 
 @draws("twins", "growth or decay of small pushes", _explain_absent_twins, in_report=True)

@@ -28,10 +28,9 @@ from ...core import (
     DelayKind,
     LinkModel,
     Points,
-    compile_to_address,
-    list_numbers,
+    UserModel,
 )
-from ...fields import Frozen, KeyProblem, TomlTable, find_kinds
+from ...fields import Frozen, KeyProblem, TomlTable
 
 MAX_DELAY_MS = MAX_DELAY_US / 1000
 """Longest delay of a link, in ms."""
@@ -354,7 +353,7 @@ class OwnDelay(LinkBase, frozen=True, kw_only=True):
         delays stores its measurements there. This model stores its floating-point settings bit
         by bit in the same table, two in each row.
         """
-        numbers = list_numbers(self)
+        numbers = UserModel(self).numbers
         rows = math.ceil(max(len(numbers), 1) / 2)
         return np.resize(numbers, (rows, 2)).view(np.int64)
 
@@ -376,12 +375,11 @@ class OwnDelay(LinkBase, frozen=True, kw_only=True):
                 the common start time of all sites.
         """
         model = super().to_core_model(from_ns)
-        return model._replace(call=compile_to_address(self, "draw", LINK_MODEL_DTYPE))
+        address = UserModel(self).compile_to_address("draw", LINK_MODEL_DTYPE)
+        return model._replace(call=address)
 
 
-DELAY_MODELS = {
-    str(kind.__struct_config__.tag): kind for kind in find_kinds(__name__, LinkBase)
-}
+DELAY_MODELS = {str(kind.__struct_config__.tag): kind for kind in LinkBase.find_kinds(__name__)}
 """Classes of all delay models, by the name of the model."""
 if TYPE_CHECKING:
     Link = LinkBase

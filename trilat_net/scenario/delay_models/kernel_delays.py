@@ -17,7 +17,7 @@ from typing import Annotated, Literal
 import numpy as np
 from msgspec import Meta
 
-from ...core import DelayKind, LinkModel, Points, TraceEnd
+from ...core import DelayKind, LinkModel, Points
 from ...fields import KeyProblem, TomlTable
 from ..delay_traces import parse_trace
 from ..key_checks import is_number
@@ -389,7 +389,7 @@ class TraceDelay(LinkBase, frozen=True, kw_only=True, tag="trace"):
 
         The recorded points themselves are in a separate array, see `points`.
         """
-        return LinkModel(kind=DelayKind.TRACE, at_end=TraceEnd[self.at_end.upper()])
+        return LinkModel.follow_trace(self.at_end)
 
     def _moments(self) -> tuple[float, float]:
         """Returns the mean and the standard deviation of the recorded delays, in ms.

@@ -234,9 +234,7 @@ COUNT_TEXTS = {
 """Texts for the placeholders in `VALUE_TEXTS`: for the planar arm, and for any other arm."""
 
 
-_KINDS = {
-    str(kind.__struct_config__.tag): kind for kind in fields.find_kinds(__name__, ActorBase)
-}
+_KINDS = {str(kind.__struct_config__.tag): kind for kind in ActorBase.find_kinds(__name__)}
 OPERATORS = {tag: kind for tag, kind in _KINDS.items() if kind.group == "hands"}
 ENVIRONMENTS = {tag: kind for tag, kind in _KINDS.items() if kind.group == "environment"}
 """Classes of the operators and of the environments, by the name of the kind."""

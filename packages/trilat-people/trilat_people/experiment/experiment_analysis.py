@@ -27,7 +27,7 @@ import numpy as np
 from trilat_net.core import Array
 from trilat_net.errors import UsageError, count_nouns
 from trilat_net.fields import split_unit
-from trilat_net.files import find_version, make_folder, make_subfolder, write_whole
+from trilat_net.files import find_version, make_folder, write_whole
 from trilat_net.presentation import Block, TextTable, compose, format_number, style
 from trilat_net.results import Result
 from trilat_net.work import encode_csv
@@ -946,7 +946,7 @@ def analyse_experiment(
     experiment = open_experiment(folder)
     analysis = ExperimentAnalysis(experiment, exclude)
     if out is None:
-        return analysis.write(make_subfolder(experiment.folder / FOLDER))
+        return analysis.write(make_folder(experiment.folder / FOLDER, may_be_link=False))
     return analysis.write(Path(out))
 
 

@@ -23,7 +23,7 @@ from typing import Any, NamedTuple
 import msgspec
 
 from trilat_net.errors import UsageError, count_nouns
-from trilat_net.files import digest_file, make_results_folder, make_subfolder, write_whole
+from trilat_net.files import digest_file, make_folder, make_results_folder, write_whole
 from trilat_net.presentation import Block, TextTable
 from trilat_net.results import Result
 from trilat_net.scenario import parse_scenario
@@ -262,7 +262,7 @@ class Experiment(Result):
         Returns:
             This experiment.
         """
-        logs = make_subfolder(self.folder / LOGS)
+        logs = make_folder(self.folder / LOGS, may_be_link=False)
         plan = self.plan
         with self.open_trials(people=False) as journal:
             if plan.protocol.staircase is not None:

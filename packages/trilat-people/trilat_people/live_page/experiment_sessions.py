@@ -24,7 +24,7 @@ from rich.console import Console
 
 from trilat_net.app import SessionResult, compile_core, run_demo
 from trilat_net.errors import LogError, LogRefused, RunFailed
-from trilat_net.files import describe_write_error, make_subfolder
+from trilat_net.files import describe_write_error, make_folder
 from trilat_net.net import Bus, Clock, SystemClock, ZenohBus
 from trilat_net.records import NS_PER_S
 from trilat_net.signals import Interrupt
@@ -206,7 +206,7 @@ class ExperimentSessions:
         planned = step.planned
         scenario = plan.find_scenario(planned, self.experiment.list_choices())
         trial = ExperimentTrial(plan.protocol, scenario, planned, plan.digest)
-        log_path = make_subfolder(self.experiment.folder / LOGS) / planned.file
+        log_path = make_folder(self.experiment.folder / LOGS, may_be_link=False) / planned.file
         # If the log already exists, the program was killed before it had counted the trial.
         if log_path.exists():
             reason_against = self._count_trial(trial, log_path)
@@ -282,8 +282,10 @@ class ExperimentSessions:
         """
         number = len(self._list_attempts(step.planned)) + 1
         begun_ns = self.clock.monotonic_ns()
-        attempts = make_subfolder(self.experiment.folder / ATTEMPTS)
-        folder = make_subfolder(attempts / f"{step.planned.number:05d}-{number:02d}")
+        attempts = make_folder(self.experiment.folder / ATTEMPTS, may_be_link=False)
+        folder = make_folder(
+            attempts / f"{step.planned.number:05d}-{number:02d}", may_be_link=False
+        )
         watch = TrialWatch(trial, self.clock)
         request = self.stage.request_step(step, rest_s)
         has_begun = False

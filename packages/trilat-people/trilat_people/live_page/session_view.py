@@ -25,7 +25,7 @@ from typing import Generic, TypeVar
 
 import msgspec
 
-from recorder import AWAY_NS, GapRepair, InboundQueue, SiteReception
+from recorder import AWAY_NS, GapRepair, InboundQueue
 from trilat_net.analysis import KEPT_S, RunningEnergy
 from trilat_net.core import TAKEN, LifeAlarm
 from trilat_net.errors import ScenarioError, WireError
@@ -35,7 +35,7 @@ from trilat_net.net import (
     Event,
     Info,
     LinkStats,
-    MemberQuery,
+    SessionMembers,
     State,
     decode,
     topics,
@@ -159,13 +159,13 @@ class SiteView:
         if loss_rule.rule.degrades:
             self.layout = scenario.layout(name)
         self.hand = settings.find_live_hand(is_open=True)
-        self.reception = SiteReception(scenario, name, boot)
         self.window = energy.windows[name]
         self.holder = ""
         self.stopped_by = ""
         self.bodies: dict[int, list[float]] = {}
         self.dropped: Counter[str] = Counter()
-        self.repair = GapRepair(bus, session, self.reception, self.dropped)
+        self.repair = GapRepair(bus, session, scenario, name, boot, self.dropped)
+        self.reception = self.repair.reception
         self.record: State | None = None
         self.stats: LinkStats | None = None
         self.first_tick = 0
@@ -280,7 +280,7 @@ class SessionView:
         self._left_ns: int | None = None
         self._pictures: dict[str, PictureDelay] = {}
         self._applied_changes: set[tuple[str, str]] = set()
-        self._query = MemberQuery(bus, clock, session)
+        self._query = SessionMembers(bus, clock, session)
         self._queue = InboundQueue(clock)
         for channel in (topics.STATE, topics.LINK, topics.EVENT):
             key_of_all_sites = topics.key(session, "*", channel)
@@ -560,9 +560,8 @@ class SessionView:
         if self.scenario is None or not self.scenario.sites_may_return:
             return False
 
-        reception = SiteReception(self.scenario, name, event.boot, site.reception)
-        site.reception = reception
-        site.repair = GapRepair(self.bus, self.session, reception, site.dropped)
+        site.repair = site.repair.follow_start(event.boot)
+        site.reception = site.repair.reception
         return True
 
     def _skip_records_before(self, site: SiteView, content: State | LinkStats | Event) -> None:

@@ -16,7 +16,6 @@ from itertools import product
 from math import prod
 from typing import NamedTuple
 
-from trilat_net.core import describe_structure
 from trilat_net.errors import ScenarioError, count_nouns
 from trilat_net.execution import FusedRun
 
@@ -127,11 +126,14 @@ def _find_structure(plan: SweepPlan, dimension: int, index: int) -> Hashable:
         The structure. If the run cannot be computed together with others, the reason is
         returned instead. `None` if the cell is not a valid scenario.
     """
+    # A sweep of single runs must not load the code of lanes.
+    from trilat_net.core import RunGroup
+
     stride = prod(plan.shape[dimension + 1 :])
     cell = plan.cell(index * stride)
     try:
         scenario = plan.scenario(*cell.overrides)
         sweep_cell.check_sweepable(scenario)
-        return describe_structure(FusedRun(scenario))
+        return RunGroup.describe_structure(FusedRun(scenario))
     except ScenarioError:
         return None

@@ -33,9 +33,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from trilat_net.analysis import GrowthColumn, build_arm_rows
-from trilat_net.core import Array
+from trilat_net.core import Array, DominanceMatrix
 from trilat_net.errors import ScenarioError, UsageError
-from trilat_net.laws import COMMON_MOTION_SHARE, PD, Adaptive, find_least_reversible
+from trilat_net.laws import COMMON_MOTION_SHARE, PD, Adaptive
 from trilat_net.scenario import (
     LinkBase,
     Scenario,
@@ -633,7 +633,7 @@ def _evaluate_damping_criterion(scenario: Scenario) -> StabilityCriterion | None
         )
 
     are_equal = len({*K}) == len({*d}) == len({*delays_ticks}) == 1
-    least_eigenvalue = find_least_reversible(scenario.alpha)
+    least_eigenvalue = DominanceMatrix(scenario.alpha).find_least_eigenvalue()
     if not are_equal or least_eigenvalue is None:
         return None
     common_delay_ticks = delays_ticks[0]

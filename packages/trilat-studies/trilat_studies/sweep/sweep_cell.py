@@ -31,7 +31,7 @@ from trilat_net.analysis import (
     find_run_roots,
     judge_virtual_run,
 )
-from trilat_net.execution import FusedRun, check_fusable
+from trilat_net.execution import FusedRun
 from trilat_net.own_code import ImportedLaw
 from trilat_net.results import finite_or_none
 from trilat_net.scenario import Scenario, parse_scenario
@@ -224,10 +224,10 @@ def check_sweepable(scenario: Scenario) -> None:
         scenario: The scenario.
 
     Raises:
-        ScenarioError: See `refuse_live_only` and `check_fusable`.
+        ScenarioError: See `refuse_live_only` and `FusedRun.check_scenario`.
     """
     refuse_live_only(scenario)
-    check_fusable(scenario)
+    FusedRun.check_scenario(scenario)
 
 
 class _CellInProgress:
@@ -364,12 +364,12 @@ def classify_cells(scenarios: Iterable[Scenario], longest_s: float) -> Iterator[
         The results in the order of the cells.
     """
     # A single run must not load the code of lanes.
-    from trilat_net.core import group_runs
+    from trilat_net.core import RunGroup
 
     cells = [_CellInProgress(scenario, longest_s) for scenario in scenarios]
     runs = [cell.run for cell in cells]
     obstacles = [""] * len(cells)
-    for group in group_runs(runs):
+    for group in RunGroup.divide(runs):
         for index in group.members:
             obstacles[index] = group.obstacle
         _run_group(group, cells)

@@ -35,7 +35,7 @@ from trilat_net.errors import (
     count_nouns,
     format_wall_time,
 )
-from trilat_net.execution import FusedRun, simulate_scenario
+from trilat_net.execution import FusedRun, SimulatedLog
 from trilat_net.files import make_results_folder, write_whole
 from trilat_net.net import SystemClock
 from trilat_net.own_code import list_imported_code
@@ -491,7 +491,7 @@ def _complete_run(task: CellItem, scenario: Scenario, outcome: CellResult) -> Ce
     metrics: dict[str, float | None] = {}
     log_metrics = [key for key in plan.metrics if key not in CellResult.__struct_fields__]
     if log_metrics:
-        measured = LogMetrics.measure_run(simulate_scenario(scenario), log_metrics)
+        measured = LogMetrics.measure_run(SimulatedLog(scenario), log_metrics)
         metrics = {key: measured[key].value for key in log_metrics}
 
     laws = dict.fromkeys(site.law_name for site in scenario.sites.values())
@@ -541,7 +541,7 @@ def _prepare_lanes(plan: SweepPlan, runs: int) -> bool:
     if plan.judge == "linear" or (runs < 2 and not is_large):
         return False
     # A sweep of single runs must not load the code of lanes.
-    from trilat_net.core import prepare_lanes
+    from trilat_net.core import RunGroup
 
     try:
         scenario = _build_scenario(CellItem(plan, plan.cell(0), plan.seeds[0]))
@@ -549,9 +549,9 @@ def _prepare_lanes(plan: SweepPlan, runs: int) -> bool:
         return is_large  # the workers compile the code of other cells
     make_run = partial(FusedRun, scenario)
     if is_large:
-        prepare_lanes(make_run, LANE_RUNS, least_site_ticks=0)
+        RunGroup.prepare_lanes(make_run, LANE_RUNS, least_site_ticks=0)
         return True
-    return prepare_lanes(make_run, runs, least_site_ticks=math.inf)
+    return RunGroup.prepare_lanes(make_run, runs, least_site_ticks=math.inf)
 
 
 def run_sweep(

@@ -44,14 +44,13 @@ import numpy as np
 from trilat_net.analysis import (
     SETTLED_ERROR_RAD,
     DominanceHistory,
-    DominanceMatrix,
     EndBehaviour,
     RunEnd,
     SourceRows,
     Stability,
     build_arm_rows,
 )
-from trilat_net.core import Array
+from trilat_net.core import Array, DominanceMatrix
 from trilat_net.errors import CodeFailed, ScenarioError
 from trilat_net.laws import LawSettings, TuningRun
 from trilat_net.log import Log
@@ -168,7 +167,7 @@ def compute_consensus_pose(scenario: Scenario, t_s: Array) -> Array:
     Returns:
         The pose at the K times, shape (K, n), in rad, for n joints.
     """
-    beta = DominanceMatrix(scenario.alpha).compute_perron_vector()
+    beta = DominanceMatrix(scenario.alpha).find_pi()
     weights = dict(zip(scenario.names, beta, strict=True))
     weighted_starts = []
     for name, spec in scenario.sites.items():

@@ -1,0 +1,240 @@
+"""Queries the members of a session, and sends requests to its sites.
+
+A member is a process that takes part in a session. A site is the process of one arm. Members
+use this module to find each other, and programs outside the session, such as the commands that
+stop arms or change network delays, use it to reach the members.
+
+Invariant:
+    - A change is requested only once, because a second request might apply it twice. The caller
+      receives either a reply, or an error that names the arm that did not reply.
+    - A log is not played back under the name of a session that is running, because programs
+      could not distinguish the messages of the log from those of the session.
+"""
+
+import math
+from collections.abc import Callable, Iterator
+from contextlib import suppress
+
+import msgspec
+from msgspec import UNSET
+
+from ..errors import SessionError, WireError
+from . import topics
+from .bus import Bus
+from .clock import Clock
+from .messages import Event, Info
+from .pinging import RepeatedQuery
+from .requests import (
+    BACKFILL_MESSAGES,
+    Backfill,
+    BackfillRequest,
+    ChangeReply,
+    ChangeRequest,
+    DirectMessage,
+)
+from .wire import decode, encode
+
+POLL_NS = 5_000_000
+"""Time between two polls for replies, in ns."""
+REPLY_TIMEOUT_S = 3.0
+"""Longest wait for a reply, in s."""
+_NAME_CHECK_S = 0.7
+"""Time for which a playback looks for sites of a session with the same name, in s.
+
+Sites try to connect every half second.
+"""
+
+
+class SessionMembers:
+    """The members of a running session, which are queried over an open connection.
+
+    A member is a process of the session, for example a site (arm controller).
+
+    Args:
+        bus: Network connection that reaches the session.
+        clock: Clock of the caller.
+        session: Name of the session.
+        member: Name of the member whose identity is queried. "*" queries all members.
+
+    Attributes:
+        unreadable: Reasons why replies cannot be decoded, by the name of the member that sent
+            the reply.
+    """
+
+    def __init__(self, bus: Bus, clock: Clock, session: str, member: str = "*") -> None:
+        self.unreadable: dict[str, str] = {}
+        self._bus = bus
+        self._clock = clock
+        self._session = session
+        self._query = RepeatedQuery(bus, clock, topics.key(session, member, topics.INFO))
+
+    def poll(self) -> Iterator[Info]:
+        """Yields the identities that have arrived, and repeats the query if it is due.
+
+        A query may be lost, and members may start at any time. Therefore the query is repeated
+        as long as the owner of this object calls this method.
+
+        A reply is skipped if it cannot be decoded, or if the name in the identity differs from
+        the name in the key under which the reply arrived.
+        """
+        while (reply := self._query.poll()) is not None:
+            _, key, payload = reply
+            parts = topics.parse_key(key)
+            if parts is None:
+                continue
+            try:
+                info = decode(payload, Info)
+            except WireError as error:  # another version of this program, or another program
+                self.unreadable[parts.member] = str(error)
+                continue
+            if parts.member == info.member:
+                yield info
+        self._query.repeat()
+
+    def find(
+        self,
+        *,
+        stopped: Callable[[], bool],
+        timeout_s: float | None,
+    ) -> Iterator[Info]:
+        """Queries the members of a session, and yields their identities as they arrive.
+
+        The query is repeated until the search ends, because a reply may be lost. The identity
+        of a member (process of a session) is therefore yielded repeatedly.
+
+        Args:
+            stopped: Function that returns True to end the search.
+            timeout_s: Duration of the search, in s. If None, there is no limit.
+
+        Yields:
+            The identity of a member, as soon as a reply has arrived.
+
+        Raises:
+            SessionError: The time is over, and none of the replies that arrived could be
+                decoded.
+        """
+        has_readable_reply = False
+        begun_ns = self._clock.monotonic_ns()
+        timeout_ns = math.inf if timeout_s is None else timeout_s * 1e9
+        while not stopped() and self._clock.monotonic_ns() - begun_ns < timeout_ns:
+            for info in self.poll():
+                has_readable_reply = True
+                yield info
+            self._clock.sleep_until(self._clock.monotonic_ns() + POLL_NS)
+        if self.unreadable and not has_readable_reply and not stopped():
+            member, reason = next(iter(self.unreadable.items()))
+            raise SessionError(f"the reply of {member} cannot be read: {reason}")
+
+    def send_change(
+        self,
+        site: str,
+        request: ChangeRequest,
+    ) -> ChangeReply:
+        """Sends a request to a site of a running session, and waits for the reply.
+
+        If the members of the session have keys, changes can be requested only with the keys of
+        the operator. Every member may send the order to stop.
+
+        Args:
+            site: Name of the site.
+            request: The requested change, or an order such as "stop".
+
+        Returns:
+            The reply of the site, accepted or refused.
+
+        Raises:
+            SessionError: The site does not reply.
+        """
+        channel = topics.STOP if request.order == "stop" else topics.SET
+        payload = self._query_once(topics.key(self._session, site, channel), request)
+        if payload is None:
+            hint = "; in a session with keys, only the operator may request changes"
+            raise SessionError(
+                f"{site} did not answer; the records of {site} show whether the change was made"
+                f"{'' if channel == topics.STOP else hint}"
+            )
+
+        try:
+            reply = decode(payload, ChangeReply)
+        except WireError as error:
+            raise SessionError(f"the reply of {site} cannot be read: {error}") from None
+
+        if request.order == "stop" and not reply.accepted and request.source is not UNSET:
+            # A site with an older version of this program does not know the field `source`, and
+            # refuses the whole request. Its arm must stop as well.
+            return self.send_change(site, msgspec.structs.replace(request, source=UNSET))
+        return reply
+
+    def list_past_events(
+        self,
+        site: str,
+    ) -> Iterator[Event]:
+        """Queries a site for the events that it has published, and yields them in order.
+
+        The first event is the oldest one that the site (arm controller) still stores. The
+        iteration ends early if the site does not reply.
+
+        Args:
+            site: Name of the site.
+        """
+        key = topics.key(self._session, site, topics.PAST)
+        first = 0
+        published = 1
+        with suppress(WireError):  # a reply of another program ends the iteration
+            while first < published:
+                request = BackfillRequest(
+                    channel="event", first=first, last=first + BACKFILL_MESSAGES - 1
+                )
+                reply = self._query_once(key, request)
+                backfill = None if reply is None else decode(reply, Backfill)
+                if backfill is None or not backfill.payloads:
+                    return
+
+                for payload in backfill.payloads:
+                    yield decode(payload, Event)
+                first = backfill.first + len(backfill.payloads)
+                published = backfill.made
+
+    def require_absent(self, stopped: Callable[[], bool]) -> None:
+        """Checks that no member is present, before the session's name is used for a playback.
+
+        Args:
+            stopped: Function that returns True to end the check early.
+
+        Raises:
+            SessionError: A site (arm controller) of the session replies.
+        """
+        for info in self.find(stopped=stopped, timeout_s=_NAME_CHECK_S):
+            if info.member == topics.RECORDER:
+                continue
+            state = "is waiting to begin"
+            if info.running:
+                state = f"is running ({info.member} is at tick {info.ticks})"
+            raise SessionError(
+                f"session {self._session!r} already exists and {state}; replay the log under "
+                "another name with --prefix or --session"
+            )
+
+    def _query_once(
+        self,
+        key: str,
+        request: DirectMessage,
+    ) -> bytes | None:
+        """Sends a request to other processes once, and waits for the first reply.
+
+        Args:
+            key: Key under which the receiver accepts requests, see `topics.key`.
+            request: The request.
+
+        Returns:
+            The payload of the reply. None if no reply arrives within `REPLY_TIMEOUT_S`.
+        """
+        replies = self._bus.query(key, encode(request))
+        deadline_ns = self._clock.monotonic_ns() + int(REPLY_TIMEOUT_S * 1e9)
+        while self._clock.monotonic_ns() < deadline_ns:
+            self._clock.sleep_until(self._clock.monotonic_ns() + POLL_NS)
+            reply = replies.poll()
+            if reply is not None:
+                _key, payload = reply
+                return payload
+        return None
