@@ -14,7 +14,6 @@ import msgspec
 from trilat_studies.sweep import prepare_sweep_folder, run_sweep, sweep_run
 from trilat_studies.sweep.sweep_cell import CellRun
 from trilat_studies.sweep.sweep_plan import plan_sweep
-from trilat_studies.sweep.sweep_results import summarize_sweep
 from trilat_studies.sweep.sweep_run import CellItem, open_sweep_folder
 
 SIDE = 1000
@@ -60,7 +59,7 @@ def run() -> list[str]:
             resumed_s = time.process_time()
             finished = run_sweep(folder, 1, note)
             swept_s = time.process_time()
-            lines = list(summarize_sweep(finished.results))
+            lines = list(finished.results.summarize())
             summary_s = time.process_time() - swept_s
             count = len(finished.results.rows)
     finally:

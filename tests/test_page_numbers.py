@@ -22,7 +22,7 @@ from trilat_studies.tuning.candidate import CandidateScore
 from trilat_studies.tuning.search_space import (
     SEARCH_SPACES,
     ModelInformation,
-    select_search_spaces,
+    SearchSpace,
 )
 
 import trilat_net
@@ -633,7 +633,7 @@ def test_gains_repeat_the_ends_of_fronts(row: int) -> None:
     """The rows with gains in docs/theory/fair-comparison-results.md have four gains for the error, then four for settling."""
     assert len(TUNED) == 8
     law, reached, effort_nm, gains = TUNED[row]
-    (space,) = select_search_spaces([law], load_scenario("free"))
+    (space,) = SearchSpace.select([law], load_scenario("free"))
     values = {
         name: float(number) for name, number in (gain.split() for gain in gains.split(", "))
     }

@@ -28,6 +28,7 @@ from tests.log.builders import (
 )
 from trilat_net.analysis.file_overview import FileInventory, info, summarise_run
 from trilat_net.errors import LogError
+from trilat_net.log.log_reader import open_log
 
 
 def parse_strictly(facts):
@@ -186,7 +187,6 @@ def test_short_logs_have_nulls_and_no_nan(records):
 
 WHOLE = make_log_bytes("paper")
 STATE = "/trilat/paper/m1/state"
-RATES = {"m1": 1000, "m2": 1000, "s": 1000}
 
 
 @settings(max_examples=15, suppress_health_check=[HealthCheck.function_scoped_fixture])
@@ -194,7 +194,7 @@ RATES = {"m1": 1000, "m2": 1000, "s": 1000}
 def test_gaps_count_missing_records(tmp_path: Path, lost: set[int]) -> None:
     """Records missing behind the last one do not count, because no number reveals them."""
     path = write_log(tmp_path, edit_log_bytes(WHOLE, record=drop_records("m1", lost)))
-    facts = FileInventory([path]).channels("paper", RATES, {})[STATE]
+    facts = FileInventory([path]).channels(open_log(path))[STATE]
     last = max(set(range(120)) - lost)
     named = {n for first, end in facts["gaps"] for n in range(first, end + 1)}
     assert named == {n for n in lost if n < last}
@@ -209,7 +209,7 @@ def test_parts_are_counted_together(tmp_path: Path) -> None:
         paths.append(tmp_path / f"{n}.mcap")
         paths[-1].write_bytes(edit_log_bytes(WHOLE, record=half))
     inventory = FileInventory(paths)
-    facts = inventory.channels("paper", RATES, {})[STATE]
+    facts = inventory.channels(open_log(*paths))[STATE]
     assert (facts["messages"], facts["missing"]) == (120, 0)
     assert [file["finished"] for file in inventory.files] == [True, True]
     assert info(*paths).facts["sites"]["m1"]["missing"] == 0

@@ -28,7 +28,6 @@ from trilat_net.execution.what_if import rerun
 from trilat_net.log.accounting import MIN_COVERAGE, Coverage
 from trilat_net.log.log_reader import open_log
 from trilat_net.log.running_digest import DigestState
-from trilat_net.log.session_check import judge_integrity
 from trilat_net.net.messages import Event
 
 LATE = {("m1", 0, 20): 35, ("m2", 1, 30): 38, ("s", 0, 25): 39}
@@ -50,7 +49,7 @@ def is_refused(data: bytes, *, chained: bool) -> bool:
     try:
         log = open_bytes(data)
         if chained:
-            return not judge_integrity(log).passed
+            return not log.judge_integrity().passed
         return not LogCheckReport.of_log(log, virtual=False).passed
     except (LogError, ScenarioError):
         return True
@@ -59,10 +58,10 @@ def is_refused(data: bytes, *, chained: bool) -> bool:
 def test_rewriting_without_changes_keeps_the_file() -> None:
     assert take_apart(make_run_bytes()).bytes() == make_run_bytes()
     log = open_bytes(make_run_bytes())
-    assert judge_integrity(log).state is DigestState.INTACT
+    assert log.judge_integrity().state is DigestState.INTACT
     assert LogCheckReport.of_log(log, virtual=True).passed
     old = open_bytes(make_pieces(chained=False).bytes())
-    assert judge_integrity(old).state is DigestState.ABSENT
+    assert old.judge_integrity().state is DigestState.ABSENT
     assert LogCheckReport.of_log(old, virtual=True).passed
 
 
@@ -217,7 +216,7 @@ def test_two_runs_over_a_gap_are_refused() -> None:
         m for m in taken.messages if "state" not in topics[m.channel] or m.sequence < 60
     ]
     taken.messages += [m for m in other if "state" in topics[m.channel] and m.sequence >= 62]
-    integrity = judge_integrity(open_bytes(taken.bytes()))
+    integrity = open_bytes(taken.bytes()).judge_integrity()
     assert integrity.state is DigestState.CHANGED
     assert "were removed or added" in integrity.text
 
@@ -243,10 +242,8 @@ def test_torn_logs_pass_no_more_than_asked() -> None:
     assert verify_log(log, min_coverage=share).passed
     assert not verify_log(log, min_coverage=share + 1e-6).passed
     whole = make_log_bytes("paper")
-    assert (
-        judge_integrity(open_bytes(whole[: whole.index(b"trilat.chain")])).state
-        is DigestState.OPEN
-    )
+    unfinished = open_bytes(whole[: whole.index(b"trilat.chain")])
+    assert unfinished.judge_integrity().state is DigestState.OPEN
 
 
 def test_foreign_records_are_found_without_execution() -> None:

@@ -15,7 +15,7 @@ from trilat_net.errors import LogError
 from trilat_net.execution import virtual
 from trilat_net.execution.verification import verify_log
 from trilat_net.log.log_reader import open_log
-from trilat_net.log.ros2.ros2_messages import read_ros2_channels
+from trilat_net.log.ros2.published import Ros2Topics
 from trilat_net.log.view_rates import FULL_RATE_HZ
 from trilat_net.presentation.rerun_viewer import build_plot_layout
 from trilat_net.scenario import load_scenario
@@ -98,7 +98,7 @@ def test_records_with_wrong_law_messages_are_unreadable() -> None:
 def test_viewers_get_a_channel_per_vector(tmp_path: Path) -> None:
     path = tmp_path / "run.mcap"
     virtual.record_virtual(load_scenario("paper", SHORT), path, views_hz=FULL_RATE_HZ)
-    channels = read_ros2_channels(path)
+    channels = Ros2Topics.of_file(path)
     about = {
         topic.rpartition("/")[2]: channel_data.about
         for topic, channel_data in channels.items()

@@ -21,7 +21,6 @@ from trilat_net.log.data_tables import (
     UNIT_SUFFIXES,
     Column,
     Table,
-    build_arrivals_table,
     read_field_docs,
 )
 from trilat_net.log.log_reader import Log
@@ -69,7 +68,7 @@ def test_column_names_are_unique_with_units(which: str) -> None:
 )
 def test_delays_of_arrivals_state_their_kind(*, live: bool, said: str) -> None:
     """In virtual time the delay of a sample is not that of a network."""
-    table = build_arrivals_table(make_paper_log()["m1"], "run.mcap", live=live)
+    table = Table.of_arrivals(make_paper_log()["m1"], "run.mcap", live=live)
     (delay,) = (column for column in table.columns if column.name == "delay_us")
     assert delay.meaning.startswith(said)
 

@@ -10,9 +10,9 @@ from hypothesis import strategies as st
 
 from trilat_net.core.step.site_setup import Layout
 from trilat_net.errors import WireError
-from trilat_net.log import record_columns
 from trilat_net.log.packed.indexed_records import IndexedRecords
 from trilat_net.log.packed.packed_messages import PackedMessages
+from trilat_net.log.record_columns import RecordColumns
 from trilat_net.net.messages import MODE_WORDS, READABLE, State
 from trilat_net.net.wire import decode, encode_state
 from trilat_net.records import Arrival, Mode, TickRecord
@@ -84,26 +84,25 @@ def assert_equal_columns(
     payloads: list[bytes], records: IndexedRecords, layout: Layout
 ) -> None:
     """Every column equals that of the decoders, bit for bit."""
-    assert records.ticks.tolist() == record_columns.decode_ticks(payloads).tolist()
+    columns = RecordColumns(payloads)
+    assert records.ticks.tolist() == columns.ticks().tolist()
     for field in INTS:
-        assert (records.ints(field) == record_columns.decode_ints(payloads, field)).all()
-    expected = record_columns.decode_vectors(payloads, layout, *layout.lengths(), "wrench")
+        assert (records.ints(field) == columns.ints(field)).all()
+    expected = columns.vectors(layout, *layout.lengths(), "wrench")
     for field, rows in records.vectors([*layout.lengths(), "wrench"]).items():
         assert rows.shape == expected[field].shape
         assert rows.tobytes() == expected[field].tobytes()
     vector_words = records.vector_words(list(layout.columns()))
     joined = np.concatenate([expected[field] for field in layout.columns()], axis=1)
     assert vector_words.tobytes() == joined.tobytes()
-    used = record_columns.decode_per_peer(payloads, "used", PEERS, -1)
+    used = columns.per_peer("used", PEERS, -1)
     assert records.used.T.tolist() == [used[peer].tolist() for peer in PEERS]
-    for mine, theirs in zip(
-        records.arrivals, record_columns.decode_arrivals(payloads), strict=True
-    ):
+    for mine, theirs in zip(records.arrivals, columns.arrivals(), strict=True):
         assert np.array_equal(mine, theirs)
-    modes = record_columns.decode_strings(payloads, "mode").tolist()
+    modes = columns.objects("mode").tolist()
     assert records.modes.tolist() == modes
     assert [MODE_WORDS[Mode(code)] for code in records.mode_codes.tolist()] == modes
-    memories = record_columns.decode_strings(payloads, "mem").tolist()
+    memories = columns.objects("mem").tolist()
     assert records.memories.tolist() == memories
     states = [decode(payload, State, READABLE, layout) for payload in payloads]
     assert [boot % 2**64 for boot in records.boots.tolist()] == [s.boot for s in states]

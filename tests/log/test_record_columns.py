@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from trilat_net.core.step.site_setup import Layout
 from trilat_net.core.step.ticks import Mode
 from trilat_net.errors import WireError
-from trilat_net.log import record_columns
+from trilat_net.log.record_columns import RecordColumns
 from trilat_net.log.site_log import SiteLog
 from trilat_net.net.messages import READABLE, State
 from trilat_net.net.wire import decode
@@ -126,7 +126,7 @@ def test_a_column_with_an_invalid_value_is_refused(field: str, value: object) ->
 )
 def test_records_without_version_or_tick_are_refused(change: dict[str, object]) -> None:
     with pytest.raises(WireError):
-        record_columns.decode_ticks([msgpack.packb(GOOD), msgpack.packb({**GOOD, **change})])
+        RecordColumns([msgpack.packb(GOOD), msgpack.packb({**GOOD, **change})]).ticks()
 
 
 def test_unrequested_fields_are_not_parsed() -> None:
@@ -138,7 +138,7 @@ def test_unrequested_fields_are_not_parsed() -> None:
 
 def test_an_overlong_payload_is_refused() -> None:
     with pytest.raises(WireError, match="oversized"):
-        record_columns.decode_ticks([msgpack.packb({**GOOD, "cmd": ["x" * 70_000]})])
+        RecordColumns([msgpack.packb({**GOOD, "cmd": ["x" * 70_000]})]).ticks()
 
 
 def test_disordered_records_are_sorted_with_their_times() -> None:

@@ -36,7 +36,7 @@ from trilat_net.log.mcap_records import (
 )
 from trilat_net.log.recovery import recover
 from trilat_net.log.running_digest import DigestState
-from trilat_net.log.session_check import LogCheckResult, check_file, judge_integrity
+from trilat_net.log.session_check import LogCheckResult, check_file
 
 WHOLE = make_log_bytes("paper")
 DATA = edit_log_bytes(WHOLE, chunk_bytes=8192)
@@ -374,7 +374,7 @@ def test_removed_records_show_without_account_or_digests(first: int, removed: se
         for message in read_messages(WHOLE)
         if message.topic != "/trilat/paper/m1/state" or message.sequence in kept_ticks
     ]
-    integrity = judge_integrity(open_log(io.BytesIO(make_bytes_of_messages(WHOLE, kept))))
+    integrity = open_log(io.BytesIO(make_bytes_of_messages(WHOLE, kept))).judge_integrity()
     assert integrity.state is DigestState.CHANGED
     verb = "record of m1 is" if len(removed) == 1 else "records of m1 are"
     assert integrity.text.startswith(f"{len(removed)} {verb} missing in between")

@@ -37,14 +37,7 @@ from tests.turning import (
 )
 from trilat_net.core.step.vectors import Array
 from trilat_net.log.log_reader import Log
-from trilat_net.log.orientations import (
-    align_signs,
-    choose_nearest_vectors,
-    compute_continuous_vectors,
-    compute_matrix_columns,
-    compute_quaternions,
-    expand_poses,
-)
+from trilat_net.log.orientations import RotationVectors, align_signs, expand_poses
 from trilat_net.log.ros2.topic_names import TopicTable
 
 ROS = get_typestore(Stores.ROS2_JAZZY)
@@ -82,17 +75,18 @@ def test_motions_pass_half_a_turn() -> None:
 def test_numbers_of_a_turning_body_never_jump(number: int) -> None:
     truth = make_rotation(number, 1000)
     vectors = truth.as_rotvec()
-    assert_follows("quaternions", compute_quaternions(vectors), truth, 1e-12)
-    assert_follows("six numbers", compute_matrix_columns(vectors), truth, 1e-12)
+    turns = RotationVectors(vectors)
+    assert_follows("quaternions", turns.as_quaternions(), truth, 1e-12)
+    assert_follows("six numbers", turns.as_matrix_columns(), truth, 1e-12)
     pose = np.hstack([np.ones((1000, 3)), vectors])
-    assert np.array_equal(expand_poses(pose)[:, 3:], compute_matrix_columns(vectors))
+    assert np.array_equal(expand_poses(pose)[:, 3:], turns.as_matrix_columns())
     assert expand_poses(pose[7]).shape == (9,)
     flipped = truth.as_quat(canonical=True, scalar_first=True)
     assert_follows("signs", align_signs(flipped), truth, 1e-12)
-    nearer = choose_nearest_vectors(vectors[1:], vectors[:-1])
+    nearer = RotationVectors(vectors[1:]).nearest_to(vectors[:-1])
     assert (Rotation.from_rotvec(nearer) * truth[1:].inv()).magnitude().max() < 1e-9
     assert np.linalg.norm(nearer - vectors[:-1], axis=1).max() < 3.0
-    steady = Rotation.from_rotvec(compute_continuous_vectors(vectors))
+    steady = Rotation.from_rotvec(turns.without_jumps())
     assert (steady * truth.inv()).magnitude().max() < 1e-9
 
 

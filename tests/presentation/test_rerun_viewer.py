@@ -18,7 +18,8 @@ from trilat_net.errors import LogError, RunFailed, UsageError
 from trilat_net.files import format_extra_install
 from trilat_net.log.log_reader import Log, open_log
 from trilat_net.log.ros2.cdr import JOINT_STATE
-from trilat_net.log.ros2.ros2_messages import Ros2Channel, read_ros2_channels
+from trilat_net.log.ros2.published import Ros2Topics
+from trilat_net.log.ros2.ros2_messages import Ros2Channel
 from trilat_net.presentation import rerun_viewer
 from trilat_net.presentation.rerun_viewer import (
     PlotLayout,
@@ -45,7 +46,7 @@ class Rerun:
         for file in map(Path, command):
             if file.suffix == ".mcap":
                 self.log = file
-                self.topics = set(read_ros2_channels(file))
+                self.topics = set(Ros2Topics.of_file(file))
             if file.suffix == ".rbl":
                 self.layout = file
                 assert file.stat().st_size > 0
@@ -156,14 +157,14 @@ def test_rerun_takes_log_and_layout_into_one_recording(
     text = run_program(*RERUN, "rrd", "print", "-vvv", str(recording))
     stores = set(re.findall(r'(Blueprint|Recording),\s*"([^"]+)"', text))
     assert stores == {("Blueprint", "live"), ("Recording", "live")}
-    assert [name for name in read_ros2_channels(files["live"]) if name not in text] == []
+    assert [name for name in Ros2Topics.of_file(files["live"]) if name not in text] == []
 
 
 def build_layouts(
     files: dict[str, Path],
 ) -> dict[str, tuple[dict[str, Ros2Channel], PlotLayout]]:
     return {
-        kind: (read_ros2_channels(path), build_plot_layout(read_ros2_channels(path)))
+        kind: (Ros2Topics.of_file(path), build_plot_layout(Ros2Topics.of_file(path)))
         for kind, path in files.items()
     }
 
@@ -231,4 +232,4 @@ def test_two_dimensional_numbers_are_named_by_both(files: dict[str, Path]) -> No
 def test_files_without_index_have_no_channels(files: dict[str, Path], tmp_path: Path) -> None:
     for content in (b"", b"nonsense" * 100, files["live"].read_bytes()[:50_000]):
         write_log(tmp_path, content, "x.mcap")
-        assert read_ros2_channels(tmp_path / "x.mcap") == {}
+        assert Ros2Topics.of_file(tmp_path / "x.mcap") == {}

@@ -23,7 +23,7 @@ from tests.scenario.builders import planar_task_text
 from trilat_net.errors import LogError
 from trilat_net.execution.virtual import write_virtual_log
 from trilat_net.log.log_reader import Log
-from trilat_net.log.ros2.ros2_messages import read_ros2_channels
+from trilat_net.log.ros2.published import Ros2Topics
 from trilat_net.presentation.export import Exporter
 from trilat_net.presentation.exports.ros2 import export_ros2
 from trilat_net.presentation.rerun_viewer import ViewerOptions, open_rerun
@@ -135,7 +135,7 @@ def test_rerun_reads_a_log_and_its_bag(tmp_path: Path) -> None:
     assert list_rerun_faults(export_log("ros2", tmp_path)) == []
     open_rerun([source], make_task_log, ViewerOptions(save=saved), lambda _: None)
     text = run_program(*RERUN, "rrd", "print", "-vvv", str(saved))
-    assert [name for name in read_ros2_channels(source) if name not in text] == []
+    assert [name for name in Ros2Topics.of_file(source) if name not in text] == []
 
 
 def test_messages_are_in_order_of_arrival(

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 
 import pytest
 from rich.console import Console
-from trilat_people.live_page.session_frames import SessionFrames, render_event
+from trilat_people.live_page.session_frames import SessionFrames
 from trilat_people.live_page.terminal_watch import SessionWatch
 
 from tests.net.local_bus import LocalNetwork
@@ -124,10 +124,9 @@ def stopped_arm(tmp_path_factory: pytest.TempPathFactory) -> StoppedArm:
                     alarms.extend(watch.alarms)
                     display.show("", [], watch.alarms)
                 sleep_for_ns(clock, 50_000_000)
-        events = [render_event(event) for event in watch.view.events.since(0, 400)]
         changes.extend(
             re.sub(r"[\d.]+ s$", "", event["text"])
-            for event in events
+            for event in pages.list_events(0, 400)
             if event["kind"] == "change"
         )
 

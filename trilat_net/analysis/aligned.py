@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core import BLEND_S, POSE, POSITION, Array
-from ..log import Ints, Log, SiteLog, choose_nearest_vectors, compute_task_errors
+from ..log import Ints, Log, RotationVectors, SiteLog, compute_task_errors
 from ..net import RESTING_MODES, TASK_VECTORS
 from ..records import NS_PER_S
 from ..scenario import Scenario
@@ -518,8 +518,8 @@ class PeerTrajectory:
         # rotation vectors of different branches must not be interpolated
         if records.x.shape[1] == POSE:
             vectors_a = qa[:, POSITION:]
-            vectors_b = qb[:, POSITION:]
-            qb[:, POSITION:] = choose_nearest_vectors(vectors_b, vectors_a)
+            vectors_b = RotationVectors(qb[:, POSITION:])
+            qb[:, POSITION:] = vectors_b.nearest_to(vectors_a)
 
         # coefficients of the cubic Hermite polynomial in the fraction of the period
         quadratic = 3 * (qb - qa) - h * (2 * va + vb)

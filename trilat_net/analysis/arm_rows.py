@@ -276,7 +276,7 @@ class EndEffectorRows(NamedTuple):
 
     @property
     def last(self) -> "EndEffectorRows":
-        """The last of the K poses alone."""
+        """Position, velocity and Jacobian in the last of the poses, as arrays with K = 1."""
         return EndEffectorRows(self.position[-1:], self.speed[-1:], self.J[-1:])
 
     def find_force(self, torque: Array, least: float = 1e-15) -> Array:

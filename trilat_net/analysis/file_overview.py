@@ -27,7 +27,6 @@ from ..errors import LogError, count_nouns
 from ..files import reading
 from ..log import (
     SESSION,
-    Account,
     Log,
     McapReader,
     Progress,
@@ -35,14 +34,12 @@ from ..log import (
     open_log,
     shift_progress,
 )
-from ..net import topics
 from ..records import NS_PER_S
 from ..results import JsonObject, Result, finite_or_none
 from ..scenario import END_WINDOW_S, list_arm_notes
 from .link_summary import (
     ONE_WAY_SCHEMA_VERSION,
     ClockSummary,
-    DelayDistribution,
     LinkSummary,
     ValueStatistics,
 )
@@ -56,9 +53,6 @@ from .timeline import Timeline
 
 MOST_LISTED_GAPS = 1000
 """Largest number of gaps that are listed per channel."""
-
-Absences = Mapping[str, Sequence[tuple[int, int]]]
-"""Ticks during which a site was absent from the session, as spans (first, last), by site."""
 
 
 class _Messages(NamedTuple):
@@ -153,22 +147,12 @@ class FileInventory:
             }
         )
 
-    def channels(
-        self,
-        session: str,
-        rates_hz: Mapping[str, int],
-        absences: Absences,
-    ) -> dict[str, JsonObject]:
+    def channels(self, log: Log | None) -> dict[str, JsonObject]:
         """Describes the messages in each channel (topic) of the files, for `trilat log info`.
 
-        Missing messages are counted only for a session whose rates are known.
-
         Args:
-            session: Name of the session. Empty to count no missing messages.
-            rates_hz: Tick rates of the session's sites, the processes that run one arm each, by
-                name.
-            absences: Ticks in which sites were absent from the session, and ticks that
-                they skipped. They are not missing.
+            log: The files as a log, of which missing messages are counted. `None` if they are
+                not a log.
 
         Returns:
             Plain values by topic.
@@ -176,13 +160,7 @@ class FileInventory:
         topics_in_order = dict.fromkeys([*self._formats, *self._messages])
         channels = {}
         for topic in topics_in_order:
-            gaps = _count_gaps(
-                topic=topic,
-                sequence=self._messages[topic].sequence,
-                session=session,
-                rates_hz=rates_hz,
-                absences=absences,
-            )
+            gaps = _describe_gaps(log, topic, self._messages[topic].sequence)
             channels[topic] = self._describe_channel(topic) | gaps
         return channels
 
@@ -217,38 +195,21 @@ class FileInventory:
         }
 
 
-def _count_gaps(
-    topic: str,
-    sequence: Sequence[int],
-    session: str,
-    rates_hz: Mapping[str, int],
-    absences: Absences,
-) -> JsonObject:
-    """Counts the missing and the duplicate messages of a channel.
-
-    Only the records and the link statistics of a site have consecutive numbers. Ticks during
-    which the site was absent, or which the site skipped, are not missing.
+def _describe_gaps(log: Log | None, topic: str, sequence: Sequence[int]) -> JsonObject:
+    """Returns the numbers of missing and of duplicate messages of a channel.
 
     Args:
+        log: The log to which the channel belongs. `None` if the files are not a log.
         topic: Topic of the channel.
         sequence: Tick of every message, in the order of the file.
-        session: Name of the session.
-        rates_hz: Tick rates of the session's sites.
-        absences: Ticks that the sites did not execute.
 
     Returns:
         The number of missing messages, the gaps as spans of message numbers, and the number of
         duplicates. All are `None` for channels without consecutive numbers.
     """
-    key = topics.parse_key(topic.removeprefix("/"))
-    if key is None or key.session != session or key.member not in rates_hz:
+    account = log.count_messages(topic, sequence) if log is not None else None
+    if account is None:
         return {"missing": None, "gaps": None, "duplicates": None}
-    if key.channel not in (topics.STATE, topics.LINK):
-        return {"missing": None, "gaps": None, "duplicates": None}
-
-    account = Account.of_ticks(
-        key.channel, sequence, rates_hz[key.member], absences.get(key.member, ())
-    )
     return {
         "missing": account.missing,
         "gaps": account.gaps[:MOST_LISTED_GAPS],
@@ -345,19 +306,15 @@ def info(*files: str | Path, progress: Progress | None = None) -> FileOverview:
         "sites": {},
         "links": {},
     }
-    session = ""
-    rates_hz = {}
-    absences: Absences = {}
+    readable_log = None
     if SESSION in inventory.metadata:
         try:
             log = open_log(*paths, progress=report_pass(1))
             facts |= _describe_log(log)
-            session = log.session["session"]
-            absences = {site: log.find_unexecuted_ticks(site) for site in log.sites}
-            rates_hz = {site: log.scenario.sites[site].rate_hz for site in log.sites}
+            readable_log = log
         except LogError as error:
             facts["problem"] = str(error)
-    facts["channels"] = inventory.channels(session, rates_hz, absences)
+    facts["channels"] = inventory.channels(readable_log)
     return FileOverview(facts)
 
 
@@ -499,9 +456,7 @@ def _describe_link_health(log: Log, peer: str, site: str) -> JsonObject:
         counts = {name: getattr(last_stats, name).get(peer) for name in counts}
     return {
         "stated": log.scenario.links[f"{peer}->{site}"].describe(),
-        "age_ms": _compute_percentiles(
-            DelayDistribution.measure_ages_ns(log, peer, site), unit=1e6
-        ),
+        "age_ms": _compute_percentiles(log.sample_ages_ns(peer, site), unit=1e6),
         "one_way_ms": _compute_percentiles(one_way_us, unit=1e3),
         "clock_offset_us": None if clock_summary is None else clock_summary.offset_us,
         "clock_bound_us": None if clock_summary is None else clock_summary.bound_us,

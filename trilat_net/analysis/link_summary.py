@@ -597,7 +597,7 @@ def _summarise_link(
     site_log = log[site]
     used = site_log.used[peer]
     delivery = predict_delivery(log, peer, site, sent)
-    age_ns = DelayDistribution.measure_ages_ns(log, peer, site)
+    age_ns = log.sample_ages_ns(peer, site)
 
     # losses, and bursts of successive losses
     first = arrivals.first
@@ -722,26 +722,6 @@ class DelayDistribution(NamedTuple):
     delay_ms: Array
     age_ms: Array
 
-    @staticmethod
-    def measure_ages_ns(log: Log, peer: str, site: str) -> Ints:
-        """Measures the age of the other arm's state that a control loop used, at every tick.
-
-        A state is older than the network delay if the next message is late or lost.
-
-        Args:
-            log: The log of the run.
-            peer: Name of the site that sent the states.
-            site: Name of the site that used them.
-
-        Returns:
-            The ages, in ns. Ticks before the first state came into use are left out.
-        """
-        site_log = log[site]
-        used = site_log.used[peer]
-        has_sample = used >= 0
-        stamp_ns = used[has_sample] * NS_PER_S // log.scenario.sites[peer].rate_hz
-        return site_log.tick[has_sample] * NS_PER_S // site_log.rate_hz - stamp_ns
-
     @classmethod
     def list_of_log(cls, log: Log) -> "list[DelayDistribution]":
         """Collects the delays of all messages on every network link of a run, for histograms.
@@ -763,6 +743,6 @@ class DelayDistribution(NamedTuple):
                 # A link without a model has only measured delays, and only in a live session.
                 if not len(delay_ms) and log.driver == "live":
                     delay_ms = arrivals.delay_us / 1e3
-                age_ms = DelayDistribution.measure_ages_ns(log, peer, site) / 1e6
+                age_ms = log.sample_ages_ns(peer, site) / 1e6
                 distributions.append(DelayDistribution(peer, site, delay_ms, age_ms))
         return distributions

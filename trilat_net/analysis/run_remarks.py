@@ -24,7 +24,6 @@ import numpy as np
 
 from ..hooks import find_hook
 from ..log import Log
-from .link_summary import DelayDistribution
 from .shared_slave import list_program_sites
 from .site_signals import external_torques
 from .timeline import Timeline
@@ -188,7 +187,7 @@ def _find_odd_age(log: Log) -> _OddAge | None:
             continue
 
         peer, site = name.split("->")
-        ages_ns = DelayDistribution.measure_ages_ns(log, peer, site)
+        ages_ns = log.sample_ages_ns(peer, site)
         if len(ages_ns):
             ages.append(_OddAge(name, 1e-6 * float(ages_ns.mean()), stated_ms))
 

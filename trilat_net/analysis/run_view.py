@@ -18,7 +18,7 @@ from typing import Any, NamedTuple, TypeVar, cast
 import numpy as np
 
 from ..core import POSE, POSITION
-from ..log import Log, compute_continuous_vectors
+from ..log import Log, RotationVectors
 from ..scenario import Scenario
 from .aligned import AlignedRecords
 from .arm_rows import build_arm_rows
@@ -180,7 +180,7 @@ def _view_shared(scenario: Scenario, site_run: SiteRun) -> SiteRun:
     if x.shape[1] == POSE:
         # metrics compare poses of different times, so rotation vectors must not change branch
         position = x[:, :POSITION]
-        rotation_vectors = compute_continuous_vectors(x[:, POSITION:])
+        rotation_vectors = RotationVectors(x[:, POSITION:]).without_jumps()
         x = np.hstack([position, rotation_vectors])
 
     shared_records = records._replace(

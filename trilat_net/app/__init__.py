@@ -10,7 +10,6 @@ from ..hooks import import_on_use
 
 __all__ = [
     # The command line
-    "flag",
     "options",
     "run_and_report",
     "seconds",
@@ -38,7 +37,7 @@ __all__ = [
 if TYPE_CHECKING:
     from .api import AnyScenario, Overrides
     from .cli import options
-    from .cli.options import flag, seconds, value
+    from .cli.options import seconds, value
     from .cli.run_progress import show_progress
     from .cli.sessions import run_and_report
     from .demo_session import SessionResult, compile_core, run_demo
@@ -51,7 +50,7 @@ else:
         __name__,
         {
             "api": "AnyScenario Overrides",
-            "cli.options": "flag options seconds value",
+            "cli.options": "options seconds value",
             "cli.run_progress": "show_progress",
             "cli.sessions": "run_and_report",
             "demo_session": "SessionResult compile_core run_demo",

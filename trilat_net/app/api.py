@@ -19,7 +19,7 @@ from ..entry_points import find_viewer
 from ..errors import UsageError
 from ..execution import LogCheckReport, SimulatedLog
 from ..files import make_results_folder
-from ..log import MIN_COVERAGE, Log, open_log, open_logs
+from ..log import MIN_COVERAGE, Log, open_log
 from ..scenario import Scenario, load_scenario
 
 if TYPE_CHECKING:
@@ -106,7 +106,7 @@ def export(
     all_logs = [log] if isinstance(log, str | Path | Log) else log
     open_already = [entry for entry in all_logs if isinstance(entry, Log)]
     paths = [entry for entry in all_logs if not isinstance(entry, Log)]
-    exporter.export(*open_already, *open_logs(*paths))
+    exporter.export(*open_already, *Log.open_sessions(*paths))
     return Path(out)
 
 

@@ -48,7 +48,6 @@ from ..log import (
     Progress,
     RecordsByTick,
     SiteLog,
-    judge_integrity,
     open_log,
 )
 from ..net import MODE_WORDS, STATE_VECTORS, State
@@ -890,7 +889,7 @@ def _make_result(log: Log, min_coverage: float) -> VerifyResult:
         whole_run=log.session.get("fingerprint") == compute_fingerprint(),
         coverage=Coverage({}, {site: log.expected_ticks(site) for site in log.sites}),
         min_coverage=min_coverage,
-        integrity=judge_integrity(log),
+        integrity=log.judge_integrity(),
     )
 
 

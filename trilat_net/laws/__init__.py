@@ -19,7 +19,6 @@ __all__ = [
     # Laws
     "PD",
     "Adaptive",
-    "complementary_shares",
     # The interface of a law
     "DAMPING",
     "ERROR_DAMPING",
@@ -62,7 +61,6 @@ if TYPE_CHECKING:
     )
     from .p_d import PD
     from .sent_vectors import SentVectorSpecs, convert_sends
-    from .six_channel import complementary_shares
 else:
     __getattr__ = import_on_use(
         __name__,
@@ -77,6 +75,5 @@ else:
             ),
             "p_d": "PD",
             "sent_vectors": "SentVectorSpecs convert_sends",
-            "six_channel": "complementary_shares",
         },
     )

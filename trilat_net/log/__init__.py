@@ -20,7 +20,6 @@ __all__ = [
     "LazyRecords",
     "Log",
     "LogFile",
-    "McapMessage",
     "McapReader",
     "Progress",
     "RecordsByTick",
@@ -29,10 +28,7 @@ __all__ = [
     "Table",
     "compute_task_errors",
     "open_log",
-    "judge_integrity",
-    "open_logs",
     "LogContents",
-    "read_link_delays",
     "shift_progress",
     # Writing a log
     "FULL_RATE_HZ",
@@ -60,7 +56,6 @@ __all__ = [
     "SITE_CHANNELS",
     "VIZ_ROOT",
     "ChannelFilter",
-    "active_path",
     # Checking, signing and recovering
     "LAST",
     "MIN_COVERAGE",
@@ -74,7 +69,6 @@ __all__ = [
     "RecoverySurvey",
     "StartGap",
     "check_file",
-    "check_signatures",
     "create_signing_keys",
     "describe_unknown_ends",
     "recover",
@@ -83,8 +77,7 @@ __all__ = [
     "MATRIX_ENTRIES",
     "QUATERNION_AXES",
     "QuaternionSigns",
-    "choose_nearest_vectors",
-    "compute_continuous_vectors",
+    "RotationVectors",
     "expand_poses",
 ]
 
@@ -112,10 +105,9 @@ if TYPE_CHECKING:
         SITE_CHANNELS,
         VIZ_ROOT,
         ChannelFilter,
-        active_path,
     )
-    from .log_reader import Log, open_log, open_logs, read_link_delays
-    from .log_signature import check_signatures, create_signing_keys, sign_log
+    from .log_reader import Log, open_log
+    from .log_signature import create_signing_keys, sign_log
     from .log_writer import (
         LogParts,
         LogStorage,
@@ -124,15 +116,14 @@ if TYPE_CHECKING:
         PutMessage,
         ReceiveMessage,
     )
-    from .mcap_reader import LogContents, McapMessage, McapReader, Progress, shift_progress
+    from .mcap_reader import LogContents, McapReader, Progress, shift_progress
     from .mcap_writer import McapWriter, Sink
     from .message_identity import compute_virtual_boot
     from .orientations import (
         MATRIX_ENTRIES,
         QUATERNION_AXES,
         QuaternionSigns,
-        choose_nearest_vectors,
-        compute_continuous_vectors,
+        RotationVectors,
         expand_poses,
     )
     from .packed.indexed_records import IndexedRecords
@@ -141,7 +132,7 @@ if TYPE_CHECKING:
     from .recovery import Recovery, recover
     from .recovery_survey import RecoverySurvey
     from .running_digest import Integrity
-    from .session_check import LogCheckResult, check_file, judge_integrity
+    from .session_check import LogCheckResult, check_file
     from .session_scenario import SessionScenario
     from .site_log import LazyRecords, RecordsByTick, SiteLog, compute_task_errors
     from .unwritten_log import UnwrittenLog
@@ -156,18 +147,16 @@ else:
             "log_file": "LogFile",
             "log_layout": (
                 "ACTIVE_SUFFIX ALL_CHANNELS CHANNEL_TYPES ChannelFilter EXECUTED_SITES_KEY "
-                "MAX_TIME_NS RERUN_DRIVER SCENARIO SESSION SITE_CHANNELS VIZ_ROOT "
-                "active_path"
+                "MAX_TIME_NS RERUN_DRIVER SCENARIO SESSION SITE_CHANNELS VIZ_ROOT"
             ),
-            "log_reader": "Log open_log open_logs read_link_delays",
-            "log_signature": "check_signatures create_signing_keys sign_log",
+            "log_reader": "Log open_log",
+            "log_signature": "create_signing_keys sign_log",
             "log_writer": "LogParts LogStorage LogWriter MakeViews PutMessage ReceiveMessage",
-            "mcap_reader": "LogContents McapMessage McapReader Progress shift_progress",
+            "mcap_reader": "LogContents McapReader Progress shift_progress",
             "mcap_writer": "McapWriter Sink",
             "message_identity": "compute_virtual_boot",
             "orientations": (
-                "MATRIX_ENTRIES QUATERNION_AXES QuaternionSigns choose_nearest_vectors "
-                "compute_continuous_vectors expand_poses"
+                "MATRIX_ENTRIES QUATERNION_AXES QuaternionSigns RotationVectors expand_poses"
             ),
             "packed.indexed_records": "IndexedRecords",
             "provenance": "collect_provenance",
@@ -175,7 +164,7 @@ else:
             "recovery": "Recovery recover",
             "recovery_survey": "RecoverySurvey",
             "running_digest": "Integrity",
-            "session_check": "LogCheckResult check_file judge_integrity",
+            "session_check": "LogCheckResult check_file",
             "session_scenario": "SessionScenario",
             "site_log": "LazyRecords RecordsByTick SiteLog compute_task_errors",
             "unwritten_log": "UnwrittenLog",

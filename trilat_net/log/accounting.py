@@ -397,6 +397,22 @@ class Account:
             text += f", of {count_nouns(len(starts), 'start')}"
         return text
 
+    @staticmethod
+    def parse_counts(account: str) -> dict[str, int]:
+        """Reads the numbers of received and missing messages from a line of `describe`.
+
+        A finished log stores the counts as such lines, for people and for programs.
+
+        Args:
+            account: The line, as a log stores it for each topic.
+
+        Returns:
+            The numbers, under the keys "received" and "missing". Empty if the text is not such
+            a line.
+        """
+        matches = re.findall(r"(received|missing) (\d{1,15})\b", account)
+        return {name: int(digits) for name, digits in matches}
+
     def format_gaps(self, most: int, base: int = 0) -> list[str]:
         """Formats the first ranges of missing numbers for a message to the user.
 
@@ -535,22 +551,6 @@ def describe_unknown_ends(sites: Sequence[str]) -> str:
     if len(sites) > 1:
         names = f"{', '.join(sites[:-1])} and {sites[-1]}"
     return f"the end of {names} is unknown: later records may be missing"
-
-
-def parse_counts(account: str) -> dict[str, int]:
-    """Reads the numbers of received and missing messages from a line of `Account.describe`.
-
-    A finished log stores the counts as such lines, for people and for programs.
-
-    Args:
-        account: The line, as a log stores it for each topic.
-
-    Returns:
-        The numbers, under the keys "received" and "missing". Empty if the text is not such a
-        line.
-    """
-    matches = re.findall(r"(received|missing) (\d{1,15})\b", account)
-    return {name: int(digits) for name, digits in matches}
 
 
 MIN_COVERAGE = 0.999

@@ -114,27 +114,26 @@ class MessageOrigins(NamedTuple):
                         epochs_ns.add(publish_ns - sent_since_epoch_ns)
         return cls(epochs_ns, boots)
 
+    def are_foreign(self, about: Mapping[str, str]) -> bool:
+        """Determines whether the messages come from another simulated run than a log.
 
-def has_foreign_boots(about: Mapping[str, str], boots: set[tuple[str, int]]) -> bool:
-    """Determines whether messages come from another simulated run than a log.
+        In a simulated run, which has virtual time, each process has a number (boot) that is
+        computed from the scenario, the description of the experiment. The numbers therefore
+        show to which run a message belongs. In a live session, the numbers are random and show
+        nothing.
 
-    In a simulated run, which has virtual time, each process has a number (boot) that is
-    computed from the scenario, the description of the experiment. The numbers therefore show to
-    which run a message belongs. In a live session, the numbers are random and show nothing.
+        Args:
+            about: Metadata of the session in the log.
 
-    Args:
-        about: Metadata of the session in the log.
-        boots: For each sender in the messages, its name and its boot.
-
-    Returns:
-        True if no boot agrees with the scenario of the log. False if a boot agrees, if there
-        are no messages, or if the log is from a live session.
-    """
-    if about.get("driver") != _VIRTUAL_DRIVER:
-        return False
-    digest = about.get("scenario_sha256", "")
-    matches = [boot == compute_virtual_boot(digest, sender) for sender, boot in boots]
-    return bool(boots) and not any(matches)
+        Returns:
+            True if no boot agrees with the scenario of the log. False if a boot agrees, if
+            there are no messages, or if the log is from a live session.
+        """
+        if about.get("driver") != _VIRTUAL_DRIVER:
+            return False
+        digest = about.get("scenario_sha256", "")
+        matches = [boot == compute_virtual_boot(digest, sender) for sender, boot in self.boots]
+        return bool(self.boots) and not any(matches)
 
 
 class ContentCheck:
@@ -365,7 +364,7 @@ class ContentCheck:
         if self._about.get("driver") != _VIRTUAL_DRIVER:
             return
         origins = MessageOrigins.find(data, _CHECKED_MESSAGES)
-        if has_foreign_boots(self._about, origins.boots):
+        if origins.are_foreign(self._about):
             raise UnreadableRecord("a chunk belongs to another run")
 
     def _find_boot(self, member: str) -> int | None:

@@ -36,7 +36,7 @@ from ..files import import_extra
 from ..net import Event, LinkStats, State, json_schema
 from ..records import NS_PER_S
 from ..scenario import TASK_AXES, ArmModel, Scenario
-from .orientations import QUATERNION_AXES, align_signs, compute_quaternions
+from .orientations import QUATERNION_AXES, RotationVectors, align_signs
 from .record_columns import Ints
 from .site_log import SiteLog, TimedMessages
 
@@ -115,6 +115,13 @@ class Column(NamedTuple):
         if self.known is None or self.known.all():
             return self.values
         return np.where(self.known, self.values, np.nan)
+
+    def texts(self) -> NDArray[Any]:
+        """Returns the values of a column of texts as NumPy strings, shape (K,).
+
+        Formats for numbers, such as .npz, store texts in this way.
+        """
+        return np.array(self.values.tolist(), dtype=np.str_)
 
     def rows(self, first: int, last: int) -> list[Any]:
         """Returns some consecutive values of the column as plain Python values, as for CSV.
@@ -211,6 +218,196 @@ class Table:
             else:
                 values[column.name] = column.numbers()
         return import_extra("pandas", "frames", "data frames").DataFrame(values)
+
+    @classmethod
+    def of_states(cls, site: SiteLog, scenario: Scenario) -> "Table":
+        """Creates a table of an arm's angles, torques and other values, a row per tick.
+
+        Args:
+            site: Records (results of control periods) of the site (arm controller).
+            scenario: Scenario of the session, which names the joints and parameters.
+
+        Returns:
+            The table, in the order of the ticks.
+        """
+        docs = read_field_docs(State)
+        arm = scenario.arms[site.name]
+        # The person or program that moves the arm, if there is one.
+        live_operator = scenario.sites[site.name].find_live_hand()
+
+        columns = list(
+            _make_time_columns(site.tick, site.t_s, site.log_time_ns, site.publish_time_ns)
+        )
+        columns.append(
+            Column(
+                name="mode", values=site.mode, unit="", meaning=docs["mode"].text, source="mode"
+            )
+        )
+        columns += _make_vector_columns(site, arm)
+        columns += _make_sent_columns(site)
+        if live_operator is not None:
+            columns += _make_hand_columns(site, arm, live_operator.mode)
+        columns += _make_bodies_columns(site, scenario.bodies_m(site.name))
+        for peer in site.peers:
+            columns += _make_sample_columns(site, peer, scenario.sites[peer].rate_hz)
+
+        # The timing of the control loop.
+        for field in ("late_us", "busy_us", "sent_ns"):
+            unit, text, _ = docs[field]
+            columns.append(
+                Column(
+                    name=field,
+                    values=site.numbers(field),
+                    unit=unit,
+                    meaning=text,
+                    source=field,
+                )
+            )
+        return cls(site.name, "state", f"a tick of {site.name}", tuple(columns))
+
+    @classmethod
+    def of_arrivals(cls, site: SiteLog, source: str, *, live: bool) -> "Table":
+        """Creates a table of the messages that a site received, with their delays.
+
+        A message (sample) is the state that a peer, another site (arm controller), publishes in
+        one tick (control period). The table has one row per message, in the order of arrival.
+
+        Args:
+            site: Records of the receiving site, which list the arrivals.
+            source: Name of the file for error messages.
+            live: True if the session was live. The delays were then measured. In virtual time
+                the delays are the ages of the samples.
+
+        Raises:
+            LogError: A record contains an arrival from a peer that the site does not have.
+        """
+        counts, entries = site.arrivals
+        index = entries[:, 0]
+        if ((index < 0) | (index >= len(site.peers))).any():
+            raise LogError(
+                f"{source}: a record of {site.name} lists a sample from a site that is not a "
+                f"peer of {site.name}"
+            )
+        # Index of the record that contains each arrival.
+        row = np.repeat(np.arange(len(site)), counts)
+        names = np.array(site.peers, dtype=np.object_)[index]
+        delay = "the age of its stamp; in virtual time every sample arrives at the next tick"
+        if live:
+            delay = "its one-way delay, by the offset of the clocks in force"
+        columns = (
+            *_make_time_columns(
+                site.tick[row], site.t_s[row], site.log_time_ns[row], site.publish_time_ns[row]
+            ),
+            Column(
+                name="peer",
+                values=names,
+                unit="",
+                meaning="whose sample came",
+                source="rx[][0]",
+            ),
+            Column(
+                name="sample_tick",
+                values=entries[:, 1].copy(),
+                unit="tick",
+                meaning="its tick, at the peer's rate",
+                source="rx[][1]",
+            ),
+            Column(
+                name="delay_us",
+                values=entries[:, 2].copy(),
+                unit="us",
+                meaning=delay,
+                source="rx[][2]",
+            ),
+        )
+        return cls(
+            site.name,
+            "arrivals",
+            f"a sample that {site.name} took in, by the tick that did",
+            columns,
+        )
+
+    @classmethod
+    def of_link_stats(
+        cls, site: SiteLog, timed: TimedMessages[LinkStats], source: str
+    ) -> "Table":
+        """Creates the table of a site's statistics about its network links, a row per message.
+
+        A field that contains a number per peer (other site) becomes a column per peer.
+
+        Args:
+            site: Records of the site (arm controller).
+            timed: The statistics messages, with their times of arrival and sending.
+            source: Name of the file for error messages.
+
+        Returns:
+            The table, in the order of the ticks (control periods).
+
+        Raises:
+            LogError: A number is out of range.
+        """
+        stats = timed.messages
+        tick = _to_int_array((s.tick for s in stats), source, "tick")
+        t_s = _to_int_array((s.t_ns for s in stats), source, "t_ns") / NS_PER_S
+        columns = list(_make_time_columns(tick, t_s, timed.log_ns, timed.publish_ns))
+        for field, (unit, text, kind) in read_field_docs(LinkStats).items():
+            if field in ("v", "site", "boot", "tick", "t_ns"):
+                continue  # the same in every row, or already a column
+            fields = [getattr(s, field) for s in stats]
+            if kind == "object":
+                keys: Iterable[str] = site.peers
+                if field == "dropped":  # counts by reason instead of by peer
+                    keys = _list_reasons(fields)
+                columns += [_make_entry_column(source, field, key, fields) for key in keys]
+                continue
+
+            values: NDArray[Any]
+            if kind == "integer":
+                values = _to_int_array(fields, source, field)
+            else:
+                values = np.array(fields, dtype=np.object_)
+            columns.append(
+                Column(name=field, values=values, unit=unit, meaning=text, source=field)
+            )
+        about = f"statistics of {site.name}'s loop and links, ten times a second"
+        return cls(site.name, "link", about, tuple(columns))
+
+    @classmethod
+    def of_events(cls, timed: TimedMessages[Event], source: str) -> "Table":
+        """Creates a table of the events of a session, with one row per event.
+
+        An event is a message about something that happened once, for example that a site (arm
+        controller) has joined. The rows have the order in which the events arrived at the
+        recorder.
+
+        Args:
+            timed: The events, with their times of sending and of arrival.
+            source: Name of the file for error messages.
+
+        Raises:
+            LogError: An integer of an event is too large for 64 bits.
+        """
+        events = timed.messages
+        t_ns = _to_int_array((event.t_ns for event in events), source, "t_ns")
+        # Events before the start of the session have the time -1.
+        t_s = np.where(t_ns >= 0, t_ns / NS_PER_S, np.nan)
+        columns = list(_make_time_columns(None, t_s, timed.log_ns, timed.publish_ns))
+        for field, (unit, text, kind) in read_field_docs(Event).items():
+            if field in ("v", "t_ns"):
+                continue
+            entries = [getattr(event, field) for event in events]
+            values: NDArray[Any]
+            if kind == "integer":
+                # The boot, which identifies a start of a process, is a random 64-bit number.
+                data_type = np.uint64 if field == "boot" else np.int64
+                values = _to_int_array(entries, source, field, data_type)
+            else:
+                texts = [_to_text(entry) for entry in entries]
+                values = np.array(texts, dtype=np.object_)
+            columns.append(
+                Column(name=field, values=values, unit=unit, meaning=text, source=field)
+            )
+        return cls(EVENTS_TABLE, "", "something that happened once", tuple(columns))
 
 
 # An entry of the section "Attributes:" in a docstring: name of the field and its meaning.
@@ -436,7 +633,8 @@ def _make_orientation_columns(site: SiteLog, field: str, text: str) -> Iterator[
         field: Name of the vector that contains the poses.
         text: Meaning of the vector.
     """
-    quaternions = compute_quaternions(getattr(site, field)[:, POSITION:])
+    orientations = RotationVectors(getattr(site, field)[:, POSITION:])
+    quaternions = orientations.as_quaternions()
     for name, values in zip(QUATERNION_AXES, quaternions.T, strict=True):
         meaning = f"{text}, {name[1]} of its orientation as {_STEADY_QUATERNION}"
         yield Column(
@@ -598,46 +796,6 @@ def _make_bodies_columns(site: SiteLog, bodies: Iterable[str]) -> Iterator[Colum
             )
 
 
-def build_state_table(site: SiteLog, scenario: Scenario) -> Table:
-    """Builds a table of an arm's angles, torques and other values, one row per control period.
-
-    Args:
-        site: Records (results of control periods) of the site (arm controller).
-        scenario: Scenario of the session, which names the joints and parameters.
-
-    Returns:
-        The table, in the order of the ticks.
-    """
-    docs = read_field_docs(State)
-    arm = scenario.arms[site.name]
-    # The person or program that moves the arm, if there is one.
-    live_operator = scenario.sites[site.name].find_live_hand()
-
-    columns = list(
-        _make_time_columns(site.tick, site.t_s, site.log_time_ns, site.publish_time_ns)
-    )
-    columns.append(
-        Column(name="mode", values=site.mode, unit="", meaning=docs["mode"].text, source="mode")
-    )
-    columns += _make_vector_columns(site, arm)
-    columns += _make_sent_columns(site)
-    if live_operator is not None:
-        columns += _make_hand_columns(site, arm, live_operator.mode)
-    columns += _make_bodies_columns(site, scenario.bodies_m(site.name))
-    for peer in site.peers:
-        columns += _make_sample_columns(site, peer, scenario.sites[peer].rate_hz)
-
-    # The timing of the control loop.
-    for field in ("late_us", "busy_us", "sent_ns"):
-        unit, text, _ = docs[field]
-        columns.append(
-            Column(
-                name=field, values=site.numbers(field), unit=unit, meaning=text, source=field
-            )
-        )
-    return Table(site.name, "state", f"a tick of {site.name}", tuple(columns))
-
-
 def _make_sample_columns(site: SiteLog, peer: str, rate_hz: int) -> Iterator[Column]:
     """Yields the columns that state which sample of a peer the control law used, and its age.
 
@@ -670,105 +828,6 @@ def _make_sample_columns(site: SiteLog, peer: str, rate_hz: int) -> Iterator[Col
         source=f"t_ns, {source}",
         known=known,
     )
-
-
-def build_arrivals_table(site: SiteLog, source: str, *, live: bool) -> Table:
-    """Builds a table of the messages that a site received, with their delays.
-
-    A message (sample) is the state that a peer, another site (arm controller), publishes in one
-    tick (control period). The table has one row per message, in the order of arrival.
-
-    Args:
-        site: Records of the receiving site, which list the arrivals.
-        source: Name of the file for error messages.
-        live: True if the session was live. The delays were then measured. In virtual time the
-            delays are the ages of the samples.
-
-    Raises:
-        LogError: A record contains an arrival from a peer that the site does not have.
-    """
-    counts, entries = site.arrivals
-    index = entries[:, 0]
-    if ((index < 0) | (index >= len(site.peers))).any():
-        raise LogError(
-            f"{source}: a record of {site.name} lists a sample from a site that is not a peer "
-            f"of {site.name}"
-        )
-    # Index of the record that contains each arrival.
-    row = np.repeat(np.arange(len(site)), counts)
-    names = np.array(site.peers, dtype=np.object_)[index]
-    delay = "the age of its stamp; in virtual time every sample arrives at the next tick"
-    if live:
-        delay = "its one-way delay, by the offset of the clocks in force"
-    columns = (
-        *_make_time_columns(
-            site.tick[row], site.t_s[row], site.log_time_ns[row], site.publish_time_ns[row]
-        ),
-        Column(
-            name="peer", values=names, unit="", meaning="whose sample came", source="rx[][0]"
-        ),
-        Column(
-            name="sample_tick",
-            values=entries[:, 1].copy(),
-            unit="tick",
-            meaning="its tick, at the peer's rate",
-            source="rx[][1]",
-        ),
-        Column(
-            name="delay_us",
-            values=entries[:, 2].copy(),
-            unit="us",
-            meaning=delay,
-            source="rx[][2]",
-        ),
-    )
-    return Table(
-        site.name,
-        "arrivals",
-        f"a sample that {site.name} took in, by the tick that did",
-        columns,
-    )
-
-
-def build_link_table(site: SiteLog, timed: TimedMessages[LinkStats], source: str) -> Table:
-    """Builds the table of a site's statistics about its network links, one row per message.
-
-    A field that contains a number per peer (other site) becomes a column per peer.
-
-    Args:
-        site: Records of the site (arm controller).
-        timed: The statistics messages, with their times of arrival and sending.
-        source: Name of the file for error messages.
-
-    Returns:
-        The table, in the order of the ticks (control periods).
-
-    Raises:
-        LogError: A number is out of range.
-    """
-    stats = timed.messages
-    tick = _to_int_array((s.tick for s in stats), source, "tick")
-    t_s = _to_int_array((s.t_ns for s in stats), source, "t_ns") / NS_PER_S
-    columns = list(_make_time_columns(tick, t_s, timed.log_ns, timed.publish_ns))
-    for field, (unit, text, kind) in read_field_docs(LinkStats).items():
-        if field in ("v", "site", "boot", "tick", "t_ns"):
-            continue  # the same in every row, or already a column
-        fields = [getattr(s, field) for s in stats]
-        if kind == "object":
-            keys: Iterable[str] = site.peers
-            if field == "dropped":  # counts by reason instead of by peer
-                keys = _list_reasons(fields)
-            columns += [_make_entry_column(source, field, key, fields) for key in keys]
-            continue
-
-        values: NDArray[Any]
-        if kind == "integer":
-            values = _to_int_array(fields, source, field)
-        else:
-            values = np.array(fields, dtype=np.object_)
-        columns.append(Column(name=field, values=values, unit=unit, meaning=text, source=field))
-    about = f"statistics of {site.name}'s loop and links, ten times a second"
-    return Table(site.name, "link", about, tuple(columns))
 
 
 def _list_reasons(dropped: Iterable[Mapping[str, int]]) -> list[str]:
@@ -833,40 +892,6 @@ def _make_entry_column(
         source=f"{field}.{name}",
         known=None if known.all() else known,
     )
-
-
-def build_events_table(timed: TimedMessages[Event], source: str) -> Table:
-    """Builds a table of the events of a session, with one row per event.
-
-    An event is a message about something that happened once, for example that a site (arm
-    controller) has joined. The rows have the order in which the events arrived at the recorder.
-
-    Args:
-        timed: The events, with their times of sending and of arrival.
-        source: Name of the file for error messages.
-
-    Raises:
-        LogError: An integer of an event is too large for 64 bits.
-    """
-    events = timed.messages
-    t_ns = _to_int_array((event.t_ns for event in events), source, "t_ns")
-    # Events before the start of the session have the time -1.
-    t_s = np.where(t_ns >= 0, t_ns / NS_PER_S, np.nan)
-    columns = list(_make_time_columns(None, t_s, timed.log_ns, timed.publish_ns))
-    for field, (unit, text, kind) in read_field_docs(Event).items():
-        if field in ("v", "t_ns"):
-            continue
-        entries = [getattr(event, field) for event in events]
-        values: NDArray[Any]
-        if kind == "integer":
-            # The boot, which identifies a start of a process, is a random number of 64 bits.
-            data_type = np.uint64 if field == "boot" else np.int64
-            values = _to_int_array(entries, source, field, data_type)
-        else:
-            texts = [_to_text(entry) for entry in entries]
-            values = np.array(texts, dtype=np.object_)
-        columns.append(Column(name=field, values=values, unit=unit, meaning=text, source=field))
-    return Table(EVENTS_TABLE, "", "something that happened once", tuple(columns))
 
 
 def _to_text(value: str | Mapping[str, Any]) -> str:

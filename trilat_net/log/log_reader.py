@@ -8,8 +8,8 @@ its joint angles, a row per period. A run may have several files, because a reco
 its log, and because several recorders can record parts of one session. These files are read as
 one log.
 
-`read_link_delays` extracts the measured network delays between two arms, so that a scenario
-with `model = "trace"` can reproduce them.
+`Log.link_delays` has the measured network delays between two arms, so that a scenario with
+`model = "trace"` can reproduce them.
 
 Invariant:
     - Files of every released schema version can be opened. A file that is cut off is read up to
@@ -23,19 +23,15 @@ Invariant:
 """
 
 import hashlib
-import math
-import os
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager
 from functools import cached_property, lru_cache
-from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO, TypeVar
 
 import numpy as np
 
-from ..core import MAX_DELAY_US, CoreChange
+from ..core import CoreChange
 from ..errors import (
     LogError,
     ScenarioError,
@@ -45,14 +41,13 @@ from ..errors import (
     count_nouns,
     suggest_nearest,
 )
-from ..files import describe_missing_library, open_regular
+from ..files import describe_missing_library
 from ..hooks import find_hook
 from ..net import (
     READABLE,
     Event,
     LinkStats,
     RecorderStats,
-    State,
     count_under_way,
     decode,
     topics,
@@ -68,27 +63,19 @@ from ..scenario import (
     parse_core_change,
     parse_embedded,
 )
-from .accounting import LAST, describe_unknown_ends
-from .data_tables import (
-    EVENTS_TABLE,
-    SITE_TABLE_KINDS,
-    Table,
-    build_arrivals_table,
-    build_events_table,
-    build_link_table,
-    build_state_table,
-)
+from .accounting import LAST, Account, describe_unknown_ends
+from .data_tables import EVENTS_TABLE, SITE_TABLE_KINDS, Table
 from .log_layout import (
     ACCOUNTS,
     EXECUTED_SITES_KEY,
     PART,
     RERUN_DRIVER,
     ChannelFilter,
-    describe_unfinished,
 )
-from .mcap_reader import ChannelMessages, LogContents, Progress, shift_progress
-from .merge import identify_session, merge_parts
+from .mcap_reader import ChannelMessages, LogContents, Progress
+from .merge import read_session, read_sessions
 from .record_columns import Ints
+from .running_digest import DigestState, Integrity
 from .session_accounts import SessionAccounts
 from .site_log import SiteLog, TimedMessages
 
@@ -157,6 +144,34 @@ class Log(Result, Mapping[str, SiteLog]):
         self.events: list[Event] = []
         for topic in self._event_topics():
             self.events += self._read_events(topic)
+
+    @classmethod
+    def open_sessions(
+        cls, *sources: str | Path, progress: Progress | None = None
+    ) -> list["Log"]:
+        """Opens all logs in the given files and folders, see `open_log`.
+
+        Args:
+            sources: Paths of logs, or of folders that contain logs.
+            progress: Function that is called repeatedly with the number of bytes read and their
+                total over all files.
+
+        Returns:
+            A log per session. Files of the same session are read as one log.
+
+        Raises:
+            LogError: A folder contains no log, or a file cannot be read.
+        """
+        files: list[Path] = []
+        for path in map(Path, sources):
+            if not path.is_dir():
+                files.append(path)
+                continue
+            logs = sorted(path.glob("*.mcap"))
+            if not logs:
+                raise LogError(f"{path}: this directory contains no log")
+            files += logs
+        return [cls(contents) for contents in read_sessions(files, progress)]
 
     def headline(self) -> str:
         """Summarises the session in one line for the user.
@@ -460,6 +475,81 @@ class Log(Result, Mapping[str, SiteLog]):
         )
         return self._contents.ended and has_all_records
 
+    def judge_integrity(self) -> Integrity:
+        """Determines whether the log was changed after it was recorded.
+
+        The contents are compared with the digests, the checksums that the log contains. In
+        addition, the records (results of control periods) are compared with the message counts
+        and the statistics of the recorder. This also reveals changes to a log that was
+        rewritten with new digests.
+
+        Returns:
+            The result, with an explanation.
+
+        Raises:
+            LogError: A message cannot be decoded.
+        """
+        if self.chain.passed:
+            for site in self.sites:
+                change = self._describe_unexplained_gap(site)
+                if change:
+                    return Integrity(DigestState.CHANGED, change)
+        return self.chain
+
+    def _describe_unexplained_gap(self, site: str) -> str:
+        """Describes missing or additional records of a site that the log does not explain.
+
+        The recorder states how many records it received and missed, in the account of the site
+        at the end of the file and in its statistics during the recording. Other gaps show that
+        records were removed, or that two logs were joined. There are two tests:
+
+        1. The account must agree with the records. This is not tested if there is no account
+           (the file was not finished), if the file is only a part of a log (the account
+           includes other parts), or if the log consists of several files (see below).
+        2. The ticks must be consecutive, except for ticks that the site did not execute, and
+           for the number of records that the recorder states as missing. This is not tested if
+           the digests, checksums of all messages, show that nothing was changed.
+
+        Args:
+            site: Name of the site.
+
+        Returns:
+            The description. Empty if the records agree with the statements of the recorder, or
+            if a part of the file cannot be read, because records may be missing then.
+        """
+        if self.damaged:
+            return ""
+        ticks = self[site].tick  # in ascending order
+        records = 1 + int(np.count_nonzero(np.diff(ticks))) if len(ticks) else 0
+        # The counts of several files were computed from their records, and prove nothing.
+        has_one_file = len(self.sources) == 1
+        stated = Account.parse_counts(self.account(site)) if has_one_file else {}
+        counted = {"received": records, "missing": self.missing(site)}
+        has_account = stated != {}
+        if not self.part and has_account and stated != counted:
+            stated_text = " and ".join(f"{stated.get(name, 0)} {name}" for name in counted)
+            counted_text = " and ".join(f"{count} {name}" for name, count in counted.items())
+            return (
+                f"records of {site} were removed or added: the account of {site} states "
+                f"{stated_text}, but the file has {counted_text}"
+            )
+
+        # Number of ticks without a record between the first and the last record.
+        ticks_without_record = int(ticks[-1] - ticks[0]) + 1 - records if records else 0
+        not_executed = min(ticks_without_record, self.absent_ticks(site))
+        missing = ticks_without_record - not_executed
+        if not missing or self.chain.state is DigestState.INTACT:
+            return ""
+        missing_in_account = stated.get("missing", 0)
+        missing_in_statistics = [
+            stats.missing.get(f"{site}/state", 0) for stats in self.recorder_stats()
+        ]
+        largest_stated = max([missing_in_account, *missing_in_statistics])
+        if missing <= largest_stated:
+            return ""
+        missing_text = count_nouns(missing, f"record of {site} is", f"records of {site} are")
+        return f"{missing_text} missing in between, and nothing in the log explains it"
+
     @property
     def executed_sites(self) -> tuple[str, ...]:
         """Names of the sites whose records can be computed again from this file.
@@ -538,6 +628,32 @@ class Log(Result, Mapping[str, SiteLog]):
             The counts as a line of text, see `accounts`. Empty if the file was not finished.
         """
         return self.accounts.get(self._topic(site, topics.STATE), "")
+
+    def count_messages(self, topic: str, sequence: Sequence[int]) -> Account | None:
+        """Counts the received and the missing messages of a channel.
+
+        Ticks (control periods) that the site did not execute are not missing.
+
+        Args:
+            topic: Topic of the channel.
+            sequence: Tick of every message, in the order of the file.
+
+        Returns:
+            The account of the channel. None for a channel without consecutive numbers: only the
+            records and the link statistics of a site have them.
+        """
+        key = topics.parse_key(topic.removeprefix("/"))
+        if (
+            key is None
+            or key.session != self.session["session"]
+            or key.member not in self.sites
+        ):
+            return None
+        if key.channel not in (topics.STATE, topics.LINK):
+            return None
+        rate_hz = self.scenario.sites[key.member].rate_hz
+        absences = self.find_unexecuted_ticks(key.member)
+        return Account.of_ticks(key.channel, sequence, rate_hz, absences)
 
     @cached_property
     def unknown_ends(self) -> tuple[str, ...]:
@@ -865,6 +981,24 @@ class Log(Result, Mapping[str, SiteLog]):
             shown_ticks[peer] = np.minimum(peer_ticks[site_log.tick], self[peer].last_tick)
         return shown_ticks
 
+    def sample_ages_ns(self, peer: str, site: str) -> Ints:
+        """Computes the age of the other arm's state that a control loop used, in every tick.
+
+        A state is older than the network delay if the next message is late or lost.
+
+        Args:
+            peer: Name of the site that sent the states.
+            site: Name of the site that used them.
+
+        Returns:
+            The ages, in ns. Ticks before the first state came into use are left out.
+        """
+        site_log = self[site]
+        used = site_log.used[peer]
+        has_sample = used >= 0
+        stamp_ns = used[has_sample] * NS_PER_S // self.scenario.sites[peer].rate_hz
+        return site_log.tick[has_sample] * NS_PER_S // site_log.rate_hz - stamp_ns
+
     def link_stats(self, site: str) -> list[LinkStats]:
         """Returns the statistics that a site published about its network links, such as losses.
 
@@ -917,6 +1051,27 @@ class Log(Result, Mapping[str, SiteLog]):
         ordered_events = [events[n] for n in order.tolist()]
         return TimedMessages(ordered_events, log_ns[order], publish_ns[order])
 
+    @cached_property
+    def link_delays(self) -> dict[str, list[TracePoint]]:
+        """Measured delays of the samples of each link, by the name of the link ("m1->s").
+
+        A delay is a pair (stamp in s, delay in ms), in the order of the stamps. The stamp of a
+        sample is the nominal time of the tick (control period) in which the sender computed it.
+        The receiver stores the network delay of each sample in the field `rx` of its records
+        (results of control periods). Delays that the scenario injected are not included. A
+        negative delay is an error of the clocks and counts as 0. If a sample arrived twice, the
+        shorter delay counts. A sample counts as sent if the sender has a record of its tick. A
+        lost sample has an infinite delay. The list is empty if no sample arrived over the link.
+        """
+        delays = {}
+        for site in self.sites:
+            for peer in self.scenario.peers(site):
+                sent_ticks = self[peer].tick.tolist() if peer in self.sites else []
+                rate_hz = self.scenario.sites[peer].rate_hz
+                samples = self[site].iterate_delays(peer, rate_hz, sent_ticks)
+                delays[f"{peer}->{site}"] = list(samples)
+        return delays
+
     def recorder_stats(self) -> list[RecorderStats]:
         """Decodes the statistics that the recorder published about itself while it recorded.
 
@@ -941,15 +1096,15 @@ class Log(Result, Mapping[str, SiteLog]):
             LogError: The messages cannot be read.
         """
         if name == EVENTS_TABLE and name not in self.sites:
-            return build_events_table(self.timed_events(), self.source)
+            return Table.of_events(self.timed_events(), self.source)
         site = self[name]
         match kind:
             case "" | "state":
-                return build_state_table(site, self.scenario)
+                return Table.of_states(site, self.scenario)
             case "link":
-                return build_link_table(site, self.timed_link_stats(name), self.source)
+                return Table.of_link_stats(site, self.timed_link_stats(name), self.source)
             case "arrivals":
-                return build_arrivals_table(site, self.source, live=self.driver == "live")
+                return Table.of_arrivals(site, self.source, live=self.driver == "live")
         raise UnknownName(
             f"{name} has no table {kind!r}; the tables of a site are "
             f"{', '.join(SITE_TABLE_KINDS)}"
@@ -964,7 +1119,7 @@ class Log(Result, Mapping[str, SiteLog]):
         for site in self.sites:
             for kind in SITE_TABLE_KINDS:
                 yield self.table(site, kind)
-        yield build_events_table(self.timed_events(), self.source)
+        yield Table.of_events(self.timed_events(), self.source)
 
     def frame(self, name: str, kind: str = "") -> "polars.DataFrame":
         """Returns a table of the log as a polars data frame.
@@ -1013,110 +1168,13 @@ def open_log(
             raised if the files belong to different sessions or contain different versions of a
             message.
     """
-    log = Log(merge_parts(_read_parts((source, *more), progress)))
+    log = Log(read_session((source, *more), progress))
     allow_logged_code(log.scenario, law, other_version=other_version, remember=remember)
     return log
 
 
-def open_logs(*sources: str | Path, progress: Progress | None = None) -> list[Log]:
-    """Opens all logs in the given files and folders, see `open_log`.
-
-    Args:
-        sources: Paths of logs, or of folders that contain logs.
-        progress: Function that is called repeatedly with the number of bytes read and their
-            total over all files.
-
-    Returns:
-        A log per session. Files of the same session are read as one log.
-
-    Raises:
-        LogError: A folder contains no log, or a file cannot be read.
-    """
-    files: list[Path] = []
-    for path in map(Path, sources):
-        if not path.is_dir():
-            files.append(path)
-            continue
-        logs = sorted(path.glob("*.mcap"))
-        if not logs:
-            raise LogError(f"{path}: this directory contains no log")
-        files += logs
-    sessions: dict[str, list[LogContents]] = {}
-    for part in _read_parts(files, progress):
-        sessions.setdefault(str(identify_session(part)), []).append(part)
-    return [Log(merge_parts(parts)) for parts in sessions.values()]
-
-
-def _read_parts(
-    sources: Sequence[str | Path | BinaryIO], progress: Progress | None
-) -> list[LogContents]:
-    """Reads the contents of files, and reports the progress over all files together.
-
-    All files are opened before the first one is read, so that a missing file is reported at
-    once.
-    """
-    parts: list[LogContents] = []
-    with ExitStack() as stack:
-        files = [_open_source(source, stack) for source in sources]
-        sizes = [_measure_size(stream) for stream, _ in files]
-        bytes_before = 0
-        for (stream, name), size in zip(files, sizes, strict=True):
-            with _convert_errors(name):
-                shifted = shift_progress(progress, bytes_before, sum(sizes))
-                parts.append(LogContents.read(stream, name, shifted))
-            bytes_before += size
-    return parts
-
-
-def _open_source(source: str | Path | BinaryIO, stack: ExitStack) -> tuple[BinaryIO, str]:
-    """Opens one file of a log. A file that the caller has opened already is used as it is.
-
-    Args:
-        source: Path, or binary file opened for reading.
-        stack: Context that closes the files that are opened here.
-
-    Returns:
-        The open file, and its name for error messages.
-    """
-    if isinstance(source, str | Path):
-        with _convert_errors(str(source)):
-            stream = stack.enter_context(open_regular(Path(source)))
-        return stream, str(source)
-    if hasattr(source, "seek"):
-        return source, "log"
-    raise LogError(
-        f"a log must be given as a path or as a file opened for reading, not {source!r:.80}"
-    )
-
-
-@contextmanager
-def _convert_errors(name: str) -> Iterator[None]:
-    """Converts an error of the operating system to a `LogError` that names the file."""
-    try:
-        yield
-    except OSError as error:
-        raise LogError(
-            f"{name} cannot be read: {error.strerror}{describe_unfinished(Path(name))}"
-        ) from None
-
-
-def _measure_size(stream: BinaryIO) -> int:
-    """Returns the number of bytes from the present position to the end of a stream."""
-    position = stream.tell()
-    end = stream.seek(0, os.SEEK_END)
-    stream.seek(position)
-    return end - position
-
-
 def read_link_delays(path: Path, link: str) -> list[TracePoint]:
-    """Returns the measured delays of the samples of a link, in the order of their stamps.
-
-    The stamp of a sample is the nominal time of the tick (control period) in which the sender
-    computed it. The receiver stores the network delay of each sample in the field `rx` of its
-    records (results of control periods). Delays that the scenario injected are not included. A
-    negative delay is an error of the clocks and counts as 0. If a sample arrived twice, the
-    shorter delay counts. A sample counts as sent if the sender has a record of its tick. A lost
-    sample has an infinite delay.
+    """Returns the measured delays of the samples of a link of a log, see `Log.link_delays`.
 
     Args:
         path: The log.
@@ -1147,85 +1205,7 @@ def _read_links(path: Path, modified_ns: int, size: int) -> dict[str, list[Trace
     after another. `modified_ns` and `size` are not used here, but are part of the key of the
     cache. If the file is written again, they change, and the file is read again.
     """
-    delays = {}
     try:
-        log = open_log(path)
-        for site in log.sites:
-            for index, peer in enumerate(log.scenario.peers(site)):
-                delays[f"{peer}->{site}"] = list(_iterate_delays(log, site, index, peer))
+        return open_log(path).link_delays
     except LogError as error:
         raise ValueError(str(error).removeprefix(f"{path}: ")) from None
-    return delays
-
-
-def _iterate_delays(log: Log, site: str, index: int, peer: str) -> Iterator[TracePoint]:
-    """Yields the stamp and the delay of every sample of a link, in the order of the stamps.
-
-    A sample that was sent but did not arrive has an infinite delay. It is left out if it may
-    have arrived in a tick whose record is missing.
-
-    Args:
-        log: The log.
-        site: Name of the receiver.
-        index: Index of the sender among the receiver's peers.
-        peer: Name of the sender.
-
-    Yields:
-        The stamp in s after the start of the session, and the delay in ms.
-    """
-    states = log[site].states
-    delays_us: dict[int, int] = {}
-    for state in states:
-        for sender, tick, delay_us in state.rx:
-            if sender == index and tick >= 0:
-                earlier_us = delays_us.get(tick, MAX_DELAY_US)
-                delays_us[tick] = min(earlier_us, max(delay_us, 0))
-    if not delays_us:
-        return
-
-    longest_ns = 1000 * max(delays_us.values())
-    gaps = _find_gaps_ns(states)
-    rate_hz = log.scenario.sites[peer].rate_hz
-    sent = log[peer].tick.tolist() if peer in log.sites else []
-    # Samples that were sent before the first or after the last arrival were lost as well.
-    # Without records of the sender, samples of all ticks up to the last arrival count as sent.
-    ticks = {*sent, *delays_us} if sent else range(max(delays_us) + 1)
-    for tick in sorted(ticks):
-        stamp_ns = tick * NS_PER_S // rate_hz
-        # The simulation kernel counts in whole microseconds.
-        stamp_s = stamp_ns // 1000 / 1e6
-        if tick in delays_us:
-            yield stamp_s, delays_us[tick] / 1e3
-            continue
-
-        latest_arrival_ns = stamp_ns + longest_ns
-        may_have_arrived_unseen = any(
-            stamp_ns <= gap_end and latest_arrival_ns >= gap_start
-            for gap_start, gap_end in gaps
-        )
-        if not may_have_arrived_unseen:
-            yield stamp_s, math.inf
-
-
-def _find_gaps_ns(states: Sequence[State]) -> list[tuple[int, float]]:
-    """Returns the intervals in which a sample may have arrived although no record shows it.
-
-    Records (results of control periods) are missing before the first record, between records
-    whose ticks (control periods) are not consecutive, and after the last record.
-
-    Args:
-        states: Records of the receiver, in the order of their ticks.
-
-    Returns:
-        The intervals (start, end) in ns after the start of the session.
-    """
-    if not states:
-        return [(0, math.inf)]
-    gaps: list[tuple[int, float]] = []
-    for record, next_record in pairwise(states):
-        if next_record.tick != record.tick + 1:
-            gaps.append((record.t_ns, next_record.t_ns))
-    if states[0].tick > 0:
-        gaps.append((0, states[0].t_ns))
-    gaps.append((states[-1].t_ns, math.inf))
-    return gaps

@@ -1037,32 +1037,35 @@ class LogContents:
             chain=reader.judge_digest(),
         )
 
+    @staticmethod
+    def check(stream: BinaryIO, name: str) -> None:
+        """Reads a log once without storing its messages, to find out whether it can be opened.
+
+        A log of any length can be checked with little memory.
+
+        Args:
+            stream: The file, opened for reading.
+            name: Name of the file for error messages.
+
+        Raises:
+            LogError: The file cannot be opened as a log. The text states the reason.
+        """
+        reader = McapReader(stream, name)
+        # Reads all messages, but stores no message.
+        deque(reader.blocks(_is_log_topic), maxlen=0)
+        _check_head(reader, name)
+        try:
+            parse_embedded(reader.attachments[SCENARIO].decode(), f"{name}: scenario")
+        except (ScenarioError, UnicodeDecodeError) as error:
+            raise LogError(
+                f"{name}: the scenario in this log cannot be read: {error}"
+            ) from None
+
 
 def _is_log_topic(topic: str) -> bool:
     """True if the messages of a topic belong to a log of this program."""
     key = topics.parse_key(topic.removeprefix("/"))
     return key is not None and key.channel in CHANNEL_TYPES
-
-
-def check_log(stream: BinaryIO, name: str) -> None:
-    """Reads a log once without storing its messages, to find out whether it can be opened.
-
-    A log of any length can be checked with little memory.
-
-    Args:
-        stream: The file, opened for reading.
-        name: Name of the file for error messages.
-
-    Raises:
-        LogError: The file cannot be opened as a log. The text states the reason.
-    """
-    reader = McapReader(stream, name)
-    deque(reader.blocks(_is_log_topic), maxlen=0)  # reads all messages, but stores no message
-    _check_head(reader, name)
-    try:
-        parse_embedded(reader.attachments[SCENARIO].decode(), f"{name}: scenario")
-    except (ScenarioError, UnicodeDecodeError) as error:
-        raise LogError(f"{name}: the scenario in this log cannot be read: {error}") from None
 
 
 def _check_head(reader: McapReader, name: str) -> None:

@@ -1,4 +1,4 @@
-"""Merges the parts of a session's log into one log.
+"""Reads the files of a session's log, and merges them into one log.
 
 A log contains the messages of a session, a joint run of several arms. It has several files, the
 parts, if the recorder split it, or if several recorders recorded the session one after another
@@ -12,21 +12,126 @@ Invariant:
 """
 
 import hashlib
+import os
 from bisect import bisect_right
 from collections import Counter
-from collections.abc import Hashable, Sequence
-from contextlib import suppress
-from typing import Any
+from collections.abc import Hashable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager, suppress
+from pathlib import Path
+from typing import Any, BinaryIO
 
 from ..errors import LogError, WireError
+from ..files import open_regular
 from ..net import READABLE, Event, LinkStats, RecorderStats, decode, topics
-from .log_layout import ACCOUNTS, PART
-from .mcap_reader import ChannelMessages, LogContents
-from .record_columns import decode_ticks
+from .log_layout import ACCOUNTS, PART, describe_unfinished
+from .mcap_reader import ChannelMessages, LogContents, Progress, shift_progress
+from .record_columns import RecordColumns
 from .running_digest import DIGESTS, PREVIOUS_DIGEST_KEY, DigestState
 
 
-def merge_parts(parts: Sequence[LogContents]) -> LogContents:
+def read_session(
+    sources: Sequence[str | Path | BinaryIO], progress: Progress | None
+) -> LogContents:
+    """Reads the log of one session from a file, or from the files of all its parts.
+
+    Args:
+        sources: Paths, or binary files opened for reading, in any order.
+        progress: Function that is called repeatedly with the number of bytes read and their
+            total over all files.
+
+    Returns:
+        The contents of all files, as if they were one file.
+
+    Raises:
+        LogError: A file cannot be read, or the files belong to different sessions or contain
+            different versions of a message.
+    """
+    return _merge_parts(_read_parts(sources, progress))
+
+
+def read_sessions(files: Sequence[Path], progress: Progress | None) -> list[LogContents]:
+    """Reads the logs of one or several sessions.
+
+    Args:
+        files: The files, in any order.
+        progress: Function that is called repeatedly with the number of bytes read and their
+            total over all files.
+
+    Returns:
+        The contents of each session. Files of the same session are merged.
+
+    Raises:
+        LogError: A file cannot be read, or files of a session contain different versions of a
+            message.
+    """
+    sessions: dict[str, list[LogContents]] = {}
+    for part in _read_parts(files, progress):
+        sessions.setdefault(str(_identify_session(part)), []).append(part)
+    return list(map(_merge_parts, sessions.values()))
+
+
+def _read_parts(
+    sources: Sequence[str | Path | BinaryIO], progress: Progress | None
+) -> list[LogContents]:
+    """Reads the contents of files, and reports the progress over all files together.
+
+    All files are opened before the first one is read, so that a missing file is reported at
+    once.
+    """
+    parts: list[LogContents] = []
+    with ExitStack() as stack:
+        files = [_open_source(source, stack) for source in sources]
+        sizes = [_measure_size(stream) for stream, _ in files]
+        bytes_before = 0
+        for (stream, name), size in zip(files, sizes, strict=True):
+            with _convert_errors(name):
+                shifted = shift_progress(progress, bytes_before, sum(sizes))
+                parts.append(LogContents.read(stream, name, shifted))
+            bytes_before += size
+    return parts
+
+
+def _open_source(source: str | Path | BinaryIO, stack: ExitStack) -> tuple[BinaryIO, str]:
+    """Opens one file of a log. A file that the caller has opened already is used as it is.
+
+    Args:
+        source: Path, or binary file opened for reading.
+        stack: Context that closes the files that are opened here.
+
+    Returns:
+        The open file, and its name for error messages.
+    """
+    if isinstance(source, str | Path):
+        with _convert_errors(str(source)):
+            stream = stack.enter_context(open_regular(Path(source)))
+        return stream, str(source)
+    if hasattr(source, "seek"):
+        return source, "log"
+    raise LogError(
+        f"a log must be given as a path or as a file opened for reading, not {source!r:.80}"
+    )
+
+
+@contextmanager
+def _convert_errors(name: str) -> Iterator[None]:
+    """Converts an error of the operating system to a `LogError` that names the file."""
+    try:
+        yield
+    except OSError as error:
+        raise LogError(
+            f"{name} cannot be read: {error.strerror}{describe_unfinished(Path(name))}"
+        ) from None
+
+
+def _measure_size(stream: BinaryIO) -> int:
+    """Returns the number of bytes from the present position to the end of a stream."""
+    position = stream.tell()
+    end = stream.seek(0, os.SEEK_END)
+    stream.seek(position)
+    return end - position
+
+
+def _merge_parts(parts: Sequence[LogContents]) -> LogContents:
     """Joins the contents of several files into which the log of a session was divided.
 
     The recorder states at the end of each file how many messages it received. The counts of a
@@ -79,8 +184,8 @@ def _check_same_session(first: LogContents, other: LogContents) -> None:
     Raises:
         LogError: The files belong to different sessions. The text lists the differences.
     """
-    expected = identify_session(first)
-    actual = identify_session(other)
+    expected = _identify_session(first)
+    actual = _identify_session(other)
     differences = [
         f"{name} is {actual[name]}, not {expected[name]}"
         for name in expected
@@ -168,7 +273,7 @@ def _recorder_boot(part: LogContents) -> int:
     return 0
 
 
-def identify_session(part: LogContents) -> dict[str, str]:
+def _identify_session(part: LogContents) -> dict[str, str]:
     """Collects the facts that identify a session, on which all parts of its log agree.
 
     Files can be read as one log only if these facts are equal.
@@ -248,7 +353,7 @@ def _list_keys(topic: str, payloads: Sequence[bytes], source: str) -> Sequence[H
     try:
         match topic.rpartition("/")[2]:
             case topics.STATE:
-                record_ticks: list[int] = decode_ticks(payloads).tolist()
+                record_ticks: list[int] = RecordColumns(payloads).ticks().tolist()
                 return record_ticks
             case topics.LINK:
                 return [decode(payload, LinkStats, READABLE).tick for payload in payloads]

@@ -31,42 +31,6 @@ MATRIX_ENTRIES = ("r11", "r21", "r31", "r12", "r22", "r32")
 """Names of the six numbers of an orientation, with row and column of the rotation matrix."""
 
 
-def compute_quaternion_parts(turns: Array) -> tuple[Array, Array]:
-    """Computes the unit quaternions of rotation vectors, as scalar and vector parts.
-
-    The quaternion of a rotation vector r with the angle a = |r| is
-
-        w = cos(a / 2),  (x, y, z) = r sin(a / 2) / a
-
-    Args:
-        turns: Rotation vectors, shape (K, 3), in rad.
-
-    Returns:
-        The scalar parts w, shape (K, 1), and the vector parts (x, y, z), shape (K, 3).
-    """
-    angle = np.linalg.norm(turns, axis=1, keepdims=True)
-    w = np.cos(0.5 * angle)
-    # This is sin(a / 2) / a, even for a = 0, because sinc(x) = sin(pi x) / (pi x).
-    sine_by_angle = 0.5 * np.sinc(angle / (2.0 * np.pi))
-    return w, sine_by_angle * turns
-
-
-def compute_quaternions(turns: Array) -> Array:
-    """Computes the unit quaternions of rotation vectors as a time series without jumps.
-
-    A quaternion and its negative are the same rotation. The sign is chosen such that
-    neighbouring quaternions are close to each other, as curves and interpolation require.
-
-    Args:
-        turns: Rotation vectors in the order of time, shape (K, 3), in rad.
-
-    Returns:
-        The quaternions w, x, y, z, shape (K, 4).
-    """
-    w, v = compute_quaternion_parts(turns)
-    return align_signs(np.hstack([w, v]))
-
-
 def align_signs(quaternions: Array) -> Array:
     """Chooses the signs of unit quaternions so that a time series of them does not jump.
 
@@ -88,36 +52,150 @@ def align_signs(quaternions: Array) -> Array:
     return aligned
 
 
-def compute_matrix_columns(turns: Array) -> Array:
-    """Computes the first two columns of the rotation matrices of rotation vectors.
+class RotationVectors:
+    """Orientations as rotation vectors, with their conversions to other formats.
 
-    With the unit quaternion (w, x, y, z) of the rotation, they are
-
-        (1 - 2 y y - 2 z z,  2 x y + 2 w z,  2 x z - 2 w y)
-        (2 x y - 2 w z,  1 - 2 x x - 2 z z,  2 y z + 2 w x)
+    A rotation vector is the axis of a rotation times its angle. Whole turns do not change the
+    rotation.
 
     Args:
-        turns: Rotation vectors, shape (..., 3), in rad.
-
-    Returns:
-        The entries `MATRIX_ENTRIES`, shape (..., 6).
+        turns: K rotation vectors, shape (K, 3), in rad. Other shapes (..., 3) are possible for
+            `as_matrix_columns`.
     """
-    rows = np.reshape(turns, (-1, 3))
-    w, v = compute_quaternion_parts(rows)
-    # In the following, xy is twice the product of the components x and y, and so on.
-    double = 2.0 * v
-    wx, wy, wz = (w * double).T
-    xx, yy, zz = (v * double).T
-    double_x, double_y, _ = double.T
-    _, y, z = v.T
-    xy = double_x * y
-    xz = double_x * z
-    yz = double_y * z
-    first_column = [1.0 - yy - zz, xy + wz, xz - wy]
-    second_column = [xy - wz, 1.0 - xx - zz, yz + wx]
-    columns = np.stack([*first_column, *second_column], axis=1)
-    shape = np.shape(turns)[:-1]
-    return columns.reshape(*shape, len(MATRIX_ENTRIES))
+
+    def __init__(self, turns: Array) -> None:
+        self._turns = turns
+
+    def as_quaternion_parts(self) -> tuple[Array, Array]:
+        """Computes the unit quaternions of the rotations, as scalar and vector parts.
+
+        The quaternion of a rotation vector r with the angle a = |r| is
+
+            w = cos(a / 2),  (x, y, z) = r sin(a / 2) / a
+
+        Returns:
+            The scalar parts w, shape (K, 1), and the vector parts (x, y, z), shape (K, 3).
+        """
+        angle = np.linalg.norm(self._turns, axis=1, keepdims=True)
+        w = np.cos(0.5 * angle)
+        # This is sin(a / 2) / a, even for a = 0, because sinc(x) = sin(pi x) / (pi x).
+        sine_by_angle = 0.5 * np.sinc(angle / (2.0 * np.pi))
+        return w, sine_by_angle * self._turns
+
+    def as_quaternions(self) -> Array:
+        """Computes the unit quaternions of the rotations as a time series without jumps.
+
+        A quaternion and its negative are the same rotation. The sign is chosen such that
+        neighbouring quaternions are close to each other, as curves and interpolation require.
+        The rotation vectors must be in the order of time.
+
+        Returns:
+            The quaternions w, x, y, z, shape (K, 4).
+        """
+        w, v = self.as_quaternion_parts()
+        return align_signs(np.hstack([w, v]))
+
+    def as_matrix_columns(self) -> Array:
+        """Computes the first two columns of the rotation matrices.
+
+        With the unit quaternion (w, x, y, z) of the rotation, they are
+
+            (1 - 2 y y - 2 z z,  2 x y + 2 w z,  2 x z - 2 w y)
+            (2 x y - 2 w z,  1 - 2 x x - 2 z z,  2 y z + 2 w x)
+
+        Returns:
+            The entries `MATRIX_ENTRIES`, shape (..., 6) for rotation vectors of the shape
+            (..., 3).
+        """
+        rows = RotationVectors(np.reshape(self._turns, (-1, 3)))
+        w, v = rows.as_quaternion_parts()
+        # In the following, xy is twice the product of the components x and y, and so on.
+        double = 2.0 * v
+        wx, wy, wz = (w * double).T
+        xx, yy, zz = (v * double).T
+        double_x, double_y, _ = double.T
+        _, y, z = v.T
+        xy = double_x * y
+        xz = double_x * z
+        yz = double_y * z
+        first_column = [1.0 - yy - zz, xy + wz, xz - wy]
+        second_column = [xy - wz, 1.0 - xx - zz, yz + wx]
+        columns = np.stack([*first_column, *second_column], axis=1)
+        shape = np.shape(self._turns)[:-1]
+        return columns.reshape(*shape, len(MATRIX_ENTRIES))
+
+    def nearest_to(self, references: Array) -> Array:
+        """Adds whole turns to the rotation vectors so that each is nearest to its reference.
+
+        The results may be longer than half a turn.
+
+        Args:
+            references: A reference for each rotation vector, shape (K, 3), in rad.
+
+        Returns:
+            Rotation vectors of the same rotations, shape (K, 3), in rad.
+        """
+        turns = self._turns
+        angle = np.linalg.norm(turns, axis=1, keepdims=True)
+        axis = np.divide(turns, angle, out=np.zeros_like(turns), where=angle > 0.0)
+        # All vectors of the same rotation are on a line along the axis. The nearest one to the
+        # reference is nearest to the projection of the reference on this line.
+        projection = np.einsum("ki,ki->k", axis, references)[:, np.newaxis]
+        turn_counts = np.round((projection - angle) / (2.0 * np.pi))
+        whole_turns = 2.0 * np.pi * turn_counts * axis
+        return np.asarray(turns + whole_turns)
+
+    def without_jumps(self) -> Array:
+        """Computes rotation vectors of the same rotations that do not jump at half a turn.
+
+        They may be up to a whole turn long, and jump at a whole turn instead. The rotation
+        vectors must be in the order of time.
+
+        Returns:
+            Rotation vectors of the same rotations, shape (K, 3), in rad.
+        """
+        quaternions = self.as_quaternions()
+        w = quaternions[:, :1]
+        v = quaternions[:, 1:]
+        sine = np.linalg.norm(v, axis=1, keepdims=True)
+        angle = 2.0 * np.arctan2(sine, w)
+        # The limit of angle / sine for small angles is 2.
+        limit = np.full_like(w, 2.0)
+        angle_by_sine = np.divide(angle, sine, out=limit, where=sine > 0.0)
+        return np.asarray(angle_by_sine * v)
+
+    def turns_from(self, references: Array) -> Array:
+        """Computes the rotation vectors from reference orientations to the orientations.
+
+        The orientation is the quaternion (a, u), with the scalar part a and the vector part u,
+        and the reference is (b, v). The product of (a, u) and the conjugate (b, -v) is the
+        rotation between them, the quaternion (w, p):
+
+            w = a b + u . v
+            p = b u - a v - u x v
+
+        It is a rotation by the angle 2 atan2(|p|, w) about the axis p.
+
+        Args:
+            references: Reference orientations as rotation vectors, shape (K, 3), in rad.
+
+        Returns:
+            Rotation vectors of at most half a turn, shape (K, 3), in rad.
+        """
+        a, u = self.as_quaternion_parts()
+        b, v = RotationVectors(references).as_quaternion_parts()
+        w = a * b + np.sum(u * v, axis=1, keepdims=True)
+        p = b * u - a * v - np.cross(u, v)
+
+        # (w, p) and (-w, -p) are the same rotation. The one with w >= 0 is the shorter turn.
+        p *= np.where(w < 0.0, -1.0, 1.0)
+        sine = np.linalg.norm(p, axis=1, keepdims=True)
+        angle = 2.0 * np.arctan2(sine, abs(w))
+
+        # The limit of angle / sine for small angles is 2.
+        limit = np.full_like(w, 2.0)
+        angle_by_sine = np.divide(angle, sine, out=limit, where=sine > 0.0)
+        return np.asarray(angle_by_sine * p)
 
 
 def expand_poses(x: Array) -> Array:
@@ -142,55 +220,8 @@ def expand_poses(x: Array) -> Array:
     if x.shape[-1] != POSE:
         return x
     positions = x[..., :POSITION]
-    orientations = compute_matrix_columns(x[..., POSITION:])
+    orientations = RotationVectors(x[..., POSITION:]).as_matrix_columns()
     return np.concatenate([positions, orientations], axis=-1)
-
-
-def choose_nearest_vectors(turns: Array, references: Array) -> Array:
-    """Adds whole turns to rotation vectors so that each is nearest to its reference.
-
-    A rotation vector is the axis of a rotation times its angle. Whole turns do not change the
-    rotation. The results may be longer than half a turn.
-
-    Args:
-        turns: K rotation vectors, shape (K, 3), in rad.
-        references: A reference for each of them, shape (K, 3), in rad.
-
-    Returns:
-        The rotation vectors, shape (K, 3), in rad.
-    """
-    angle = np.linalg.norm(turns, axis=1, keepdims=True)
-    axis = np.divide(turns, angle, out=np.zeros_like(turns), where=angle > 0.0)
-    # All vectors of the same rotation are on a line along the axis. The nearest one to the
-    # reference is nearest to the projection of the reference on this line.
-    projection = np.einsum("ki,ki->k", axis, references)[:, np.newaxis]
-    turn_counts = np.round((projection - angle) / (2.0 * np.pi))
-    whole_turns = 2.0 * np.pi * turn_counts * axis
-    return np.asarray(turns + whole_turns)
-
-
-def compute_continuous_vectors(turns: Array) -> Array:
-    """Computes rotation vectors of the same rotations that do not jump at half a turn.
-
-    A rotation vector is the axis of a rotation times its angle. A whole turn can be added
-    without changing the rotation. The resulting vectors may be up to a whole turn long. They
-    jump at a whole turn instead.
-
-    Args:
-        turns: K rotation vectors in the order of time, shape (K, 3), in rad.
-
-    Returns:
-        The rotation vectors, shape (K, 3), in rad.
-    """
-    quaternions = compute_quaternions(turns)
-    w = quaternions[:, :1]
-    v = quaternions[:, 1:]
-    sine = np.linalg.norm(v, axis=1, keepdims=True)
-    angle = 2.0 * np.arctan2(sine, w)
-    # The limit of angle / sine for small angles is 2.
-    limit = np.full_like(w, 2.0)
-    angle_by_sine = np.divide(angle, sine, out=limit, where=sine > 0.0)
-    return np.asarray(angle_by_sine * v)
 
 
 class QuaternionSigns:

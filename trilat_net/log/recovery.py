@@ -32,7 +32,7 @@ from ..net import VERSION, json_schema, topics
 from ..results import Result
 from ..scenario import parse_embedded
 from . import mcap_records
-from .accounting import Coverage, parse_counts
+from .accounting import Account, Coverage
 from .content_check import ContentCheck
 from .log_file import LogFile
 from .log_layout import (
@@ -44,7 +44,7 @@ from .log_layout import (
     SESSION,
     describe_unfinished,
 )
-from .mcap_reader import McapReader, Progress, check_log
+from .mcap_reader import LogContents, McapReader, Progress
 from .mcap_records import Damage, ScannedRecord, UnreadableRecord
 from .mcap_writer import McapWriter
 from .provenance import collect_provenance
@@ -288,7 +288,7 @@ def _check_output(working: Path, result: Recovery) -> None:
     """
     with working.open("rb") as stream:
         try:
-            check_log(stream, str(result.output))
+            LogContents.check(stream, str(result.output))
         except LogError as error:
             result.lost.insert(0, f"{error}; {_UNOPENED}")
 
@@ -1063,8 +1063,8 @@ class _FileCopy:
         for topic, text in accounts.format_accounts().items():
             if not topic.endswith(f"/{topics.STATE}"):
                 continue
-            source_counts = parse_counts(source_accounts.get(topic, ""))
-            if source_counts not in ({}, parse_counts(text)):
+            source_counts = Account.parse_counts(source_accounts.get(topic, ""))
+            if source_counts not in ({}, Account.parse_counts(text)):
                 return True
         return False
 

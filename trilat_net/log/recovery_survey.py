@@ -33,7 +33,7 @@ from mcap.opcode import Opcode
 from ..files import reading
 from ..net import topics
 from . import mcap_records
-from .content_check import MessageOrigins, has_foreign_boots
+from .content_check import MessageOrigins
 from .log_layout import ACCOUNTS, PART, SCENARIO, SESSION
 from .mcap_records import ChunkHead, RecordFrame, UnreadableRecord
 from .torn_chunk import PAGE_BYTES
@@ -292,7 +292,7 @@ class RecoverySurvey:
         has_other_epoch = bool(epochs) and named_session.get("epoch_unix_ns", "") not in epochs
         if has_other_epoch:
             self._reject_session(named_session, is_renamed=True)
-        elif has_foreign_boots(named_session, covered_origins.boots):
+        elif covered_origins.are_foreign(named_session):
             self._reject_session(named_session, is_renamed=False)
 
     def _reject_session(self, session: dict[str, str], *, is_renamed: bool) -> None:

@@ -20,15 +20,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, BinaryIO
 
-import numpy as np
-
 from ..errors import LogError, ScenarioError, WireError, count_nouns
 from ..files import open_regular
 from ..net import decode, messages, topics
 from ..recorded_change import count_skipped_ticks
 from ..records import NS_PER_S
 from ..scenario import Scenario, parse_embedded
-from .accounting import Account, describe_unknown_ends, parse_counts
+from .accounting import Account, describe_unknown_ends
 from .findings import CheckReport, Finding, Findings
 from .log_layout import (
     ACCOUNTS,
@@ -41,13 +39,11 @@ from .log_layout import (
     ChannelFilter,
     describe_unfinished,
 )
-from .log_reader import Log
 from .mcap_check import FileCheck
 from .mcap_reader import ChannelInfo, McapMessage, McapReader, Progress, shift_progress
 from .mcap_records import ScannedRecord
 from .message_identity import AnyMessage, MessageIdentity
 from .ros2 import cdr
-from .running_digest import DigestState, Integrity
 from .session_accounts import SessionAccounts
 
 _MAX_AHEAD_NS = 10 * NS_PER_S
@@ -111,6 +107,22 @@ class LogCheckResult(CheckReport):
             }
             for finding in self.findings
         ]
+
+    def check_signatures(self, key_file: Path, progress: Progress | None = None) -> None:
+        """Checks the signatures of the files as well, and adds the result to the findings.
+
+        Args:
+            key_file: File of the public key of a signer whom the user trusts.
+            progress: Function that is called after every record (result of a control period) of
+                a log.
+
+        Raises:
+            LogError: A log cannot be read.
+            UsageError: The key file is not a public key.
+        """
+        from .log_signature import check_signatures  # loads the library `cryptography`
+
+        self.findings.append(check_signatures(list(map(Path, self.files)), key_file, progress))
 
 
 def check_file(*files: str | Path, progress: Progress | None = None) -> LogCheckResult:
@@ -787,7 +799,7 @@ class _SessionCheck:
             return finding.conclude("include other parts of the log, and were not compared")
 
         for topic, check in self.channels.items():
-            stated = parse_counts(self._accounts.get(topic, ""))
+            stated = Account.parse_counts(self._accounts.get(topic, ""))
             if check.kind != topics.STATS:
                 missing = sum(account.missing for account in self._counted.list_starts(topic))
                 counted = {"received": check.received, "missing": missing}
@@ -831,84 +843,3 @@ class _SessionCheck:
                 # The problem concerns the whole log: no file, no offset.
                 finding.add("", None, f"{sent}, but the scenario says {check.rate_hz}")
         return finding.conclude(", ".join(texts) or "the log is too short to measure them")
-
-
-def judge_integrity(log: Log) -> Integrity:
-    """Determines whether a log was changed after it was recorded.
-
-    The contents are compared with the digests, the checksums that the log contains. In
-    addition, the records (results of control periods) are compared with the message counts and
-    the statistics of the recorder. This also reveals changes to a log that was rewritten with
-    new digests.
-
-    Args:
-        log: The log.
-
-    Returns:
-        The result, with an explanation.
-
-    Raises:
-        LogError: A message cannot be decoded.
-    """
-    if log.chain.passed:
-        for site in log.sites:
-            change = _describe_unexplained_gap(log, site)
-            if change:
-                return Integrity(DigestState.CHANGED, change)
-    return log.chain
-
-
-def _describe_unexplained_gap(log: Log, site: str) -> str:
-    """Describes missing or additional records of a site that the log does not explain.
-
-    The recorder states how many records it received and missed, in the account of the site at
-    the end of the file and in its statistics during the recording. Other gaps show that records
-    were removed, or that two logs were joined. There are two tests:
-
-    1. The account must agree with the records. This is not tested if there is no account (the
-       file was not finished), if the file is only a part of a log (the account includes other
-       parts), or if the log consists of several files (see below).
-    2. The ticks must be consecutive, except for ticks that the site did not execute, and for
-       the number of records that the recorder states as missing. This is not tested if the
-       digests, checksums of all messages, show that nothing was changed.
-
-    Args:
-        log: The log.
-        site: Name of the site.
-
-    Returns:
-        The description. Empty if the records agree with the statements of the recorder, or if
-        a part of the file cannot be read, because records may be missing for this reason.
-    """
-    if log.damaged:
-        return ""
-    ticks = log[site].tick  # in ascending order
-    records = 1 + int(np.count_nonzero(np.diff(ticks))) if len(ticks) else 0
-    # The counts of several files were computed from their records, and prove nothing.
-    has_one_file = len(log.sources) == 1
-    stated = parse_counts(log.account(site)) if has_one_file else {}
-    counted = {"received": records, "missing": log.missing(site)}
-    has_account = stated != {}
-    if not log.part and has_account and stated != counted:
-        stated_text = " and ".join(f"{stated.get(name, 0)} {name}" for name in counted)
-        counted_text = " and ".join(f"{count} {name}" for name, count in counted.items())
-        return (
-            f"records of {site} were removed or added: the account of {site} states "
-            f"{stated_text}, but the file has {counted_text}"
-        )
-
-    # Number of ticks without a record between the first and the last record.
-    ticks_without_record = int(ticks[-1] - ticks[0]) + 1 - records if records else 0
-    not_executed = min(ticks_without_record, log.absent_ticks(site))
-    missing = ticks_without_record - not_executed
-    if not missing or log.chain.state is DigestState.INTACT:
-        return ""
-    missing_in_account = stated.get("missing", 0)
-    missing_in_statistics = [
-        stats.missing.get(f"{site}/state", 0) for stats in log.recorder_stats()
-    ]
-    largest_stated = max([missing_in_account, *missing_in_statistics])
-    if missing <= largest_stated:
-        return ""
-    missing_text = count_nouns(missing, f"record of {site} is", f"records of {site} are")
-    return f"{missing_text} missing in between, and nothing in the log explains it"

@@ -11,26 +11,28 @@ Invariant:
       records are decoded in blocks when they are accessed.
 """
 
+import math
 from bisect import bisect_right
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import cached_property, lru_cache
+from itertools import pairwise
 from typing import Any, Generic, NamedTuple, TypeVar, overload
 
 import numpy as np
 from numpy.typing import NDArray
 
 from .. import process
-from ..core import POSE, POSITION, Array, LawChannel
+from ..core import MAX_DELAY_US, POSE, POSITION, Array, LawChannel
 from ..errors import LogError, WireError, count_nouns
 from ..hooks import find_hook
 from ..net import READABLE, State, decode
 from ..recorded_change import count_skipped_ticks
 from ..records import NS_PER_S, Layout
-from . import record_columns
-from .orientations import align_signs, compute_quaternion_parts, compute_quaternions
+from ..scenario import TracePoint
+from .orientations import RotationVectors, align_signs
 from .packed.indexed_records import IndexedRecords
 from .packed.packed_messages import PackedMessages
-from .record_columns import Ints
+from .record_columns import Ints, RecordColumns
 
 M = TypeVar("M")
 T = TypeVar("T")
@@ -92,46 +94,10 @@ def compute_task_errors(x: Array, x_des: Array, axes: Sequence[float]) -> Array:
     """
     e: Array = x - x_des
     if e.shape[1] > POSITION:
-        rotation = x[:, POSITION:]
-        reference = x_des[:, POSITION:]
-        e[:, POSITION:] = _compute_rotation_errors(rotation, reference)
+        orientations = RotationVectors(x[:, POSITION:])
+        e[:, POSITION:] = orientations.turns_from(x_des[:, POSITION:])
     e *= np.array(axes)
     return e
-
-
-def _compute_rotation_errors(rotation: Array, reference: Array) -> Array:
-    """Computes the rotation vectors from reference orientations to orientations.
-
-    The orientation is the quaternion (a, u), with the scalar part a and the vector part u, and
-    the reference is (b, v). The product of (a, u) and the conjugate (b, -v) is the rotation
-    between them, the quaternion (w, p):
-
-        w = a b + u . v
-        p = b u - a v - u x v
-
-    It is a rotation by the angle 2 atan2(|p|, w) about the axis p.
-
-    Args:
-        rotation: Orientations as rotation vectors, shape (K, 3), in rad.
-        reference: Reference orientations in the same format.
-
-    Returns:
-        Rotation vectors of at most half a turn, shape (K, 3), in rad.
-    """
-    a, u = compute_quaternion_parts(rotation)
-    b, v = compute_quaternion_parts(reference)
-    w = a * b + np.sum(u * v, axis=1, keepdims=True)
-    p = b * u - a * v - np.cross(u, v)
-
-    # (w, p) and (-w, -p) are the same rotation. The one with w >= 0 is the shorter turn.
-    p *= np.where(w < 0.0, -1.0, 1.0)
-    sine = np.linalg.norm(p, axis=1, keepdims=True)
-    angle = 2.0 * np.arctan2(sine, abs(w))
-
-    # The limit of angle / sine for small angles is 2.
-    limit = np.full_like(w, 2.0)
-    angle_by_sine = np.divide(angle, sine, out=limit, where=sine > 0.0)
-    return np.asarray(angle_by_sine * p)
 
 
 class LazyRecords(Sequence[State]):
@@ -312,13 +278,13 @@ def _read_ints(site: "SiteLog", field: str) -> Ints:
     """Returns an integer field of all records of a site, shape (K,)."""
     if site.indexed is not None and site.indexed.has_ints(field):
         return freeze(site.indexed.ints(field))
-    return site._read(record_columns.decode_ints, field)
+    return site._read(RecordColumns.ints, field)
 
 
 def _read_objects(site: "SiteLog", field: str) -> NDArray[np.object_]:
     """Returns the field `mode` or `mem` of all records of a site, shape (K,)."""
     if site.indexed is None:
-        return site._read(record_columns.decode_strings, field)
+        return site._read(RecordColumns.objects, field)
     return freeze(site.indexed.modes if field == "mode" else site.indexed.memories)
 
 
@@ -383,7 +349,7 @@ class SiteLog:
         self.payloads = PackedMessages.pack(payloads)
         self.indexed = IndexedRecords.of_payloads(self.payloads, name, peers, layout)
         if self.indexed is None:
-            self.tick = self._read(record_columns.decode_ticks)
+            self.tick = self._read(RecordColumns.ticks)
         else:
             self.tick = self.indexed.ticks
         zeros = np.zeros(len(payloads), dtype=np.int64)
@@ -422,8 +388,8 @@ class SiteLog:
         """Decodes some quantities of all records into arrays that cannot be changed.
 
         Args:
-            decode_column: Function that decodes the payloads.
-            *arguments: Further arguments of that function.
+            decode_column: Method of `RecordColumns`, or a function of its object.
+            *arguments: Further arguments of that method.
 
         Raises:
             LogError: A record cannot be decoded.
@@ -437,14 +403,14 @@ class SiteLog:
 
         Args:
             payloads: The encoded records (results of control periods).
-            decode_column: Function that decodes the field of all given records.
-            *arguments: Further arguments of that function, such as the name of the field.
+            decode_column: Method of `RecordColumns`, or a function of its object.
+            *arguments: Further arguments of that method, such as the name of the field.
 
         Raises:
             LogError: A record cannot be decoded.
         """
         try:
-            return freeze(decode_column(payloads, *arguments))
+            return freeze(decode_column(RecordColumns(payloads), *arguments))
         except WireError as error:
             raise LogError(
                 f"{self._source}: a record of {self.name} cannot be read: {error}"
@@ -467,7 +433,7 @@ class SiteLog:
         """Returns vectors of all records by name, each of shape (K, length)."""
         if self.indexed is not None:
             return freeze(self.indexed.vectors(fields))
-        return self._read(record_columns.decode_vectors, self.layout, *fields)
+        return self._read(RecordColumns.vectors, self.layout, *fields)
 
     def numbers(self, field: str) -> Ints:
         """Returns an integer field of all records as an array, for example "busy_us".
@@ -528,7 +494,7 @@ class SiteLog:
             LogError: A record cannot be decoded.
         """
 
-        def decode_states(_: Sequence[bytes]) -> list[State]:
+        def decode_states(_: RecordColumns) -> list[State]:
             return [decode(payload, State, READABLE, self.layout) for payload in payloads]
 
         return self._read(decode_states)
@@ -704,7 +670,7 @@ class SiteLog:
         """
         if not self.layout.task or self.layout.shared != POSE:
             return freeze(np.zeros((len(self), 0)))
-        return freeze(compute_quaternions(poses[:, POSITION:]))
+        return freeze(RotationVectors(poses[:, POSITION:]).as_quaternions())
 
     @cached_property
     def body_poses(self) -> Array:
@@ -767,7 +733,7 @@ class SiteLog:
         if self.indexed is not None:
             ticks = self.indexed.used
             return freeze({peer: ticks[:, n].copy() for n, peer in enumerate(self.peers)})
-        return self._read(record_columns.decode_per_peer, "used", self.peers, -1)
+        return self._read(RecordColumns.per_peer, "used", self.peers, -1)
 
     @cached_property
     def arrivals(self) -> tuple[Ints, Ints]:
@@ -779,7 +745,7 @@ class SiteLog:
         """
         if self.indexed is not None:
             return freeze(self.indexed.arrivals)
-        return self._read(record_columns.decode_arrivals)
+        return self._read(RecordColumns.arrivals)
 
     @cached_property
     def _changes(self) -> dict[int, list[str]]:
@@ -790,7 +756,7 @@ class SiteLog:
             rows = np.flatnonzero(self.indexed.change_counts)
             ticks = ticks[rows]
             payloads = payloads.select(rows)
-        texts = self._read_from(payloads, record_columns.decode_strings, "cmd").tolist()
+        texts = self._read_from(payloads, RecordColumns.objects, "cmd").tolist()
         pairs = zip(ticks.tolist(), texts, strict=True)
         return {tick: tick_texts for tick, tick_texts in pairs if tick_texts}
 
@@ -820,3 +786,72 @@ class SiteLog:
         stamps_ns = used_ticks * NS_PER_S // rate_hz
         age_ns = self.t_ns - stamps_ns
         return np.where(used_ticks >= 0, age_ns / NS_PER_S, np.nan)
+
+    def iterate_delays(
+        self, peer: str, rate_hz: int, sent_ticks: Sequence[int]
+    ) -> Iterator[TracePoint]:
+        """Yields the stamp and the delay of every sample of a peer, in the order of the stamps.
+
+        A sample that was sent but did not arrive has an infinite delay. It is left out if it
+        may have arrived in a tick whose record is missing. `Log.link_delays` defines the
+        delays.
+
+        Args:
+            peer: Name of the sender.
+            rate_hz: Tick rate of the sender, in Hz.
+            sent_ticks: Ticks of the samples that the sender is known to have sent. If there are
+                none, samples of all ticks up to the last arrival count as sent.
+
+        Yields:
+            The stamp in s after the start of the session, and the delay in ms.
+        """
+        sender_index = self.peers.index(peer)
+        delays_us: dict[int, int] = {}
+        for state in self.states:
+            for sender, tick, delay_us in state.rx:
+                if sender == sender_index and tick >= 0:
+                    earlier_us = delays_us.get(tick, MAX_DELAY_US)
+                    delays_us[tick] = min(earlier_us, max(delay_us, 0))
+        if not delays_us:
+            return
+
+        longest_ns = 1000 * max(delays_us.values())
+        gaps = self._find_gaps_ns()
+        # Samples that were sent before the first or after the last arrival were lost as well.
+        ticks = {*sent_ticks, *delays_us} if sent_ticks else range(max(delays_us) + 1)
+        for tick in sorted(ticks):
+            stamp_ns = tick * NS_PER_S // rate_hz
+            # The simulation kernel counts in whole microseconds.
+            stamp_s = stamp_ns // 1000 / 1e6
+            if tick in delays_us:
+                yield stamp_s, delays_us[tick] / 1e3
+                continue
+
+            latest_arrival_ns = stamp_ns + longest_ns
+            may_have_arrived_unseen = any(
+                stamp_ns <= gap_end and latest_arrival_ns >= gap_start
+                for gap_start, gap_end in gaps
+            )
+            if not may_have_arrived_unseen:
+                yield stamp_s, math.inf
+
+    def _find_gaps_ns(self) -> list[tuple[int, float]]:
+        """Returns the intervals in which a sample may have arrived although no record shows it.
+
+        Records (results of control periods) are missing before the first record, between
+        records whose ticks (control periods) are not consecutive, and after the last record.
+
+        Returns:
+            The intervals (start, end) in ns after the start of the session.
+        """
+        states = self.states
+        if not states:
+            return [(0, math.inf)]
+        gaps: list[tuple[int, float]] = []
+        for record, next_record in pairwise(states):
+            if next_record.tick != record.tick + 1:
+                gaps.append((record.t_ns, next_record.t_ns))
+        if states[0].tick > 0:
+            gaps.append((0, states[0].t_ns))
+        gaps.append((states[-1].t_ns, math.inf))
+        return gaps

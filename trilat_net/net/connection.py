@@ -49,7 +49,7 @@ _BLOCK = 64
 class DefaultEndpoints:
     """The network addresses at which the sites of a session (arm controllers) listen.
 
-    They apply if the user names no endpoints. The ports are computed from the name of the
+    These endpoints apply if the user names none. The ports are computed from the name of the
     session and the index of the site, so that every process finds the endpoints without any
     configuration.
 

@@ -18,12 +18,9 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import numpy as np
-from numpy.typing import NDArray
-
 from ..errors import UsageError
 from ..files import import_extra, refuse_existing, stage_output
-from ..log import SCENARIO, Column, Log, Progress, Table, collect_provenance
+from ..log import SCENARIO, Log, Progress, Table, collect_provenance
 from ..results import JsonObject
 from . import exports
 
@@ -300,14 +297,3 @@ def name_inside(table: Table, name: str, separator: str) -> str:
         separator: Text between the name and the kind, such as ".".
     """
     return name if table.kind in ("", "state") else f"{name}{separator}{table.kind}"
-
-
-def read_texts(column: Column) -> NDArray[Any]:
-    """Reads the texts of a table column as an array of NumPy strings, shape (K,).
-
-    Formats for numbers, such as .npz, store texts in this way.
-
-    Args:
-        column: Column of a table with K rows.
-    """
-    return np.array(column.values.tolist(), dtype=np.str_)

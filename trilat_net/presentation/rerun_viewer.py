@@ -39,7 +39,7 @@ from ..log.ros2 import (
     TRANSFORMS,
     WORLD,
     Ros2Channels,
-    read_ros2_channels,
+    Ros2Topics,
 )
 from .exports.ros2 import export_ros2
 
@@ -101,7 +101,7 @@ def open_rerun(
         # Therefore the file has a name that Rerun does not change.
         named_path = Path(folder) / f"{make_application_id(path)}.mcap"
         has_several_parts = len(paths) > 1
-        must_export = options.full or has_several_parts or not read_ros2_channels(path)
+        must_export = options.full or has_several_parts or not Ros2Topics.of_file(path)
         if must_export:
             print_line("making standard channels of every record ...")
             export_ros2(read_log(), named_path)
@@ -110,7 +110,7 @@ def open_rerun(
             named_path.symlink_to(path.resolve())
             path = named_path
 
-        layout = build_plot_layout(read_ros2_channels(path))
+        layout = build_plot_layout(Ros2Topics.of_file(path))
         layout_path = Path(folder) / "layout.rbl"
         _save_blueprint(layout, path.stem, layout_path)
         environment = {**_QUIET_ENVIRONMENT, **os.environ}

@@ -14,8 +14,8 @@ from pathlib import Path
 
 from ..errors import UsageError
 from ..files import refuse_existing, write_whole
-from ..log import VIZ_ROOT, open_log
-from ..log.ros2 import list_log_topics, read_ros2_channels
+from ..log import open_log
+from ..log.ros2 import Ros2Topics
 from .foxglove_layout import build_foxglove_layout
 from .rerun_viewer import build_plot_layout
 
@@ -41,7 +41,7 @@ def write_foxglove_layout(log: Path, *, force: bool = False) -> Path:
     """
     path = log.with_suffix(LAYOUT_SUFFIX)
     refuse_existing(path, force=force)
-    channels = read_ros2_channels(log)
+    channels = Ros2Topics.of_file(log)
     if not build_plot_layout(channels).pages:
         raise UsageError(
             f"{log}: there is nothing to plot, because the file is not finished or was written "
@@ -50,9 +50,8 @@ def write_foxglove_layout(log: Path, *, force: bool = False) -> Path:
         )
 
     sources = {"ROS 2": channels}
-    is_log = any(topic.startswith(VIZ_ROOT) for topic in channels)
-    if is_log:
-        sources = {"Log": channels, "ROS 2": list_log_topics(open_log(log))}
+    if channels.are_of_log:
+        sources = {"Log": channels, "ROS 2": Ros2Topics.of_log(open_log(log))}
     layout = build_foxglove_layout(sources)
     write_whole(path, json.dumps(layout, indent=1) + "\n", force=force)
     return path

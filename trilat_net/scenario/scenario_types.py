@@ -476,6 +476,28 @@ class Scenario(Frozen, frozen=True, dict=True):
                 )
             raise ScenarioError(problem, path=f"sites.{name}.plant", source=self.name)
 
+    def refuse_live_only(self) -> None:
+        """Refuses an experiment that only a live session can run.
+
+        A live session has a real network, and may have real robots.
+
+        Raises:
+            ScenarioError: An arm is external, or a link has the model "measured", with which
+                the real network determines the delay. In virtual time there is no real network.
+        """
+        self.refuse_external_arms()
+        if not self.measured:
+            return
+        measured_links = [name for name, link in self.links.items() if link.measured]
+        path = f"links.{measured_links[0]}.model" if measured_links else "timeline"
+        raise ScenarioError(
+            "is 'measured', the delay of a real network: a scenario with such a link can only "
+            "run live; to run the scenario here, set another model, as in link.model=constant "
+            "and link.delay_ms=50",
+            path=path,
+            source=self.name,
+        )
+
     @property
     def open_hands(self) -> tuple[str, ...]:
         """Names of the sites whose arms any member of the session may move.

@@ -12,7 +12,7 @@ from typing import Annotated
 
 import typer
 
-from trilat_net.app import flag, options, show_progress, value
+from trilat_net.app import options, show_progress, value
 from trilat_net.errors import count_nouns
 from trilat_net.presentation import terminal_output as terminal
 
@@ -33,7 +33,9 @@ def experiment_new_command(
     ],
     pair: Annotated[
         bool,
-        flag("--pair", "Write a protocol for two people, each of whom holds a master arm."),
+        typer.Option(
+            "--pair", help="Write a protocol for two people, each of whom holds a master arm."
+        ),
     ] = False,
     force: options.ForceOption = False,
 ) -> None:
@@ -73,7 +75,10 @@ def experiment_run_command(
         value("--out -o", "DIR", "Folder for the results; default: runs/experiment-NAME-N."),
     ] = None,
     live: Annotated[
-        bool, flag("--live", "Run with people, who take part on pages in their browsers.")
+        bool,
+        typer.Option(
+            "--live", help="Run with people, who take part on pages in their browsers."
+        ),
     ] = False,
     *,
     serving: PageServing,

@@ -9,7 +9,7 @@ from typing import Annotated, NamedTuple
 
 import typer
 
-from trilat_net.app import flag, value
+from trilat_net.app import value
 
 
 class PageServing(NamedTuple):
@@ -37,13 +37,16 @@ class PageServing(NamedTuple):
         ),
     ] = 0
     insecure: Annotated[
-        bool, flag("--insecure", "Allow a --host other than loopback without encryption.")
+        bool,
+        typer.Option(
+            "--insecure", help="Allow a --host other than loopback without encryption."
+        ),
     ] = False
     browser: Annotated[
         bool,
-        flag(
+        typer.Option(
             "--browser/--no-browser",
-            "Open the page in a browser, if this machine has a browser.",
+            help="Open the page in a browser, if this machine has a browser.",
         ),
     ] = True
     tls: Annotated[

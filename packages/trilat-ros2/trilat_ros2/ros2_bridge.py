@@ -29,7 +29,7 @@ from pathlib import Path
 
 from trilat_net.app import RunningSession, open_hand
 from trilat_net.errors import TrilatError, UsageError, count_nouns
-from trilat_net.files import refuse_existing, write_whole
+from trilat_net.files import refuse_existing
 from trilat_net.log.ros2 import (
     COMMON_TOPICS,
     DIAGNOSTICS,
@@ -38,9 +38,7 @@ from trilat_net.log.ros2 import (
     RobotTable,
     Ros2SiteChannels,
     TopicTable,
-    build_rviz_config,
     cdr,
-    list_topics,
     pack_event,
     pack_session_diagnostics,
 )
@@ -1085,7 +1083,7 @@ def publish_session(
         if info is None:
             return False
         scenario = parse_embedded(info.scenario, ends.session)
-        refuse_other_robots(ends.table, scenario)
+        ends.table.refuse_other_robots(scenario)
         for site in scenario.outside:
             if site not in robots:
                 robot = ends.table.robots.get(site, RobotTable())
@@ -1112,24 +1110,9 @@ def publish_session(
         input_clauses = _describe_inputs(ends, bridge, robots)
         say("; ".join([session_text, *input_clauses]))
         if rviz is not None:
-            write_session_config(ends, scenario, rviz)
+            ends.write_rviz_config(scenario, rviz)
             say(f"{rviz} shows the arms; open it with: rviz2 -d {rviz}")
         return bridge.run(rate_hz, stopped, say)
-
-
-def write_session_config(ends: BridgeEnds, scenario: Scenario, path: Path) -> None:
-    """Writes a file of settings with which the viewer RViz shows the arms of a session.
-
-    Args:
-        ends: Connections to ROS and to the session.
-        scenario: Scenario of the session.
-        path: File of the configuration. A file of an earlier session is replaced.
-
-    Raises:
-        UsageError: The file cannot be written.
-    """
-    topics = list_topics(scenario, ends.session, ends.table)
-    write_whole(path, build_rviz_config(topics))
 
 
 def _describe_inputs(ends: BridgeEnds, bridge: _Bridge, robots: Iterable[str]) -> list[str]:
@@ -1200,43 +1183,6 @@ def _open_robot(
         _repeat_in_thread(DRIVE_PERIOD_S, arm.send_command, arm.send_safe_command),
     ):
         yield arm
-
-
-def refuse_other_robots(table: TopicTable, scenario: Scenario) -> None:
-    """Checks that each robot belongs to a site with an external arm of as many joints.
-
-    An external arm is a real arm, or a simulation in another program. The settings of a robot
-    have a meaning only for a site with such an arm. Settings that equal the defaults are
-    tolerated for other sites of the scenario, because they have no effect.
-
-    Args:
-        table: The user's settings of topics and robots.
-        scenario: Scenario of the session.
-
-    Raises:
-        UsageError: A site without an external arm has settings of a robot, the scenario has no
-            such site, or the robot has another number of joints than the arm of its site.
-    """
-    for site, robot in table.robots.items():
-        has_external_arm = site in scenario.outside
-        is_unknown = site not in scenario.names
-        differs_from_defaults = robot != RobotTable()
-        if not has_external_arm and (differs_from_defaults or is_unknown):
-            outside = ", ".join(scenario.outside) or "none"
-            raise UsageError(
-                f"--names: sites.{site}: no site of this name has an external arm; sites with "
-                f"an external arm: {outside}"
-            )
-
-        if has_external_arm and robot.joints:
-            joints = scenario.arms[site].joint_names
-            if len(robot.joints) != len(joints):
-                names_text = count_nouns(len(robot.joints), "name")
-                joints_text = count_nouns(len(joints), "joint")
-                raise UsageError(
-                    f"--names: sites.{site}.joints has {names_text}, but the arm of {site} has "
-                    f"{joints_text}: {', '.join(joints)}"
-                )
 
 
 def _await_site(ends: BridgeEnds, stopped: Callable[[], bool], *, running: bool) -> Info | None:

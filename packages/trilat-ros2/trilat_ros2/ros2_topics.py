@@ -11,10 +11,12 @@ Invariant:
       the same as in a ROS bag that is exported from a log.
 """
 
+from pathlib import Path
 from typing import NamedTuple
 
 from trilat_net.app import ShareHistory
-from trilat_net.log.ros2 import SiteMessages, TopicTable
+from trilat_net.files import write_whole
+from trilat_net.log.ros2 import Ros2Topics, SiteMessages, TopicTable, build_rviz_config
 from trilat_net.net import Bus, Clock, LinkStats, State
 from trilat_net.net.ros2 import QualityOfService, Ros2Graph, TopicPublisher
 from trilat_net.records import NS_PER_S
@@ -51,6 +53,19 @@ class BridgeEnds(NamedTuple):
             name: Short name of the topic, such as "joint_states".
         """
         return self.table.find(self.session, site, name)
+
+    def write_rviz_config(self, scenario: Scenario, path: Path) -> None:
+        """Writes a file of settings with which the viewer RViz shows the arms of the session.
+
+        Args:
+            scenario: Scenario of the session.
+            path: File of the configuration. A file of an earlier session is replaced.
+
+        Raises:
+            UsageError: The file cannot be written.
+        """
+        topics = Ros2Topics.of_session(scenario, self.session, self.table)
+        write_whole(path, build_rviz_config(topics))
 
 
 class SiteTopics:

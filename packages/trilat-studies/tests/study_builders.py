@@ -286,6 +286,16 @@ def make_exponent_plane() -> MapPlane:
 _DECAY = EnvelopeFit(EnvelopeTrend.DECAYS, -0.2)
 
 
+def read_tables(page: str) -> list[list[tuple[str, ...]]]:
+    """Returns the tables of a Markdown page as rows of cells. The first row has the heads."""
+    tables = []
+    for block in page.split("\n\n"):
+        if block.startswith("|"):
+            heads, _, *rows = block.splitlines()
+            tables.append([tuple(row[2:-2].split(" | ")) for row in (heads, *rows)])
+    return tables
+
+
 def make_run_end(behaviour: EndBehaviour = EndBehaviour.CONVERGED, **fields: Any) -> RunEnd:
     """Returns the end of a run that decays to rest, with another behaviour or other fields."""
     return RunEnd(behaviour, _DECAY, _DECAY, 0.0, 0.0)._replace(**fields)

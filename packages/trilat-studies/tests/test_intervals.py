@@ -8,7 +8,6 @@ import msgspec
 import numpy as np
 import pytest
 from trilat_studies.sweep import plan_sweep, prepare_sweep_folder, run_sweep
-from trilat_studies.sweep.sweep_results import list_totals
 from trilat_studies.trials import run_trials, trials
 from trilat_studies.tuning import plan_tuning
 from trilat_studies.tuning.candidate import CandidateClass, CandidateScore
@@ -94,7 +93,7 @@ def test_swept_cells_have_the_means_of_seeds(file: Path) -> None:
     for run in runs:
         run.advance_to(2.0)
 
-    totals = list_totals(plan)
+    totals = plan.list_totals()
     for key, mean in zip(totals, point.means, strict=True):
         assert mean == MeanInterval.of_values([getattr(run.totals, key) for run in runs])
     assert point.means[0].half > 0.0

@@ -9,7 +9,6 @@ from trilat_studies.sweep.fixed_gains import describe_fixed_gains
 from trilat_studies.tuning.search_space import (
     ModelInformation,
     SearchSpace,
-    select_search_spaces,
 )
 from trilat_studies.tuning.tuning_plan import plan_tuning
 
@@ -76,7 +75,7 @@ def test_trials_take_tables() -> None:
 
 
 def test_ranges_come_from_the_class() -> None:
-    (space,) = select_search_spaces(["tests.own_laws:PD"], tn.load_scenario("free"))
+    (space,) = SearchSpace.select(["tests.own_laws:PD"], tn.load_scenario("free"))
     assert [tuple(knob) for knob in space.knobs] == [
         ("K", "N m/rad", 5.0, 50.0, ""),
         ("d", "N m s/rad", 1.0, 20.0, ""),

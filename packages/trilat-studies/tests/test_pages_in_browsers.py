@@ -13,7 +13,7 @@ from study_builders import (
 )
 from trilat_studies.bench import plan_bench, prepare_bench_folder, run_bench
 from trilat_studies.bench.bench_figures import FIGURES_OF_BENCH, write_bench
-from trilat_studies.sweep.map_page import write_map
+from trilat_studies.sweep.map_page import MapReport
 from trilat_studies.sweep.stability_map import MapLine, MapPlane, StabilityMap
 from trilat_studies.sweep.sweep_cell import CellClass
 
@@ -44,7 +44,8 @@ PLANES: dict[str, MapPlane] = {
 def test_page_of_a_map_is_whole(name: str, browser: Browser, tmp_path: Path) -> None:
     plane = PLANES[name]
     lines = tuple((LINE,) for _ in plane.panels)
-    write_map(StabilityMap(plane, lines, ("a remark",), ("trilat sweep a",), "P+d"), tmp_path)
+    chart = StabilityMap(plane, lines, ("a remark",), ("trilat sweep a",), "P+d")
+    MapReport(chart).write(tmp_path)
     assert_markdown_is_whole(browser, tmp_path / "map.md", pictures=1)
 
 

@@ -9,7 +9,8 @@ import pytest
 from trilat_studies.bench.bench_plan import plan_bench
 from trilat_studies.study_commands import parse_seeds
 from trilat_studies.sweep.margin_search import SearchRange
-from trilat_studies.sweep.sweep_plan import parse_axis, plan_sweep
+from trilat_studies.sweep.sweep_axis import SweepAxis
+from trilat_studies.sweep.sweep_plan import plan_sweep
 from trilat_studies.tuning import plan_tuning
 
 import trilat_net as tn
@@ -21,7 +22,7 @@ from trilat_net.errors import ScenarioError, UsageError
 
 FUNCTIONS: dict[str, Callable[..., object]] = {
     "make_env": tn.make_env,
-    "parse_axis": parse_axis,
+    "parse_axis": SweepAxis.parse,
     "SearchRange.parse": SearchRange.parse,
     "parse_seeds": parse_seeds,
     "plan_bench": plan_bench,

@@ -45,7 +45,7 @@ from trilat_net.analysis import EnvelopeFit, EnvelopeTrend, RestingLoop
 from trilat_net.core import BUCKETS_PER_S, Array
 from trilat_net.errors import UsageError
 from trilat_net.execution import FusedRun
-from trilat_net.log import open_log, read_link_delays
+from trilat_net.log import open_log
 from trilat_net.presentation import MARKS, Block, MarkedText, TextTable, describe_moving_states
 from trilat_net.results import Result, finite_or_none
 from trilat_net.scenario import BUILT_IN, Scenario, load_scenario
@@ -279,13 +279,12 @@ def _read_delay(delay: str | float) -> tuple[dict[str, Any], str]:
         return link, f"the delays of {path.name}"
 
     medians_ms = {}
-    try:
-        log = open_log(path)
-        for name in log.scenario.links:
-            delays_ms = [delay_ms for _, delay_ms in read_link_delays(path, name)]
-            medians_ms[name] = float(np.median(delays_ms))
-    except ValueError as error:
-        raise UsageError(f"--delay {text}: {error}") from None
+    log = open_log(path)
+    for name in log.scenario.links:
+        delays = log.link_delays[name]
+        if not delays:
+            raise UsageError(f"--delay {text}: no sample arrived over {name}")
+        medians_ms[name] = float(np.median([delay_ms for _, delay_ms in delays]))
     longest = max(medians_ms, key=lambda name: medians_ms[name])
     return {**link, "of": longest}, f"the delays of {longest} in {path.name}"
 

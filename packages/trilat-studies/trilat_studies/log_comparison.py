@@ -78,7 +78,7 @@ class _ComparisonRow(NamedTuple):
         return tuple(entry.value for entry in self.entries)
 
 
-class _MetricComparison(NamedTuple):
+class MetricComparison(NamedTuple):
     """Measured quantities of several runs side by side, as a table.
 
     Attributes:
@@ -102,50 +102,46 @@ class _MetricComparison(NamedTuple):
         row_by_key = {row.quantity.key: row for row in self.rows}
         return row_by_key[key]
 
+    @classmethod
+    def of_logs(cls, logs: Sequence[Log], names: Sequence[str] = ()) -> "MetricComparison":
+        """Computes the same quantities from several logs, to show them in one table.
 
-def compare_metrics(logs: Sequence[Log], names: Sequence[str] = ()) -> _MetricComparison:
-    """Computes the same quantities from several logs, to show them in one table.
+        Args:
+            logs: The logs, which may be torn, short or empty.
+            names: Names of the columns. By default the names of the logs' files.
 
-    Args:
-        logs: The logs, which may be torn, short or empty.
-        names: Names of the columns. By default the names of the logs' files.
+        Raises:
+            LogError: A record cannot be read, or names a change that is not valid.
+        """
+        measured = [LogMetrics.of_log(log) for log in logs]
+        rows = []
+        for quantity in Quantity.list_all():
+            entries = tuple(metrics.run_value(quantity) for metrics in measured)
+            if any(entry.applies for entry in entries):
+                rows.append(_ComparisonRow(quantity, entries))
+        columns = list(names)
+        if not columns:
+            columns = [Path(log.source).stem for log in logs]
+        return cls(tuple(columns), tuple(rows))
 
-    Raises:
-        LogError: A record cannot be read, or names a change that is not valid.
-    """
-    measured = [LogMetrics.of_log(log) for log in logs]
-    rows = []
-    for quantity in Quantity.list_all():
-        entries = tuple(metrics.run_value(quantity) for metrics in measured)
-        if any(entry.applies for entry in entries):
-            rows.append(_ComparisonRow(quantity, entries))
-    columns = list(names)
-    if not columns:
-        columns = [Path(log.source).stem for log in logs]
-    return _MetricComparison(tuple(columns), tuple(rows))
+    def to_dict(self) -> dict[str, Any]:
+        """Returns a comparison of runs as plain values, ready for JSON.
 
-
-def comparison_to_json(comparison: _MetricComparison) -> dict[str, Any]:
-    """Returns a comparison of runs as plain values, ready for JSON.
-
-    A missing value is `None`, with the reason next to it.
-
-    Args:
-        comparison: The comparison.
-    """
-    rows = []
-    for row in comparison.rows:
-        quantity = row.quantity
-        content = {
-            "key": quantity.key,
-            "name": quantity.name,
-            "unit": quantity.unit,
-            "group": quantity.group,
-            "values": list(row.values),
-            "unknown": [entry.why or None for entry in row.entries],
-        }
-        rows.append(content)
-    return {"columns": list(comparison.columns), "rows": rows}
+        A missing value is `None`, with the reason next to it.
+        """
+        rows = []
+        for row in self.rows:
+            quantity = row.quantity
+            content = {
+                "key": quantity.key,
+                "name": quantity.name,
+                "unit": quantity.unit,
+                "group": quantity.group,
+                "values": list(row.values),
+                "unknown": [entry.why or None for entry in row.entries],
+            }
+            rows.append(content)
+        return {"columns": list(self.columns), "rows": rows}
 
 
 @dataclass(frozen=True, repr=False)
@@ -164,7 +160,7 @@ class LogComparison(Result):
     """
 
     logs: tuple[Log, ...]
-    metrics: _MetricComparison
+    metrics: MetricComparison
     differences: list[ScenarioDifference]
     means: Sequence[MeanInterval | None]
     remarks: dict[str, list[str]]
@@ -328,7 +324,7 @@ class LogComparison(Result):
             "logs": logs,
             "differences": [difference._asdict() for difference in self.differences],
             "remarks": self.remarks,
-            **comparison_to_json(self.metrics),
+            **self.metrics.to_dict(),
         }
         if self.means:
             means = {}
@@ -383,7 +379,7 @@ def compare(*logs: str | Path | Log) -> LogComparison:
         verdict = describe_judgement(judgement)
         remarks[name] = [verdict, *check_final_posture(log)]
 
-    metrics = compare_metrics(opened, names)
+    metrics = MetricComparison.of_logs(opened, names)
     scenarios = [log.scenario for log in opened]
 
     return LogComparison(
@@ -467,7 +463,7 @@ def _name_columns(files: Sequence[Path]) -> list[str]:
 
 
 def _average_repeats(
-    logs: Sequence[Log], metrics: _MetricComparison
+    logs: Sequence[Log], metrics: MetricComparison
 ) -> list[MeanInterval | None]:
     """Averages each quantity over logs that repeat one experiment with different seeds.
 

@@ -1506,28 +1506,3 @@ def describe_program() -> tuple[str, dict[str, str]]:
     provenance = collect_provenance()
     versions = {name: provenance[name] for name in _VERSIONS}
     return compute_fingerprint(), versions
-
-
-def refuse_live_only(scenario: Scenario) -> None:
-    """Rejects a scenario that only a live session can run.
-
-    A live session has a real network, and may have real robots.
-
-    Args:
-        scenario: Description of the experiment.
-
-    Raises:
-        ScenarioError: An arm is external, or a link has the model "measured", with which the
-            real network determines the delay. In virtual time there is no real network.
-    """
-    scenario.refuse_external_arms()
-    if scenario.measured:
-        measured_links = [name for name, link in scenario.links.items() if link.measured]
-        path = f"links.{measured_links[0]}.model" if measured_links else "timeline"
-        raise ScenarioError(
-            "is 'measured', the delay of a real network: a scenario with such a link can only "
-            "run live; to run the scenario here, set another model, as in link.model=constant "
-            "and link.delay_ms=50",
-            path=path,
-            source=scenario.name,
-        )

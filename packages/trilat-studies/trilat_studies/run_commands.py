@@ -11,7 +11,7 @@ import tomli_w
 
 from trilat_net.errors import ScenarioError, join_arguments
 from trilat_net.own_code import name_law_classes
-from trilat_net.scenario import is_distribution
+from trilat_net.scenario import is_distribution, is_number
 
 
 def format_command(*arguments: str) -> str:
@@ -68,6 +68,16 @@ def format_toml_value(value: Any) -> str:
         raise ScenarioError(
             f"{value!r:.80} cannot be a value in a scenario: scenarios contain TOML values only"
         ) from None
+
+
+def format_override_value(value: Any) -> str:
+    """Returns the text of the value in an override KEY=VALUE.
+
+    Args:
+        value: A number, whose text parses back to exactly this number and has no decimal point
+            if the number is whole. Any other value, such as a word, becomes its text.
+    """
+    return repr(value).removesuffix(".0") if is_number(value) else str(value)
 
 
 def list_assignments(overrides: Mapping[str, Any], prefix: str = "") -> Iterator[str]:

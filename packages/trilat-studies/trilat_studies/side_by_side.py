@@ -6,8 +6,7 @@ which compiles the code if there are enough runs to be worth it. After the runs,
 `describe_runs_alone` names those that were computed one by one.
 """
 
-from collections import Counter
-from collections.abc import Hashable, Iterable, Mapping
+from collections.abc import Hashable, Mapping
 from functools import partial
 from typing import NamedTuple, TypeVar
 
@@ -99,8 +98,3 @@ def describe_runs_alone(reasons: Mapping[str, int], run_count: int) -> str:
     all_runs = count_nouns(run_count, "run")
     texts = ", ".join(f"{reason} ({count})" for reason, count in reasons.items())
     return f"{sum(reasons.values())} of {all_runs} were computed one by one: {texts}"
-
-
-def count_reasons(obstacles: Iterable[str]) -> Counter[str]:
-    """Counts the reasons why runs were computed alone. Empty texts are ignored."""
-    return Counter(filter(None, obstacles))

@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from trilat_net.app import flag, options, show_progress, value
+from trilat_net.app import options, show_progress, value
 from trilat_net.errors import UsageError, count_nouns, format_wall_time
 from trilat_net.net import SystemClock
 from trilat_net.presentation import terminal_output as terminal
@@ -51,10 +51,10 @@ def test_command(
     ] = None,
     live: Annotated[
         bool,
-        flag(
+        typer.Option(
             "--live/--virtual",
-            "Run the scenarios live over a network, one after another, instead of in virtual "
-            "time.",
+            help="Run the scenarios live over a network, one after another, instead of in "
+            "virtual time.",
         ),
     ] = False,
     seeds: Annotated[
@@ -270,7 +270,7 @@ def _run_tuning(
     from trilat_net.files import make_results_folder
     from trilat_net.work import count_workers
 
-    from .tuning.tuning_report import describe_procedure, write_tuning
+    from .tuning.tuning_report import TuningReport, describe_procedure
 
     workers = count_workers(jobs, on)
     name = plan.base.scenario.name
@@ -288,7 +288,7 @@ def _run_tuning(
 
     with terminal.progress_bar("searching") as progress:
         comparison = plan.run(jobs, progress, on)
-    paths = write_tuning(comparison, results_folder)
+    paths = TuningReport(comparison).write(results_folder)
     if not as_json:
         terminal.out.print()
     terminal.print_result(comparison, as_json=as_json)
@@ -619,7 +619,6 @@ def bench_command(
 
     from .bench import plan_bench, prepare_bench_folder
     from .bench.bench_figures import write_bench
-    from .bench.bench_plan import find_stale
     from .run_commands import format_command
 
     check_workers(jobs, on)
@@ -644,7 +643,7 @@ def bench_command(
         return
 
     tuned_gains = {str(planned.tuned): planned.tuned for planned in plan.cells}
-    stale = find_stale(tuned_gains.values())
+    stale = [str(gains) for gains in tuned_gains.values() if gains.is_stale]
     if stale:
         terminal.print_note(
             f"tuned for another version of the law or the task, see --tune: {', '.join(stale)}"

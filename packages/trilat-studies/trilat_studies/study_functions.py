@@ -166,15 +166,14 @@ def margin(
         UsageError: The range does not have the form KEY=LOW:HIGH.
     """
     from .sweep import plan_sweep
-    from .sweep.margin_search import SearchRange, SweepMargins, search_margins
-    from .sweep.sweep_plan import list_axes
+    from .sweep.margin_search import SearchRange, SweepMargins
+    from .sweep.sweep_axis import SweepAxis
 
     search_range = SearchRange.parse(along, tolerance)
-    axes = [*list_axes(over), search_range.format_axis()]
+    axes = [*SweepAxis.list_descriptions(over), search_range.format_axis()]
     overrides = _list_override_texts(set, duration_s)
     plan = plan_sweep(scenario, overrides, over=axes, seeds=seeds, laws=laws)
-    edges = search_margins(plan, search_range, jobs, on=on)
-    return SweepMargins(plan, search_range, edges)
+    return SweepMargins.search(plan, search_range, jobs, on=on)
 
 
 def tune(

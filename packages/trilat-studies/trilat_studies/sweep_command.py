@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from trilat_net.app import flag, options, show_progress, value
+from trilat_net.app import options, show_progress, value
 from trilat_net.errors import UsageError, count_nouns, format_wall_time, join_arguments
 from trilat_net.presentation import terminal_output as terminal
 
@@ -85,7 +85,7 @@ def _draw_map(
 
     from .sweep import read_results
     from .sweep.fixed_gains import FAIR_COMPARISON
-    from .sweep.map_page import write_map
+    from .sweep.map_page import MapReport
     from .sweep.stability_map import StabilityMap
 
     size = FigureSize.for_print(COLUMN_IN if width is None else width)
@@ -103,7 +103,7 @@ def _draw_map(
 
     terminal.print_texts(f"note: {remark}" for remark in stability_map.remarks)
     terminal.print_text("map: drawing ...")
-    paths = write_map(stability_map, folder, size.width_in)
+    paths = MapReport(stability_map).write(folder, size.width_in)
     terminal.print_texts(f"not swept: {text}" for text in stability_map.fixed)
     terminal.print_text(FAIR_COMPARISON)
     terminal.print_paths(paths)
@@ -132,17 +132,16 @@ def _search_margins(
     """
     from trilat_net.files import make_results_folder
 
-    from .sweep.margin_search import SweepMargins, search_margins
+    from .sweep.margin_search import SweepMargins
 
     results_folder = make_results_folder(folder, f"margin-{plan.base.name}", force=None)
     with (
         terminal.lines_aside(as_json),
         show_progress("searching", terminal.print_text, "places") as progress,
     ):
-        edges = search_margins(
+        margins = SweepMargins.search(
             plan=plan, within=search_range, jobs=jobs, progress=progress, on=on
         )
-        margins = SweepMargins(plan, search_range, edges)
 
     paths = margins.write(results_folder)
     if not as_json:
@@ -178,7 +177,7 @@ def _run_sweep(
 
     from .side_by_side import describe_runs_alone
     from .sweep import sweep_results, sweep_run
-    from .sweep.cell_groups import find_cell_groups
+    from .sweep.cell_groups import CellGroups
 
     existing_folder = None
     plan = new_plan
@@ -188,9 +187,9 @@ def _run_sweep(
         plan = existing_folder.plan
         finished_runs = existing_folder.read_done()
     assert plan is not None  # the caller gives a plan or a folder
-    terminal.print_texts(sweep_results.describe_sweep_plan(plan))
+    terminal.print_texts(plan.describe())
     if plan.judge != "linear":
-        terminal.print_texts(filter(None, [f"  {find_cell_groups(plan).sentence}".rstrip()]))
+        terminal.print_texts(filter(None, [f"  {CellGroups.of_plan(plan).sentence}".rstrip()]))
     if existing_folder is not None:
         done_text = count_nouns(len(finished_runs), "run is", "runs are")
         terminal.print_text(f"  {done_text} done already")
@@ -252,11 +251,17 @@ def _print_results(results: "SweepResults", remarks: list[str], path: Path) -> N
         remarks: Lines to print after the summary.
         path: Folder of the sweep.
     """
-    from .sweep.sweep_results import list_next_commands, summarize_sweep
+    from .run_commands import format_command
 
-    terminal.print_texts(summarize_sweep(results))
+    terminal.print_texts(results.summarize())
     terminal.print_texts(remarks)
-    terminal.print_texts(f"  {command}" for command in list_next_commands(path))
+    command = format_command("sweep", str(path))
+    terminal.print_texts(
+        [
+            f"  {command} --cell 0      # the command that makes a log of a cell",
+            f"  {command} --map         # its map, with the lines of theory",
+        ]
+    )
 
 
 def _print_cell_commands(path: Path, number: int, *, as_json: bool) -> None:
@@ -308,7 +313,9 @@ def sweep_command(
     cell: Annotated[int | None, value("--cell", "N")] = None,
     jobs: options.JobsOption = None,
     on: options.OnOption = None,
-    yes: Annotated[bool, flag("--yes", "Run the sweep even if it is very large.")] = False,
+    yes: Annotated[
+        bool, typer.Option("--yes", help="Run the sweep even if it is very large.")
+    ] = False,
     overrides: options.SetOption = None,
     mapped: Annotated[
         bool,
@@ -437,14 +444,14 @@ def _show_results(
         draw: Function that draws the map. If `None`, no map is drawn.
         as_json: True to print the results as JSON in addition.
     """
-    from .sweep.sweep_results import describe_sweep_plan, read_results
+    from .sweep.sweep_results import read_results
 
     results = read_results(path)
     with terminal.lines_aside(as_json):
         if draw is not None:
             draw(results, path if path.is_dir() else path.parent)
         else:
-            terminal.print_texts(describe_sweep_plan(results.plan))
+            terminal.print_texts(results.plan.describe())
             _print_results(results, [], path)
     if as_json:
         terminal.print_json(results.to_dict())

@@ -50,7 +50,7 @@ from trilat_net.work import MAX_LOSSES, MeanInterval, WorkerPool, Workers, open_
 
 from .measure_run import ExpectationResult, RunMetrics
 from .run_commands import format_command, list_assignments, set_options
-from .side_by_side import RunKind, count_reasons, describe_runs_alone, prepare_kinds
+from .side_by_side import RunKind, describe_runs_alone, prepare_kinds
 
 
 class TrialResult(NamedTuple):
@@ -347,7 +347,7 @@ class _ExpectationRow(NamedTuple):
         """
         mark = "ok" if self.held == self.runs else "FAIL"
         worst = self.worst
-        margin = format_margin(self.worst.margin)
+        margin = _format_margin(self.worst.margin)
         held = f"{self.held}/{self.runs}"
         return mark, self.scenario, self.key, worst.limit, worst.measured, margin, held
 
@@ -460,7 +460,7 @@ class TrialReport(Result):
         speed = f": {simulated_s / self.wall_s:.3g}x" if self.wall_s > 0.0 else ""
         runs = count_nouns(len(self.results), "run")
         remarks.append(f"{runs}, {simulated_s:.6g} s {kind} in {self.wall_s:.1f} s{speed}")
-        reasons = count_reasons(result.alone for result in self.results)
+        reasons = Counter(result.alone for result in self.results if result.alone)
         remarks += filter(None, [describe_runs_alone(reasons, len(self.results))])
         return remarks
 
@@ -775,7 +775,7 @@ def check(
     return report
 
 
-def format_margin(margin: float | None) -> str:
+def _format_margin(margin: float | None) -> str:
     """Returns a margin as a text in percent, with a sign.
 
     Margins below 10 % have one decimal place.
@@ -877,7 +877,7 @@ def _describe_outcome(outcome: ExpectationResult) -> str:
     Example: "FAIL error_rad: 0.031 rad, expected at most 0.02 rad".
     """
     mark = "ok" if outcome.held else "FAIL"
-    margin = "" if outcome.margin is None else f" ({format_margin(outcome.margin)})"
+    margin = "" if outcome.margin is None else f" ({_format_margin(outcome.margin)})"
     return f"{mark} {outcome.key}: {outcome.measured}, expected {outcome.limit}{margin}"
 
 

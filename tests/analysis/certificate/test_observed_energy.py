@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from trilat_studies.tuning.tuning_report import list_energy_notes
+from trilat_studies.tuning.tuning_report import TuningReport
 
 from tests.energy_runs import CONSTANT, FOLLOWER, JITTER, LAWS, make_energy_pair
 from tests.log.builders import drop_records, edit_log_bytes, make_log_bytes, open_bytes
@@ -277,11 +277,11 @@ def test_three_texts_explain_negative_energy_alike() -> None:
     tuned: Any = SimpleNamespace(
         found=[SimpleNamespace(space=SimpleNamespace(law=law)) for law in ("p_d", "tdpa")]
     )
-    (note,) = list_energy_notes(tuned)
+    (note,) = TuningReport(tuned).list_energy_notes()
     assert note.startswith("tdpa declare")
     assert note.endswith(NEGATIVE_ENERGY_MEANING)
     tuned.found.pop()
-    assert list_energy_notes(tuned) == []
+    assert TuningReport(tuned).list_energy_notes() == []
 
 
 def test_a_complete_brief_run_satisfies_all_premises() -> None:

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from trilat_studies.log_comparison import compare_metrics, comparison_to_json
+from trilat_studies.log_comparison import MetricComparison
 
 import trilat_net
 from tests.analysis.builders import (
@@ -150,7 +150,7 @@ def test_a_row_is_the_largest_or_the_sum() -> None:
             "q_des": [0.0, 0.0],
         }
     )
-    comparison = compare_metrics([log, log], ["a", "b"])
+    comparison = MetricComparison.of_logs([log, log], ["a", "b"])
     assert comparison.columns == ("a", "b")
     assert comparison.row("peak_tau_nm").values == (4.0, 4.0)
     assert comparison.row("effort_nm2_s").values == pytest.approx((25.0 * 4.0, 25.0 * 4.0))
@@ -161,7 +161,7 @@ def test_runs_lack_figures_missing_at_a_site() -> None:
     """A largest value of some sites is none of the run; sites that cannot have the figure do not count."""
     log = make_run("free", {"duration_s": 1.0, "rate_hz": 100}).log
     torn = rewrite_log(log, lambda state: state.site != "m2")
-    row = compare_metrics([log, torn]).row("max_error_rad")
+    row = MetricComparison.of_logs([log, torn]).row("max_error_rad")
     assert row.values[0] is not None
     assert row.values[1] is None
     assert row.entries[1].why == "m2: no records of m2"
@@ -170,18 +170,18 @@ def test_runs_lack_figures_missing_at_a_site() -> None:
 def test_rows_without_any_value_are_left_out() -> None:
     free = make_run("free", {"duration_s": 1.0, "rate_hz": 100}).log
     wall = make_run("contact", {"duration_s": 1.0, "rate_hz": 100}).log
-    keys = [row.quantity.key for row in compare_metrics([free]).rows]
+    keys = [row.quantity.key for row in MetricComparison.of_logs([free]).rows]
     assert "force_peak_n" not in keys
     assert "late_p99_us" not in keys
-    both = compare_metrics([free, wall]).row("force_peak_n")
+    both = MetricComparison.of_logs([free, wall]).row("force_peak_n")
     assert both.values == (None, 0.0)
     with pytest.raises(KeyError):
-        compare_metrics([free]).row("force_peak_n")
+        MetricComparison.of_logs([free]).row("force_peak_n")
 
 
 def test_json_has_value_and_reason_per_column() -> None:
     free = make_run("free", {"duration_s": 1.0, "rate_hz": 100}).log
-    facts = json.loads(json.dumps(comparison_to_json(compare_metrics([free])), allow_nan=False))
+    facts = json.loads(json.dumps(MetricComparison.of_logs([free]).to_dict(), allow_nan=False))
     assert facts["columns"] == ["log"]
     for row in facts["rows"]:
         assert (row["values"][0] is None) == (row["unknown"][0] is not None)

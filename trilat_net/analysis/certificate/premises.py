@@ -27,7 +27,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ...core import DominanceMatrix
-from ...log import Coverage, Log, judge_integrity
+from ...log import Coverage, Log
 from ...net import HALTED_MODES
 from ..aligned import Bools
 from ..dominance_history import (
@@ -248,7 +248,7 @@ class RunFacts(NamedTuple):
             coverage=Coverage(recorded_ticks, expected_ticks),
             functional_share=functional_share,
             min_coverage=min_coverage,
-            integrity=judge_integrity(log),
+            integrity=log.judge_integrity(),
             unmet=tuple(site for site in log.sites if site not in log.executed_sites),
         )
 

@@ -23,7 +23,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ...core import POSE, POSITION, Array, Law
-from ...log import Log, choose_nearest_vectors, compute_task_errors
+from ...log import Log, RotationVectors, compute_task_errors
 from ...results import JsonObject
 from ...scenario import END_WINDOW_S, Scenario
 from .. import site_signals
@@ -185,10 +185,8 @@ def _compute_undelayed_error(
         positions = motion.q
         if records.x.shape[1] == POSE:
             # a rotation vector and its other branch must not be averaged
-            orientations = choose_nearest_vectors(
-                positions[:, POSITION:], records.x[:, POSITION:]
-            )
-            positions[:, POSITION:] = orientations
+            orientations = RotationVectors(positions[:, POSITION:])
+            positions[:, POSITION:] = orientations.nearest_to(records.x[:, POSITION:])
         reference += alpha[:, np.newaxis] * positions
     if records.x.size:
         return compute_task_errors(records.x, reference, records.axes), is_known
@@ -238,7 +236,8 @@ def _measure_spread(view: RunView, _run: str) -> MetricValues:
     # by a whole turn
     if sites[0].x.shape[1] == POSE:
         for orientations in poses[1:, :, POSITION:]:
-            orientations[:] = choose_nearest_vectors(orientations, poses[0, :, POSITION:])
+            turns = RotationVectors(orientations)
+            orientations[:] = turns.nearest_to(poses[0, :, POSITION:])
 
     spread = np.ptp(poses, axis=0)
     axes = [records.axes for records in sites]

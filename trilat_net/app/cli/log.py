@@ -56,10 +56,8 @@ def log_check_command(
     with terminal.progress_bar(f"checking {files[0]}") as progress:
         check = check_file(*files, progress=progress)
     if key is not None:
-        from ...log import check_signatures
-
         with terminal.progress_bar(f"checking the signature of {files[0]}") as progress:
-            check.findings.append(check_signatures(files, key, progress))
+            check.check_signatures(key, progress)
     terminal.print_result(check, as_json=as_json)
     if not as_json:
         if not check.ours:
@@ -157,7 +155,7 @@ def log_export_command(
             that the sites exchange.
         output: File or folder to write; default: next to FILE, with a name derived from it.
     """
-    from ...log import open_logs
+    from ...log import Log
     from ...presentation import Exporter
 
     pairs = [text.partition("=") for text in settings or []]
@@ -168,7 +166,7 @@ def log_export_command(
     exporter = Exporter(form, output, force=force, log=files[0], settings=format_settings)
 
     with terminal.progress_bar(f"reading {files[0]}") as progress:
-        logs = open_logs(*files, progress=progress)
+        logs = Log.open_sessions(*files, progress=progress)
     for log in logs:
         terminal.warn_of_damage(log)
     with terminal.progress_bar(f"writing {exporter.path}") as progress:

@@ -493,8 +493,7 @@ def rerun_command(
     react.
     """
     from ...execution import rerun
-    from ...files import refuse_existing
-    from ...log import active_path
+    from ...log import LogStorage
 
     if output is not None:
         is_input = any(
@@ -505,7 +504,8 @@ def rerun_command(
                 f"{output}: this file is the log that is being read; choose another name for "
                 "the output"
             )
-        refuse_existing(output, force=force, unfinished=active_path(output))
+        # Refuses an existing output before the run is computed.
+        LogStorage(output, force=force).find_first_part()
     log = laws.open(*files)
     with terminal.progress_bar(f"executing {files[0]}") as progress:
         result = rerun(

@@ -34,7 +34,6 @@ from ...log import (
     SESSION,
     SITE_CHANNELS,
     ChannelFilter,
-    McapMessage,
     McapReader,
     Progress,
 )
@@ -266,7 +265,7 @@ class _PlayedChannel:
         # Index of each start of the site, by its boot.
         self._starts: dict[int, int] = {}
 
-    def find_number(self, item: McapMessage, t_ns: int) -> int:
+    def find_number(self, sequence: int, payload: bytes, t_ns: int) -> int:
         """Finds the number by which a message is ordered among the messages of its channel.
 
         The messages of a channel are played in the order of their numbers. Three kinds of
@@ -282,18 +281,19 @@ class _PlayedChannel:
         because it counts the events and the starts of the site.
 
         Args:
-            item: The message, as the file contains it.
+            sequence: Sequence number of the message in the file.
+            payload: The encoded message.
             t_ns: Time of the message, in ns after the start of the session.
 
         Returns:
             The number, as `PlayedMessage` defines it.
         """
         if self.kind in (topics.STATE, topics.LINK):
-            return number_message(self.kind, item.sequence, self.rate_hz)
+            return number_message(self.kind, sequence, self.rate_hz)
         if self.kind != topics.EVENT:
             return t_ns
 
-        header = _decode_header(item.payload)
+        header = _decode_header(payload)
         event_index = self._event_count
         self._event_count += 1
         has_number = header.n >= 0
@@ -362,7 +362,7 @@ class SessionReader:
                 # The reader has read the metadata when it yields the first message.
                 epoch_ns, header = self._read_session(path, reader)
 
-            t_ns = self._find_time_ns(item, epoch_ns)
+            t_ns = self._find_time_ns(item.publish_time_ns, item.log_time_ns, epoch_ns)
             arrival_ns = item.log_time_ns - epoch_ns
             # A message arrives later than it was sent, but by less than the horizon.
             if stop_ns is not None and arrival_ns > stop_ns + HORIZON_NS:
@@ -382,7 +382,7 @@ class SessionReader:
                 if boot >= 0:
                     header.boots[channel.site] = boot
 
-            number = channel.find_number(item, t_ns)
+            number = channel.find_number(item.sequence, item.payload, t_ns)
             if channel.channel_number >= 0 and self._selection.contains(t_ns):
                 yield t_ns, channel.channel_number, number, item.payload
 
@@ -393,21 +393,22 @@ class SessionReader:
         elif reader.damaged:
             header.torn[path] = f"damaged in {count_nouns(len(reader.damaged), 'place')}"
 
-    def _find_time_ns(self, item: McapMessage, epoch_ns: int) -> int:
+    def _find_time_ns(self, sent_ns: int, arrived_ns: int, epoch_ns: int) -> int:
         """Returns the time at which a message is played, in ns after the start of the session.
 
         A message was sent at one time and arrived at a later time. The user chooses which of
         the two times is used.
 
         Args:
-            item: The message.
+            sent_ns: Time at which the message was sent, in Unix time, in ns.
+            arrived_ns: Time at which the message arrived, in Unix time, in ns.
             epoch_ns: Start of the session, in Unix time, in ns.
         """
-        t_ns = item.log_time_ns
+        t_ns = arrived_ns
         # An impossible sending time is replaced by the arrival time.
-        is_possible = abs(item.publish_time_ns - t_ns) <= HORIZON_NS
+        is_possible = abs(sent_ns - arrived_ns) <= HORIZON_NS
         if self._selection.time == "publish" and is_possible:
-            t_ns = item.publish_time_ns
+            t_ns = sent_ns
         return min(max(t_ns - epoch_ns, -_LAST), _LAST)
 
     def _read_session(self, path: Path, reader: McapReader) -> tuple[int, SessionHeader]:

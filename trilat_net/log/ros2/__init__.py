@@ -27,12 +27,10 @@ __all__ = [
     "SESSION_CHANNELS",
     "Ros2Channels",
     "Ros2SiteChannels",
+    "Ros2Topics",
     "SiteMessages",
-    "list_log_topics",
-    "list_topics",
     "pack_event",
     "pack_session_diagnostics",
-    "read_ros2_channels",
     "ros2_messages",
     # Names of topics
     "DIAGNOSTICS",
@@ -53,9 +51,8 @@ if TYPE_CHECKING:
     from .cdr import FLOAT64_ARRAY, JOINT_STATE, POSE, STRING, TRANSFORMS
     from .published import (
         COMMON_TOPICS,
+        Ros2Topics,
         SiteMessages,
-        list_log_topics,
-        list_topics,
         pack_session_diagnostics,
     )
     from .robot_model import SPACING_M, WORLD
@@ -69,7 +66,6 @@ if TYPE_CHECKING:
         Ros2Channels,
         Ros2SiteChannels,
         pack_event,
-        read_ros2_channels,
     )
     from .rviz_config import build_rviz_config, write_rviz_config
     from .topic_names import (
@@ -85,14 +81,11 @@ else:
         __name__,
         {
             "cdr": "FLOAT64_ARRAY JOINT_STATE POSE STRING TRANSFORMS cdr",
-            "published": (
-                "COMMON_TOPICS SiteMessages list_log_topics list_topics "
-                "pack_session_diagnostics"
-            ),
+            "published": ("COMMON_TOPICS Ros2Topics SiteMessages pack_session_diagnostics"),
             "robot_model": "SPACING_M WORLD",
             "ros2_messages": (
                 "EVENTS FRAMES LINES NUMBERS_BY_MODE_WORD Ros2Channels Ros2SiteChannels "
-                "SENT_PREFIX SESSION_CHANNELS pack_event read_ros2_channels ros2_messages"
+                "SENT_PREFIX SESSION_CHANNELS pack_event ros2_messages"
             ),
             "rviz_config": "build_rviz_config write_rviz_config",
             "topic_names": (

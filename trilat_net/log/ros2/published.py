@@ -13,11 +13,17 @@ Invariant:
     - A message is encoded only if its topic is wanted.
 """
 
+import struct
 from collections.abc import Callable, Iterable, Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING
 
+from mcap.exceptions import McapError
+from mcap.reader import SeekingReader
+
 from ...core import POSE, POSITION
-from ...log import QuaternionSigns
+from ...files import reading
+from ...log import VIZ_ROOT, QuaternionSigns
 from ...net import LinkStats, State
 from ...scenario import Scenario
 from . import cdr
@@ -36,8 +42,7 @@ if TYPE_CHECKING:
     from ...log import Log
 
 Topics = dict[str, Ros2Channel]
-"""Topics by name: by the name within trilat-net for one site, by the full name for a session.
-"""
+"""Descriptions of the topics of one site, by their names within trilat-net."""
 
 IsWanted = Callable[[str], bool]
 """Function that returns True if the message of a topic is needed, by its name in trilat-net."""
@@ -64,43 +69,90 @@ COMMON_TOPICS = {
 """Topics that all sessions have in common, by their names without the leading "/"."""
 
 
-def list_topics(scenario: Scenario, session: str, table: TopicTable) -> Topics:
-    """Lists all ROS 2 topics under which a session is published, by the bridge or in a bag.
-
-    Args:
-        scenario: Scenario of the session, its description in a TOML file.
-        session: Name of the session.
-        table: Names of the topics in ROS 2.
-
-    Returns:
-        The description of each topic, by its full name, which begins with "/".
-    """
-    topics = {f"/{name}": channel for name, channel in COMMON_TOPICS.items()}
-    for name, channel in SESSION_CHANNELS.items():
-        topics[f"/{session}/{name}"] = channel
-    for site in scenario.names:
-        site_messages = SiteMessages(scenario, site, epoch_unix_ns=0)
-        for name, channel in site_messages.topics.items():
-            topic = table.find(session, site, name)
-            topics[f"/{topic}"] = channel
-    return topics
+_INDEX_ERRORS = (
+    McapError,
+    EOFError,
+    OSError,
+    struct.error,
+    ValueError,
+    OverflowError,
+)
+"""Errors of the library `mcap` for a file whose index cannot be read."""
 
 
-def list_log_topics(log: "Log") -> Topics:
-    """Lists the ROS 2 topics under which a bridge would publish the session of a log live.
+class Ros2Topics(dict[str, Ros2Channel]):
+    """Descriptions of ROS 2 topics, by their full names, which begin with "/"."""
 
-    Files for viewers then work for the log and for the live session. The names follow the first
-    of the built-in conventions.
+    @classmethod
+    def of_session(cls, scenario: Scenario, session: str, table: TopicTable) -> "Ros2Topics":
+        """Lists all topics under which a session is published, by the bridge or in a bag.
 
-    Args:
-        log: Log of the session.
+        Args:
+            scenario: Scenario of the session, its description in a TOML file.
+            session: Name of the session.
+            table: Names of the topics in ROS 2.
+        """
+        topics = cls()
+        for name, channel in COMMON_TOPICS.items():
+            topics[f"/{name}"] = channel
+        for name, channel in SESSION_CHANNELS.items():
+            topics[f"/{session}/{name}"] = channel
+        for site in scenario.names:
+            site_messages = SiteMessages(scenario, site, epoch_unix_ns=0)
+            for name, channel in site_messages.topics.items():
+                topic = table.find(session, site, name)
+                topics[f"/{topic}"] = channel
+        return topics
 
-    Returns:
-        The description of each topic, by its full name, which begins with "/".
-    """
-    session = make_session_name(log.session["session"])
-    table = TopicTable.read(NAMINGS[0])
-    return list_topics(log.scenario, session, table)
+    @classmethod
+    def of_log(cls, log: "Log") -> "Ros2Topics":
+        """Lists the topics under which a bridge would publish the session of a log live.
+
+        Files for viewers then work for the log and for the live session. The names follow the
+        first of the built-in conventions.
+
+        Args:
+            log: Log of the session.
+        """
+        session = make_session_name(log.session["session"])
+        table = TopicTable.read(NAMINGS[0])
+        return cls.of_session(log.scenario, session, table)
+
+    @classmethod
+    def of_file(cls, path: Path) -> "Ros2Topics":
+        """Lists the standard ROS 2 channels that a finished log or bag contains.
+
+        Args:
+            path: The file.
+
+        Returns:
+            The descriptions of the channels, by topic. Empty if the file has no readable index.
+
+        Raises:
+            LogError: The file cannot be opened.
+        """
+        with reading(path) as stream:
+            try:
+                summary = SeekingReader(stream).get_summary()
+            except _INDEX_ERRORS:
+                summary = None
+        topics = cls()
+        if summary is None:
+            return topics
+        for _, channel in sorted(summary.channels.items()):
+            schema = summary.schemas.get(channel.schema_id)
+            is_ros2 = channel.message_encoding == cdr.ENCODING
+            if is_ros2 and schema is not None:
+                topics[channel.topic] = Ros2Channel(schema.name, dict(channel.metadata))
+        return topics
+
+    @property
+    def are_of_log(self) -> bool:
+        """True if the topics are those that a log contains for viewers, and not those of a bag.
+
+        False for a file without topics.
+        """
+        return any(topic.startswith(VIZ_ROOT) for topic in self)
 
 
 class SiteMessages:

@@ -13,18 +13,13 @@ Invariant:
 """
 
 import math
-import struct
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from itertools import product
-from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from mcap.exceptions import McapError
-from mcap.reader import make_reader
 
 from ...core import POSITION
-from ...files import reading
 from ...log import McapWriter, compute_task_errors
 from ...net import MODE_WORDS, Event, LinkStats, State
 from ...records import Mode, TickRecord
@@ -46,15 +41,6 @@ FRAMES = "tf"
 
 NamedMessages = Iterator[tuple[str, bytes]]
 """Encoded messages, each with the name of its channel or topic."""
-_INDEX_ERRORS = (
-    McapError,
-    EOFError,
-    OSError,
-    struct.error,
-    ValueError,
-    OverflowError,
-)
-"""Errors of the library `mcap` for a file whose index cannot be read."""
 
 
 class Ros2Channel(NamedTuple):
@@ -461,36 +447,6 @@ def _make_sent_arrays(scenario: Scenario, site: str) -> ArrayChannels:
 def _convert_to_ms(us: int) -> float:
     """Converts a time to ms. The value -1, a time that was not measured, becomes NaN."""
     return us / 1e3 if us != -1 else math.nan
-
-
-def read_ros2_channels(path: Path) -> dict[str, Ros2Channel]:
-    """Lists the standard ROS 2 channels that a finished file contains.
-
-    Args:
-        path: The file.
-
-    Returns:
-        The descriptions of the channels, by topic. Empty if the file has no readable index.
-
-    Raises:
-        LogError: The file cannot be opened.
-    """
-    with reading(path) as stream:
-        try:
-            summary = make_reader(stream).get_summary()
-        except _INDEX_ERRORS:
-            summary = None
-    if summary is None:
-        return {}
-    channels: dict[str, Ros2Channel] = {}
-    numbered_channels = sorted(summary.channels.items())
-    for _, channel in numbered_channels:
-        schema = summary.schemas.get(channel.schema_id)
-        is_ros2 = channel.message_encoding == cdr.ENCODING
-        if is_ros2 and schema is not None:
-            metadata = dict(channel.metadata)
-            channels[channel.topic] = Ros2Channel(schema.name, metadata)
-    return channels
 
 
 Record = State | TickRecord

@@ -20,11 +20,11 @@ from string import Template
 
 from ...errors import UsageError
 from ...files import refuse_existing, write_whole
-from ...log import VIZ_ROOT, open_log
+from ...log import open_log
 from .cdr import DEFINITIONS, POSE
-from .published import list_log_topics
+from .published import Ros2Topics
 from .robot_model import SPACING_M, WORLD
-from .ros2_messages import Ros2Channel, read_ros2_channels
+from .ros2_messages import Ros2Channel
 
 _SUFFIX = ".rviz"
 """Suffix of the templates, and of configurations."""
@@ -48,10 +48,10 @@ def write_rviz_config(log: Path, *, force: bool = False) -> Path:
     """
     path = log.with_suffix(_SUFFIX)
     refuse_existing(path, force=force)
-    channels = read_ros2_channels(log)
-    is_log = any(topic.startswith(VIZ_ROOT) for topic in channels)
-    is_bag = bool(channels) and not is_log
-    topics = channels if is_bag else list_log_topics(open_log(log))
+    topics = Ros2Topics.of_file(log)
+    is_bag = bool(topics) and not topics.are_of_log
+    if not is_bag:
+        topics = Ros2Topics.of_log(open_log(log))
     write_whole(path, build_rviz_config(topics), force=force)
     return path
 

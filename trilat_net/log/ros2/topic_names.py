@@ -19,9 +19,10 @@ from typing import Any, NamedTuple
 
 import msgspec
 
-from ...errors import UsageError, suggest_nearest
+from ...errors import UsageError, count_nouns, suggest_nearest
 from ...files import open_regular
 from ...net.ros2 import check_ros_name
+from ...scenario import Scenario
 
 NAMINGS = ("crisp", "crtk")
 """The two built-in conventions: CRISP, and the Collaborative Robotics Toolkit (CRTK)."""
@@ -92,6 +93,42 @@ class TopicTable(NamedTuple):
     names: Mapping[str, str]
     of_site: Mapping[str, Mapping[str, str]] = {}
     robots: Mapping[str, RobotTable] = {}
+
+    def refuse_other_robots(self, scenario: Scenario) -> None:
+        """Checks that each robot belongs to a site with an external arm of as many joints.
+
+        An external arm is a real arm, or a simulation in another program. The settings of a
+        robot have a meaning only for a site with such an arm. Settings that equal the defaults
+        are tolerated for other sites of the scenario, because they have no effect.
+
+        Args:
+            scenario: Scenario of the session.
+
+        Raises:
+            UsageError: A site without an external arm has settings of a robot, the scenario has
+                no such site, or the robot has another number of joints than the arm of its
+                site.
+        """
+        for site, robot in self.robots.items():
+            has_external_arm = site in scenario.outside
+            is_unknown = site not in scenario.names
+            differs_from_defaults = robot != RobotTable()
+            if not has_external_arm and (differs_from_defaults or is_unknown):
+                outside = ", ".join(scenario.outside) or "none"
+                raise UsageError(
+                    f"--names: sites.{site}: no site of this name has an external arm; sites "
+                    f"with an external arm: {outside}"
+                )
+
+            if has_external_arm and robot.joints:
+                joints = scenario.arms[site].joint_names
+                if len(robot.joints) != len(joints):
+                    names_text = count_nouns(len(robot.joints), "name")
+                    joints_text = count_nouns(len(joints), "joint")
+                    raise UsageError(
+                        f"--names: sites.{site}.joints has {names_text}, but the arm of {site} "
+                        f"has {joints_text}: {', '.join(joints)}"
+                    )
 
     def find(self, session: str, site: str, topic: str) -> str:
         """Returns the full name of a site's topic in ROS 2, without the first /.

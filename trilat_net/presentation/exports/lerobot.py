@@ -42,7 +42,7 @@ from ...log import MATRIX_ENTRIES, Ints, Log, collect_provenance, expand_poses
 from ...records import NS_PER_S
 from ...scenario import TASK_AXES
 from ..export import EXPORT_MANIFEST, ExportFormat, Written
-from ..plugin_observation import find_plugin_actions, observe_as_plugin
+from ..lerobot_observation import find_plugin_actions, observe_as_plugin
 
 _EXTRA = ("pyarrow.parquet", "lerobot", "datasets of LeRobot")
 _FILE = "chunk-000/file-000.parquet"

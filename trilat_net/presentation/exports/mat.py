@@ -15,7 +15,7 @@ import numpy as np
 from ...errors import UsageError
 from ...files import import_extra
 from ...log import Column, Log, Table
-from ..export import ExportFormat, Written, name_inside, read_texts, store_tables
+from ..export import ExportFormat, Written, name_inside, store_tables
 
 _EXTRA = ("scipy.io", "mat", "MAT files")
 _MAX_EXACT_INTEGER = 2**53
@@ -96,7 +96,7 @@ def _convert_column(column: Column, table: Table) -> Any:
     """
     if column.is_text:
         is_event_table = not table.kind
-        return column.values.reshape(-1, 1) if is_event_table else read_texts(column)
+        return column.values.reshape(-1, 1) if is_event_table else column.texts()
 
     values = column.numbers()
     is_stamp = column.unit == "ns" and not column.name.startswith("drift")

@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ...log import Column, Log, Table
-from ..export import ExportFormat, Written, name_inside, read_texts, store_tables
+from ...log import Log, Table
+from ..export import ExportFormat, Written, name_inside, store_tables
 
 
 def _write(log: Log, path: Path, written: Written) -> None:
@@ -32,7 +32,8 @@ def _write(log: Log, path: Path, written: Written) -> None:
             table_name: Name of the table, which is the first part of the names of its arrays.
         """
         for column in table.columns:
-            arrays[f"{table_name}/{column.name}"] = _build_array(column)
+            values = column.texts() if column.is_text else column.numbers()
+            arrays[f"{table_name}/{column.name}"] = values
 
     description = store_tables(log, written, _name_table, store)
     arrays["about_json"] = np.array(description)
@@ -45,11 +46,6 @@ def _write(log: Log, path: Path, written: Written) -> None:
 def _name_table(table: Table) -> str:
     """Returns the name of a table in the file, such as "m1" or "m1/link"."""
     return name_inside(table, table.name, "/")
-
-
-def _build_array(column: Column) -> NDArray[Any]:
-    """Returns the values of a column as an array of numbers or of texts."""
-    return read_texts(column) if column.is_text else column.numbers()
 
 
 FORMAT = ExportFormat(_write, ".npz")

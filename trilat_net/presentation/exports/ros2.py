@@ -25,10 +25,10 @@ from ...log.ros2 import (
     DIAGNOSTICS,
     FRAMES_TOPIC,
     NAMINGS,
+    Ros2Topics,
     SiteMessages,
     TopicTable,
     cdr,
-    list_topics,
     make_session_name,
     pack_session_diagnostics,
     ros2_messages,
@@ -98,7 +98,7 @@ def export_ros2(
             data=log.scenario_text.encode(),
         )
         channels = {}
-        topics = list_topics(log.scenario, session, table)
+        topics = Ros2Topics.of_session(log.scenario, session, table)
         for topic, channel in topics.items():
             channels[topic] = _add_quality(channel)
         channel_numbers = ros2_messages.StandardChannels(file, channels)

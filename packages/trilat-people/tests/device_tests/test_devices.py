@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 from trilat_people.devices import open_device
 from trilat_people.devices.haply_inverse3 import HaplyInverse3
-from trilat_people.devices.spacemouse import SpaceMouse, find_spacemouse
+from trilat_people.devices.spacemouse import SpaceMouse
 
 from tests.cli.running import trilat
 from tests.net.manual_clock import ManualClock
@@ -245,6 +245,6 @@ def test_a_spacemouse_is_found_by_its_maker(maker: str, tmp_path: Path) -> None:
         (tmp_path / name / "device" / "uevent").write_text(
             f"DRIVER=hid-generic\nHID_ID={made_by}\n"
         )
-    assert find_spacemouse(tmp_path) == "/dev/hidraw1"
+    assert SpaceMouse.find(tmp_path) == "/dev/hidraw1"
     with pytest.raises(FileNotFoundError, match="no SpaceMouse"):
-        find_spacemouse(tmp_path / "nothing")
+        SpaceMouse.find(tmp_path / "nothing")

@@ -7,7 +7,7 @@ from typing import Any
 
 import msgspec
 import pytest
-from trilat_people.experiment.protocol import ExperimentPlan, ExperimentProtocol, list_orders
+from trilat_people.experiment.protocol import ExperimentPlan, ExperimentProtocol
 from trilat_people.experiment.questionnaires import Questionnaire
 from trilat_people.experiment.trial_run import ExperimentTrial
 
@@ -46,6 +46,12 @@ def test_keys_of_a_site_leave_its_others() -> None:
     assert plan.scenarios["near"].dominance["s"] == {"m1": 0.8, "m2": 0.2}
     assert plan.scenarios["far"].dominance == paper.dominance
     assert plan.scenarios["far"].sites["s"].qd0_rad_s == (0.1, 0.1)
+
+
+def list_orders(design: str, names: list[str], seed: int = 1) -> list[tuple[str, ...]]:
+    """Returns the orders of conditions of these names."""
+    conditions = {name: {"link.delay_ms": n} for n, name in enumerate(names)}
+    return make_protocol(design=design, conditions=conditions, seed=seed).list_orders()
 
 
 @pytest.mark.parametrize("count", [2, 3, 4, 5, 6, 7])

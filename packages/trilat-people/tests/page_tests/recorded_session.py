@@ -12,7 +12,7 @@ from typing import Any
 
 from playwright.sync_api import Browser, Page, WebSocketRoute
 from trilat_people.live_page.experiment_stage import Stage
-from trilat_people.live_page.session_frames import SessionFrames, render_event
+from trilat_people.live_page.session_frames import SessionFrames
 from trilat_people.live_page.session_view import SessionView
 
 from tests.live.page_client import with_query
@@ -169,9 +169,7 @@ def _record(
             added = {
                 "points": pages.points.since(point_count, 10_000),
                 "energies": pages.energies.since(energy_count, 10_000),
-                "events": [
-                    render_event(event) for event in view.events.since(event_count, 100)
-                ],
+                "events": pages.list_events(event_count, 100),
             }
             point_count = pages.points.count
             energy_count = pages.energies.count

@@ -26,22 +26,6 @@ _BUTTON_REPORT = 3
 """Number of the reports that contain the buttons."""
 
 
-def find_spacemouse(devices: Path = Path("/sys/class/hidraw")) -> str:
-    """Returns the file of the first SpaceMouse that is connected, such as "/dev/hidraw3".
-
-    Args:
-        devices: Folder in which Linux lists the hidraw devices.
-
-    Raises:
-        FileNotFoundError: No SpaceMouse is connected.
-    """
-    for uevent in sorted(devices.glob("*/device/uevent")):
-        identity = uevent.read_text(encoding="utf-8")
-        if any(maker in identity for maker in _MAKER_IDS):
-            return f"/dev/{uevent.parts[-3]}"
-    raise FileNotFoundError("no SpaceMouse is connected")
-
-
 class SpaceMouse:
     """A SpaceMouse, a cap that is deflected by hand, as an input device without forces.
 
@@ -63,7 +47,7 @@ class SpaceMouse:
         self._file = -1
 
     def __enter__(self) -> Self:
-        self._file = os.open(self._address or find_spacemouse(), os.O_RDONLY | os.O_NONBLOCK)
+        self._file = os.open(self._address or self.find(), os.O_RDONLY | os.O_NONBLOCK)
         self._position_m: Vector = (0.0, 0.0, 0.0)
         self._velocity_m_s = self._position_m
         self._button_bits = 0
@@ -72,6 +56,22 @@ class SpaceMouse:
         self._reported_ns = now_ns
         self._read_ns = now_ns
         return self
+
+    @staticmethod
+    def find(devices: Path = Path("/sys/class/hidraw")) -> str:
+        """Returns the file of the first SpaceMouse that is connected, such as "/dev/hidraw3".
+
+        Args:
+            devices: Folder in which Linux lists the hidraw devices.
+
+        Raises:
+            FileNotFoundError: No SpaceMouse is connected.
+        """
+        for uevent in sorted(devices.glob("*/device/uevent")):
+            identity = uevent.read_text(encoding="utf-8")
+            if any(maker in identity for maker in _MAKER_IDS):
+                return f"/dev/{uevent.parts[-3]}"
+        raise FileNotFoundError("no SpaceMouse is connected")
 
     def __exit__(self, *_: object) -> None:
         os.close(self._file)

@@ -21,11 +21,11 @@ Statistical Association 53 (1958); Conover, "Practical nonparametric statistics"
 import math
 from collections.abc import Sequence
 from itertools import combinations
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
-from .statistics import CONFIDENCE, Row, correct_holm, import_scipy_stats, read_number
+from .statistics import CONFIDENCE, Row, correct_holm, read_number
 
 COMPLETION = "completion_s"
 """Column of the completion times."""
@@ -191,13 +191,13 @@ def summarise_times(
             timed_out=timed_out_count,
             number=len(medians),
             median=_replace_infinity(find_median(medians)),
-            interval=find_median_interval(medians),
+            interval=_find_median_interval(medians),
         )
         summaries.append(summary)
     return summaries
 
 
-def find_median_interval(times_s: Sequence[float]) -> tuple[float, float | None] | None:
+def _find_median_interval(times_s: Sequence[float]) -> tuple[float, float | None] | None:
     """Returns a confidence interval of at least 95 % for a median, by order statistics.
 
     The r-th smallest and the r-th largest time enclose the median with probability 1 - 2 P(B <
@@ -211,9 +211,12 @@ def find_median_interval(times_s: Sequence[float]) -> tuple[float, float | None]
         Lower and upper end, in s. The upper end is `None` if it was not reached. The whole
         interval is `None` if there is no such rank, which is the case for fewer than six times.
     """
+    # imported late: the import takes half a second, and trials do not need it
+    from scipy import stats
+
     sorted_s = sorted(times_s)
     tail_probability = (1.0 - CONFIDENCE) / 2.0
-    binomial = import_scipy_stats().binom(len(sorted_s), 0.5)
+    binomial = stats.binom(len(sorted_s), 0.5)
     candidates = range(1, len(sorted_s) // 2 + 1)
     ranks = [rank for rank in candidates if float(binomial.cdf(rank - 1)) <= tail_probability]
     if not ranks:
@@ -269,13 +272,16 @@ def _compare(
         pairs: Medians of each unit under both conditions, in s. A median that was not reached
             is infinite.
     """
+    # imported late: the import takes half a second, and trials do not need it
+    from scipy import stats
+
     longer = sum(second_s > first_s for first_s, second_s in pairs)
     shorter = sum(second_s < first_s for first_s, second_s in pairs)
     untied = longer + shorter
 
     p_value = None
     if untied > 1:  # a single unit cannot show a difference
-        p_value = float(import_scipy_stats().binomtest(longer, untied).pvalue)
+        p_value = float(stats.binomtest(longer, untied).pvalue)
 
     return CompletionComparison(
         first=first,
@@ -319,19 +325,3 @@ def _find_median_difference(pairs: Sequence[tuple[float, float]]) -> float | Non
 def _replace_infinity(time_s: float) -> float | None:
     """Returns a median for a result: `None` instead of infinity if it was not reached."""
     return time_s if math.isfinite(time_s) else None
-
-
-def to_table(
-    results: Sequence[CompletionTime] | Sequence[CompletionComparison],
-) -> list[dict[str, Any]]:
-    """Converts completion times, or comparisons of them, to table rows for CSV and JSON.
-
-    A completion time is the time that a participant needs for a trial.
-
-    Args:
-        results: Completion times of conditions, or their comparisons.
-
-    Returns:
-        A row per condition or comparison, with the field names as keys.
-    """
-    return [result._asdict() for result in results]

@@ -40,7 +40,6 @@ from .completion_times import (
     find_unit_medians,
     is_completed,
     summarise_times,
-    to_table,
 )
 from .condition_figures import draw_conditions, draw_learning, draw_times
 from .experiment_run import Experiment, open_experiment
@@ -619,8 +618,8 @@ class ExperimentAnalysis(Result):
             "comparisons.csv": self.to_rows(),
         }
         optional_tables = {
-            "completion_times.csv": to_table(self.times),
-            "completion_comparisons.csv": to_table(self.time_comparisons),
+            "completion_times.csv": _list_rows(self.times),
+            "completion_comparisons.csv": _list_rows(self.time_comparisons),
             "missing_answers.csv": [answers._asdict() for answers in self.missing_answers],
         }
         tables |= {name: rows for name, rows in optional_tables.items() if rows}
@@ -735,8 +734,8 @@ class ExperimentAnalysis(Result):
             "digest": self._experiment.plan.digest,
             "conditions": self._list_means(),
             "comparisons": self.to_rows(),
-            "completion_times": to_table(self.times),
-            "completion_comparisons": to_table(self.time_comparisons),
+            "completion_times": _list_rows(self.times),
+            "completion_comparisons": _list_rows(self.time_comparisons),
             "missing_answers": [answers._asdict() for answers in self.missing_answers],
             "absent": self.absent,
             "mixed_models": models,
@@ -916,6 +915,17 @@ class ExperimentAnalysis(Result):
         alignment = "l" + "r" * len(conditions)
         yield TextTable(("measure", *conditions), rows, align=alignment)
         yield ""
+
+
+def _list_rows(
+    results: Sequence[CompletionTime] | Sequence[CompletionComparison],
+) -> list[dict[str, Any]]:
+    """Converts completion times, or comparisons of them, to table rows for CSV and JSON.
+
+    Returns:
+        A row per condition or comparison, with the field names as keys.
+    """
+    return [result._asdict() for result in results]
 
 
 def analyse_experiment(

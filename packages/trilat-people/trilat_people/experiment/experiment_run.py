@@ -41,7 +41,7 @@ from .completion_times import COMPLETION, find_median, is_completed
 from .protocol import Choices, ExperimentPlan, ExperimentProtocol, PlannedTrial
 from .questionnaires import CHOICE
 from .staircase import COMPARISON, Staircase
-from .trial_run import TrialEntry, run_trial
+from .trial_run import SyntheticTrial, TrialEntry
 
 PROTOCOL_FILE = "protocol.toml"
 PLAN_FILE = "protocol.json"
@@ -278,7 +278,12 @@ class Experiment(Result):
             most_workers = len(tasks) or 1
             with open_worker_pool(jobs, on, most=most_workers, hint=self._remedy) as pool:
                 journal.run_pending(
-                    pool, run_trial, tasks, len(finished_trials), len(plan.trials), show
+                    pool,
+                    SyntheticTrial.run_task,
+                    tasks,
+                    len(finished_trials),
+                    len(plan.trials),
+                    show,
                 )
 
         self.write_tables()

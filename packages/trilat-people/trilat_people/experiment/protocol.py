@@ -313,6 +313,51 @@ class ExperimentProtocol(Frozen, frozen=True):
             limited_sites[user] = replace(site_settings, hands=hands)
         return limited_sites
 
+    def list_orders(self) -> list[tuple[str, ...]]:
+        """Lists orders of the conditions, which are assigned to participants in turn.
+
+        Participants improve with practice and deteriorate with fatigue. If the orders of the
+        conditions differ between participants, these effects are on average the same for all
+        conditions.
+
+        The design "williams" has each condition equally often at each position, and equally
+        often right after each other condition (Williams 1949); an odd number of conditions
+        needs twice as many orders. "latin" is a cyclic Latin square, which balances only the
+        positions. "random" has 1000 random permutations, drawn with the seed of the protocol.
+        "fixed" is the order of `conditions`.
+        """
+        conditions = list(self.conditions)
+        count = len(conditions)
+        if self.design == "fixed":
+            return [tuple(conditions)]
+
+        if self.design == "random":
+            random = np.random.default_rng(self.seed)
+            names = np.array(conditions)
+            orders: list[tuple[str, ...]] = []
+            for _ in range(1000):
+                order = names[random.permutation(count)]
+                orders.append(tuple(order.tolist()))
+            return orders
+
+        # Each row of the square is an order, as indices of conditions.
+        first_row = list(range(count))
+        if self.design == "williams":
+            # The first row is 0, 1, n - 1, 2, n - 2, ...
+            first_row = [0]
+            for step in range(1, count // 2 + 1):
+                first_row += [step, count - step]
+            first_row = first_row[:count]
+
+        rows = []
+        for shift in range(count):
+            row = [(index + shift) % count for index in first_row]
+            rows.append(row)
+        if self.design == "williams" and count % 2:
+            # For an odd number, only the rows and their mirror images together are balanced.
+            rows += [row[::-1] for row in rows]
+        return [tuple(conditions[index] for index in row) for row in rows]
+
 
 class PlannedTrial(NamedTuple):
     """One trial of an experiment, with its participants, condition and place in the order.
@@ -775,7 +820,7 @@ def _find_group_problems(protocol: ExperimentProtocol) -> Iterator[str]:
         participants = count_nouns(name_count, "participant")
         yield f"{participants} cannot form pairs: the number of participants must be even"
 
-    orders = list_orders(protocol.design, list(protocol.conditions), protocol.seed)
+    orders = protocol.list_orders()
     group_count = len(protocol.groups)
     if protocol.design in ("williams", "latin") and group_count % len(orders):
         units_text = "pairs" if len(users) == 2 else "participants"
@@ -856,62 +901,15 @@ def _check_scenario(scenario: Scenario, protocol: ExperimentProtocol) -> Scenari
     return scenario
 
 
-def list_orders(design: str, conditions: Sequence[str], seed: int) -> list[tuple[str, ...]]:
-    """Lists orders of the experiment's conditions, which are assigned to participants in turn.
-
-    Participants improve with practice and deteriorate with fatigue. If the orders of the
-    conditions differ between participants, these effects are on average the same for all
-    conditions.
-
-    Args:
-        design: "williams": each condition is equally often at each position, and equally often
-            right after each other condition (Williams 1949); an odd number of conditions needs
-            twice as many orders. "latin": a cyclic Latin square, which balances only the
-            positions. "random": 1000 random permutations. "fixed": the order of `conditions`.
-        conditions: Names of the conditions.
-        seed: Seed of random permutations.
-    """
-    count = len(conditions)
-    if design == "fixed":
-        return [tuple(conditions)]
-
-    if design == "random":
-        random = np.random.default_rng(seed)
-        names = np.array(conditions)
-        orders: list[tuple[str, ...]] = []
-        for _ in range(1000):
-            order = names[random.permutation(count)]
-            orders.append(tuple(order.tolist()))
-        return orders
-
-    # Each row of the square is an order, as indices of conditions.
-    first_row = list(range(count))
-    if design == "williams":
-        # The first row is 0, 1, n - 1, 2, n - 2, ...
-        first_row = [0]
-        for step in range(1, count // 2 + 1):
-            first_row += [step, count - step]
-        first_row = first_row[:count]
-
-    rows = []
-    for shift in range(count):
-        row = [(index + shift) % count for index in first_row]
-        rows.append(row)
-    if design == "williams" and count % 2:
-        # For an odd number, only the rows and their mirror images together are balanced.
-        rows += [row[::-1] for row in rows]
-    return [tuple(conditions[index] for index in row) for row in rows]
-
-
 def _list_trials(protocol: ExperimentProtocol) -> Iterator[PlannedTrial]:
     """Yields all trials of an experiment in their order.
 
     Each group of participants does one block of trials per condition. The order of the
-    conditions is the next order that `list_orders` returns. A block begins with practice
-    trials. The further trials are those of `ExperimentProtocol.list_phases`: a trial has a
-    phase (of a training or of a staircase, otherwise empty), and a lead, the first user's share
-    of the authority over the slave arm. The condition of a catch trial differs from that of its
-    block. Numbers start at 1, and indices at 0.
+    conditions is the next order that `ExperimentProtocol.list_orders` returns. A block begins
+    with practice trials. The further trials are those of `ExperimentProtocol.list_phases`: a
+    trial has a phase (of a training or of a staircase, otherwise empty), and a lead, the first
+    user's share of the authority over the slave arm. The condition of a catch trial differs
+    from that of its block. Numbers start at 1, and indices at 0.
 
     Each random quantity has a generator of its own, whose seed contains the seed of the
     protocol, the group and the block. A last number distinguishes the quantities: none for the
@@ -921,7 +919,7 @@ def _list_trials(protocol: ExperimentProtocol) -> Iterator[PlannedTrial]:
     Args:
         protocol: Design of the experiment: conditions, task and participants.
     """
-    orders = list_orders(protocol.design, list(protocol.conditions), protocol.seed)
+    orders = protocol.list_orders()
     groups = list(enumerate(protocol.groups))
     blocks = range(len(protocol.conditions))
     number = 0

@@ -1,6 +1,6 @@
 """Defines the tasks of an experiment: reach a target, hand over, press a wall, track a path.
 
-A protocol defines a `TrialTask` with its parameters, such as the distance of the targets. For
+A protocol defines a `_TrialTask` with its parameters, such as the distance of the targets. For
 each trial, the task creates a `TrialGoal`. The goal computes the position of the target at any
 time, and judges the result of the trial. The participants move the slave arm over the network
 with their master arms.
@@ -28,7 +28,7 @@ Metres = Annotated[float, Meta(gt=0.0, le=10.0)]
 Seconds = Annotated[float, Meta(gt=0.0, le=600.0)]
 
 
-class TrialTask(Frozen, frozen=True, tag_field="kind"):
+class _TrialTask(Frozen, frozen=True, tag_field="kind"):
     """A task for the participants, as a protocol defines it: reach, press or follow.
 
     The task is the same for all trials. `make_goal` creates the goal of a single trial.
@@ -235,7 +235,7 @@ class Outcome(NamedTuple):
     ended_s: float
 
 
-class ReachTrial(TrialTask, frozen=True, tag="reach"):
+class ReachTrial(_TrialTask, frozen=True, tag="reach"):
     """Task of an experiment: move the arm to targets on a ring, as in ISO 9241-411.
 
     Each target is opposite the previous target.
@@ -509,7 +509,7 @@ class _ReachGoal(_DwellGoal):
         return super()._judge(t_s, position_m, force_n)
 
 
-class ContactTrial(TrialTask, frozen=True, tag="contact"):
+class ContactTrial(_TrialTask, frozen=True, tag="contact"):
     """Task of an experiment: press a wall with a given force, and hold it for some time.
 
     Attributes:
@@ -603,7 +603,7 @@ class _ContactGoal(_DwellGoal):
         return error_n <= self._tolerance_n
 
 
-class TrackTrial(TrialTask, frozen=True, tag="track"):
+class TrackTrial(_TrialTask, frozen=True, tag="track"):
     """The task to follow a target that moves unpredictably along one axis.
 
     The path is a sum of sines whose frequencies have no common multiple.

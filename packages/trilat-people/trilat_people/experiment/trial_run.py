@@ -24,7 +24,6 @@ from msgspec.structs import replace
 
 from trilat_net.analysis import (
     AlignedRecords,
-    DelayDistribution,
     TorqueSplit,
     build_arm_rows,
 )
@@ -279,7 +278,8 @@ class ExperimentTrial:
         Returns:
             The magnitudes, shape (K,).
         """
-        forces = self._rows.place_end_effector(q, 0.0 * q).find_force(tau_x)
+        at_rest = 0.0 * q
+        forces = self._rows.place_end_effector(q, at_rest).find_force(tau_x)
         magnitude_n: Array = np.linalg.norm(forces, axis=1)
         return magnitude_n
 
@@ -384,7 +384,7 @@ class ExperimentTrial:
         if len(forces) > 1:
             measures |= self._measure_pair(aligned, forces, outcome.ended_s)
 
-        age_ms = DelayDistribution.measure_ages_ns(log, self.slave, users[0]) / 1e6
+        age_ms = log.sample_ages_ns(self.slave, users[0]) / 1e6
         mean_age_ms = 0.0
         if len(age_ms):
             mean_age_ms = float(age_ms.mean())
@@ -408,6 +408,7 @@ class ExperimentTrial:
         is_between = has_started & (records.t_s <= end_s)
         indices = np.flatnonzero(is_between)[::RECORD_STEP]
 
+        # The velocities are computed from differences below.
         q = records.q[indices]
         end_effector = self._rows.place_end_effector(q, 0.0 * q)
         positions_m = end_effector.position
@@ -637,24 +638,24 @@ class SyntheticTrial(ExperimentTrial):
         )
         return self.settle(path)
 
+    @staticmethod
+    def run_task(task: tuple[ExperimentProtocol, str, PlannedTrial, str, Path]) -> TrialEntry:
+        """Runs a trial of synthetic participants, models of people, and keeps its log.
 
-def run_trial(task: tuple[ExperimentProtocol, str, PlannedTrial, str, Path]) -> TrialEntry:
-    """Runs a trial of synthetic participants, which are models of people, and keeps its log.
+        Worker processes call this method. All inputs are in one argument, because it is sent
+        to the worker as a whole.
 
-    Worker processes call this function. All inputs are in one argument, because it is sent to
-    the worker as a whole.
+        Args:
+            task: The protocol of the experiment, the text of the scenario, the planned trial,
+                the digest that identifies the plan of all trials, and the folder of the log.
 
-    Args:
-        task: The protocol of the experiment, the text of the scenario, the planned trial, the
-            digest that identifies the plan of all trials, and the folder of the log.
+        Returns:
+            The result of the trial.
 
-    Returns:
-        The result of the trial.
-
-    Raises:
-        LogError: The written log does not reproduce the run.
-    """
-    protocol, text, planned, digest, folder = task
-    scenario = parse_scenario(text)
-    trial = SyntheticTrial(protocol, scenario, planned, digest)
-    return trial.write(folder / planned.file)
+        Raises:
+            LogError: The written log does not reproduce the run.
+        """
+        protocol, text, planned, digest, folder = task
+        scenario = parse_scenario(text)
+        trial = SyntheticTrial(protocol, scenario, planned, digest)
+        return trial.write(folder / planned.file)

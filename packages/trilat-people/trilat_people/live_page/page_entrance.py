@@ -71,7 +71,7 @@ class Strangers:
 class _SeatedPage(Protocol):
     """Describes the fields of an open web page that are needed to limit the number of pages.
 
-    The class `page_server.Page` has these fields.
+    The class `page_server._Page` has these fields.
 
     Attributes:
         role: Role of the person at the page: experimenter, user of one arm, or watcher.
@@ -85,17 +85,6 @@ class _SeatedPage(Protocol):
 
 
 Page = TypeVar("Page", bound=_SeatedPage)
-
-
-def is_full(pages: Iterable[_SeatedPage], role: Role) -> bool:
-    """Returns True if no further web page of a role may be opened.
-
-    Args:
-        pages: The open pages of all roles.
-        role: The role whose pages are counted.
-    """
-    role_pages = _list_pages_of_role(pages, role)
-    return len(role_pages) >= MAX_PAGES[role.kind]
 
 
 def choose_page_to_close(pages: Iterable[Page], role: Role) -> Page | None:

@@ -140,7 +140,7 @@ class StopArms(PageMessage, frozen=True, kw_only=True, tag="stop"):
     """
 
 
-class ReleaseArms(PageMessage, frozen=True, kw_only=True, tag="release"):
+class _ReleaseArms(PageMessage, frozen=True, kw_only=True, tag="release"):
     """Request of a web page to let stopped arms move again, or to reset arms after a fault.
 
     Attributes:
@@ -153,7 +153,7 @@ class ReleaseArms(PageMessage, frozen=True, kw_only=True, tag="release"):
     sites: Annotated[list[Name], Meta(min_length=1, max_length=16)]
 
 
-class SetLink(PageMessage, frozen=True, kw_only=True, tag="link"):
+class _SetLink(PageMessage, frozen=True, kw_only=True, tag="link"):
     """Request of a page to change the delay or other settings of a network link.
 
     A link is the connection in one direction between two sites, the processes that each control
@@ -168,7 +168,7 @@ class SetLink(PageMessage, frozen=True, kw_only=True, tag="link"):
     to: Annotated[dict[Name, float | Name], Meta(max_length=8)]
 
 
-class SetShares(PageMessage, frozen=True, kw_only=True, tag="shares"):
+class _SetShares(PageMessage, frozen=True, kw_only=True, tag="shares"):
     """Request of a page to change the weights with which an arm follows the other arms.
 
     These weights are called dominance factors.
@@ -182,7 +182,7 @@ class SetShares(PageMessage, frozen=True, kw_only=True, tag="shares"):
     to: Annotated[dict[Name, float], Meta(max_length=16)]
 
 
-class MarkMoment(PageMessage, frozen=True, kw_only=True, tag="mark"):
+class _MarkMoment(PageMessage, frozen=True, kw_only=True, tag="mark"):
     """Request of a web page to mark the present moment in the log, by an event with a text.
 
     Attributes:
@@ -251,18 +251,19 @@ class AbortTrial(PageMessage, frozen=True, kw_only=True, tag="abort"):
     why: Annotated[str, Meta(max_length=200)] = ""
 
 
-Order = SetLink | SetShares
+SiteOrder = _SetLink | _SetShares | _ReleaseArms | _MarkMoment
+"""Request of a page that `OrderDesk.accept` passes on to sites."""
 StageMessage = DoStep | AbortTrial
 _ANY_MESSAGE = reduce(or_, PageMessage.__subclasses__())
 _DECODER = msgspec.json.Decoder(_ANY_MESSAGE)
 _RATES: dict[type[PageMessage], tuple[float, int]] = {
     PageMessage: (240.0, 480),
     MoveHand: (200.0, 400),
-    MarkMoment: (2.0, 10),
+    _MarkMoment: (2.0, 10),
     TakePart: (1.0, 5),
     AnswerPage: (1.0, 5),
     StopArms: (5.0, 10),
-    ReleaseArms: (5.0, 10),
+    _ReleaseArms: (5.0, 10),
     DoStep: (2.0, 5),
     AbortTrial: (1.0, 3),
 }
@@ -586,8 +587,30 @@ class OrderDesk:
             refused = Counter()
         self.refused = refused
 
-    def queue_change(
-        self, order: Order, sites: Collection[str], links: Collection[str], source: str = ""
+    def accept(
+        self, order: SiteOrder, sites: Collection[str], links: Collection[str], source: str = ""
+    ) -> None:
+        """Queues the request of a page that changes the session, moves arms, or marks a moment.
+
+        Args:
+            order: The request.
+            sites: Names of the sites of the session. The first one publishes a mark.
+            links: Names of the links of the session.
+            source: Sender of the request, for the events in the log.
+        """
+        if isinstance(order, _SetLink | _SetShares):
+            self._queue_change(order, sites, links, source)
+        elif isinstance(order, _ReleaseArms):
+            self._release(order, sites, source)
+        elif sites:
+            self.mark(next(iter(sites)), order.text)
+
+    def _queue_change(
+        self,
+        order: _SetLink | _SetShares,
+        sites: Collection[str],
+        links: Collection[str],
+        source: str,
     ) -> None:
         """Queues a request to change the settings of a link, or the weights of a site.
 
@@ -602,7 +625,7 @@ class OrderDesk:
             links: Names of the links of the session.
             source: Sender of the request, for the site's event.
         """
-        if isinstance(order, SetLink):
+        if isinstance(order, _SetLink):
             if order.link not in links:
                 self.refused["no such link"] += 1
                 return
@@ -637,7 +660,7 @@ class OrderDesk:
             self._pending.pop((site, RELEASE), None)
             self._send_request(site, topics.STOP, request)
 
-    def release(self, order: ReleaseArms, sites: Collection[str], source: str = "") -> None:
+    def _release(self, order: _ReleaseArms, sites: Collection[str], source: str) -> None:
         """Queues requests to let stopped arms move again, or to reset arms after a fault.
 
         A request that names a site outside the session is refused and counted.
@@ -757,7 +780,7 @@ def _add_source(request: ChangeRequest, source: str) -> ChangeRequest:
     return msgspec.structs.replace(request, source=source)
 
 
-def _make_link_request(order: SetLink) -> ChangeRequest:
+def _make_link_request(order: _SetLink) -> ChangeRequest:
     """Returns the request that changes the settings of a link as requested by a page.
 
     The page sets a delay and its standard deviation. Unless the page names a preset, a delay

@@ -56,31 +56,28 @@ from trilat_net.net import (
 )
 from trilat_net.process import raise_priority
 
-from .page_entrance import Strangers, choose_page_to_close, is_full
+from .page_entrance import Strangers, choose_page_to_close
 from .page_files import PageFiles
 from .page_opening import BrowserOpening
 from .page_orders import (
     MAX_MESSAGE_BYTES,
     AnswerPage,
     EndSession,
-    MarkMoment,
     MessageLimits,
     MoveHand,
     OrderDesk,
     PageHands,
     PageMessage,
-    ReleaseArms,
     Role,
     RoleLinks,
     Seen,
-    SetLink,
-    SetShares,
     ShowAges,
+    SiteOrder,
     StageMessage,
     StopArms,
     TakePart,
 )
-from .session_frames import SessionFrames, render_event
+from .session_frames import SessionFrames
 from .session_view import SessionView
 
 # The libraries of experiments are loaded for experiments only.
@@ -191,7 +188,7 @@ class _Visitor(ServerConnection):
         super().send_data()
 
 
-class Page:
+class _Page:
     """State of one page that is open in a browser: its rights, and the data sent to it.
 
     The server sends frames, messages from which the page draws the session. A frame describes
@@ -232,7 +229,7 @@ class Page:
         self.role = role
         self.hands = hands
         self.takes_part = takes_part
-        self.asks: tuple[set[Page], int] | None = None
+        self.asks: tuple[set[_Page], int] | None = None
 
         # Frames that were sent and drawn.
         self.wake = asyncio.Event()
@@ -360,7 +357,7 @@ class PageServer:
         self._scheme = "http" if self._tls is None else "https"
 
         # Connected pages, and the session that they show.
-        self._pages: set[Page] = set()
+        self._pages: set[_Page] = set()
         self.refused: Counter[str] = Counter()
         self._next_session: tuple[Bus, str] | None = None
         self._switch_session(bus, session)
@@ -671,7 +668,11 @@ class PageServer:
 
         if target.path == "/socket":
             role = self._links.find(target.query)
-            if role is not None and role.kind == "watcher" and is_full(self._pages, role):
+            if (
+                role is not None
+                and role.kind == "watcher"
+                and choose_page_to_close(self._pages, role) is not None
+            ):
                 self.refused["too many watchers"] += 1
                 return connection.respond(HTTPStatus.SERVICE_UNAVAILABLE, "too many watchers\n")
             return None
@@ -717,7 +718,7 @@ class PageServer:
         takes_part = role.kind == "user"
         if role.kind == "experimenter":
             takes_part = not any(other.takes_part for other in self.experimenters)
-        page = Page(connection, self._page_count, role, hands, takes_part=takes_part)
+        page = _Page(connection, self._page_count, role, hands, takes_part=takes_part)
 
         self._close_page_for(role)
         self._pages.add(page)
@@ -764,7 +765,7 @@ class PageServer:
         self._closing.add(task)
         task.add_done_callback(self._closing.discard)
 
-    def _receive(self, page: Page, text: str | bytes) -> None:
+    def _receive(self, page: _Page, text: str | bytes) -> None:
         """Decodes and handles a message of a web page, unless the page sends too many messages.
 
         A message that releases an arm is always handled, because continuing to hold the arm
@@ -788,7 +789,7 @@ class PageServer:
         except Exception as error:
             self._count_failure("message", error)
 
-    def _handle_message(self, page: Page, message: PageMessage) -> None:
+    def _handle_message(self, page: _Page, message: PageMessage) -> None:
         """Carries out the request in a page's message if the page has the right to it.
 
         A request without the right is counted as refused, with the reason. The right depends on
@@ -815,7 +816,7 @@ class PageServer:
         else:
             self._control_session(page, message)
 
-    def _note_drawn_frame(self, page: Page, frame_number: int) -> None:
+    def _note_drawn_frame(self, page: _Page, frame_number: int) -> None:
         """Records that a web page has drawn a frame, and can receive newer frames.
 
         A slow browser is thus not flooded.
@@ -829,7 +830,7 @@ class PageServer:
             page.unseen.popleft()
         page.wake.set()
 
-    def _control_session(self, page: Page, message: PageMessage) -> None:
+    def _control_session(self, page: _Page, message: PageMessage) -> None:
         """Carries out a request of a page that moves an arm or changes the session.
 
         For example, an experimenter changes the delay of a link, or a user moves an arm with
@@ -841,13 +842,8 @@ class PageServer:
         """
         view = self.view
 
-        if isinstance(message, SetLink | SetShares):
-            self._desk.queue_change(message, view.sites, view.links, page.role.noun)
-        elif isinstance(message, ReleaseArms):
-            self._desk.release(message, view.sites, page.role.noun)
-        elif isinstance(message, MarkMoment):
-            if view.scenario is not None:
-                self._desk.mark(view.scenario.names[0], message.text)
+        if isinstance(message, SiteOrder):
+            self._desk.accept(message, view.sites, view.links, page.role.noun)
         elif isinstance(message, ShowAges):
             self._shows_ages = message.shown
         elif isinstance(message, MoveHand):
@@ -864,7 +860,7 @@ class PageServer:
         elif isinstance(message, EndSession) and self._ends:
             self.end_requested.set()
 
-    def _request_part(self, page: Page, want: bool) -> None:
+    def _request_part(self, page: _Page, want: bool) -> None:
         """Handles a page's request for the right to control the session, or its return.
 
         If other pages hold an arm, the page gets the right only if they agree.
@@ -886,14 +882,14 @@ class PageServer:
                 page.takes_part = True
 
     @property
-    def experimenters(self) -> set[Page]:
+    def experimenters(self) -> set[_Page]:
         """The open web pages of experimenters.
 
         The pages that take part control the session.
         """
         return {page for page in set(self._pages) if page.role.kind == "experimenter"}
 
-    def _answer_request(self, page: Page, answer: AnswerPage) -> None:
+    def _answer_request(self, page: _Page, answer: AnswerPage) -> None:
         """Applies the answer of a page to another page's request to control the session.
 
         An answer to a request that does not exist, or that was sent to other pages, is counted
@@ -931,7 +927,7 @@ class PageServer:
                 page.takes_part = not is_arm_held
                 page.asks = None
 
-    def _list_held_sites(self, page: Page) -> list[str]:
+    def _list_held_sites(self, page: _Page) -> list[str]:
         """Lists the arms that the person at a web page holds, by the names of their sites.
 
         The holder of an arm is only known from the records of its site (arm controller). Before
@@ -944,7 +940,7 @@ class PageServer:
                 held_sites.append(name)
         return held_sites
 
-    async def _send(self, page: Page) -> None:
+    async def _send(self, page: _Page) -> None:
         """Sends a web page the newest frame each time the page has drawn an earlier frame.
 
         The first message is a greeting with the constants of the session. A page for a site
@@ -980,7 +976,7 @@ class PageServer:
                 page.greeted = has_begun
                 await page.connection.send(payload, text=True)
 
-    def _is_frame_due(self, page: Page, *, has_begun: bool) -> bool:
+    def _is_frame_due(self, page: _Page, *, has_begun: bool) -> bool:
         """Returns True if the page should receive the newest frame now.
 
         A page that has not drawn the previous frame yet gets no new frame, so that messages do
@@ -1000,7 +996,7 @@ class PageServer:
             return True
         return self._frame_number - page.sent >= WAITING_FRAME_STEP
 
-    def _describe_greeting(self, page: Page) -> dict[str, Any]:
+    def _describe_greeting(self, page: _Page) -> dict[str, Any]:
         """Returns the first message to a page, with the constants of the session.
 
         The message has the single key "hello". Its value contains the constants, the role of
@@ -1027,7 +1023,7 @@ class PageServer:
         }
         return {"hello": fields}
 
-    def _describe_stage(self, page: Page, t_s: float | None = None) -> dict[str, Any]:
+    def _describe_stage(self, page: _Page, t_s: float | None = None) -> dict[str, Any]:
         """Returns the facts of the present step of an experiment that a web page shows.
 
         The result is empty if there is no experiment.
@@ -1041,7 +1037,7 @@ class PageServer:
         role = page.role
         return {"stage": self._stage.describe(role.kind, role.site, page.number, t_s)}
 
-    def _describe_frame(self, page: Page) -> dict[str, Any]:
+    def _describe_frame(self, page: _Page) -> dict[str, Any]:
         """Returns the newest frame for a page: the state of the session and of the page itself.
 
         A frame is a message from which the page draws the session, about 30 times a second. The
@@ -1084,7 +1080,7 @@ class PageServer:
             **self._describe_stage(page, state["t"]),
         }
 
-    def _list_requests(self, page: Page) -> list[int]:
+    def _list_requests(self, page: _Page) -> list[int]:
         """Lists the numbers of the pages that wait for this page's permission to take part."""
         numbers: list[int] = []
         for other in self._pages:
@@ -1094,7 +1090,7 @@ class PageServer:
                     numbers.append(other.number)
         return numbers
 
-    def _list_notices(self, page: Page) -> list[dict[str, Any]]:
+    def _list_notices(self, page: _Page) -> list[dict[str, Any]]:
         """Lists the replies of sites (arm controllers) that a web page has not received yet.
 
         The replies name keys and commands, which only an experimenter can use. Pages of other
@@ -1129,7 +1125,7 @@ class PageServer:
         hidden_fields: dict[str, Any] = {"points": [], "energies": [], "events": []}
         return {**self._frames_as_site[site], **hidden_fields}
 
-    def _describe_all(self, page: Page) -> dict[str, Any]:
+    def _describe_all(self, page: _Page) -> dict[str, Any]:
         """Returns the frame for a web page that sees everything, with new points and events.
 
         The numbers of points and events that were sent to the page are stored. The first
@@ -1145,7 +1141,7 @@ class PageServer:
         limit = 100_000 if is_first else POINTS_PER_FRAME
         points = frames.points.since(page.points, limit)
         energies = frames.energies.since(page.energies, limit)
-        events = [render_event(event) for event in view.events.since(page.events, 100)]
+        events = frames.list_events(page.events, 100)
 
         page.points = frames.points.count
         page.energies = frames.energies.count

@@ -430,6 +430,15 @@ class SessionFrames:
             "columns": columns,
         }
 
+    def list_events(self, first: int, most: int) -> list[Json]:
+        """Returns events of the session, such as a lost connection, for the list on a page.
+
+        Args:
+            first: Number of the first event.
+            most: Largest number of events.
+        """
+        return [_render_event(event) for event in self._view.events.since(first, most)]
+
     def _describe_waiting(self, scenario: Scenario | None) -> Json:
         """Describes for a web page the processes for which a session that has not begun waits.
 
@@ -825,7 +834,7 @@ def _describe_alarm(alarm: LifeAlarm) -> Json:
     }
 
 
-def render_event(event: Event) -> Json:
+def _render_event(event: Event) -> Json:
     """Formats an event of the session, such as a lost connection, for the list on a page.
 
     Args:

@@ -119,7 +119,7 @@ class SiteView:
         scenario: Scenario of the session.
         name: Name of the site.
         boot: Random number that identifies this start of the site.
-        window: Latest records of the site.
+        energy: Energy of the session, which has the latest records of the site.
 
     Attributes:
         glides: True if the site stops smoothly when it loses its peers (the rule `glide`). Only

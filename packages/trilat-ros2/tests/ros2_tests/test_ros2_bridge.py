@@ -32,8 +32,6 @@ from trilat_ros2.ros2_bridge import (
     publish_session,
     read_joint_target,
     read_vector_target,
-    refuse_other_robots,
-    write_session_config,
 )
 from trilat_ros2.ros2_topics import BridgeEnds, SiteTopics
 
@@ -49,7 +47,7 @@ from trilat_net.core.step.ticks import Mode, TickRecord
 from trilat_net.errors import RunFailed, UsageError
 from trilat_net.files import find_page
 from trilat_net.log.ros2 import cdr
-from trilat_net.log.ros2.published import list_topics
+from trilat_net.log.ros2.published import Ros2Topics
 from trilat_net.log.ros2.robot_model import RobotModel
 from trilat_net.log.ros2.topic_names import (
     DIAGNOSTICS,
@@ -249,7 +247,7 @@ def test_a_site_without_external_arm_takes_no_robot(tmp_path: Path, site: str) -
         UsageError,
         match=rf"sites\.{site}: no site of this name has an external arm; sites with an external arm: s",
     ):
-        refuse_other_robots(TopicTable.read(str(tmp_path / "names.toml")), scenario)
+        TopicTable.read(str(tmp_path / "names.toml")).refuse_other_robots(scenario)
 
 
 @pytest.mark.parametrize("count", [1, 2, 3])
@@ -259,10 +257,10 @@ def test_robots_have_as_many_joints_as_arms(count: int) -> None:
     robot = RobotTable(joints=["shoulder", "elbow", "wrist"][:count])
     table = TopicTable.read("crisp")._replace(robots={"s": robot})
     if count == 2:
-        refuse_other_robots(table, scenario)
+        table.refuse_other_robots(scenario)
         return
     with pytest.raises(UsageError, match=rf"sites\.s\.joints has {count} name.* has 2 joints"):
-        refuse_other_robots(table, scenario)
+        table.refuse_other_robots(scenario)
 
 
 def test_reasons_of_strangers_are_counted_but_not_kept() -> None:
@@ -862,7 +860,7 @@ def test_bags_of_other_scenarios_share_no_topics(
     ends: Any = BridgeEnds(graph, None, None, name, table)  # type: ignore[arg-type]
     for site in log.sites:
         SiteTopics(ends, log.scenario, site, 0, graph.published["tf"])  # type: ignore[arg-type]
-    topics = list_topics(log.scenario, name, table)
+    topics = Ros2Topics.of_session(log.scenario, name, table)
     planned = {topic.removeprefix("/"): channel for topic, channel in topics.items()}
     assert {
         topic: offer for topic, offer in graph.offered.items() if topic in planned
@@ -917,7 +915,7 @@ def test_rviz_has_the_topics_of_the_live_bridge(tmp_path: Path, name: str, namin
     for site in scenario.names:
         SiteTopics(ends, scenario, site, 0, graph.published["tf"])  # type: ignore[arg-type]
     config = tmp_path / "view.rviz"
-    write_session_config(ends, scenario, config)
+    ends.write_rviz_config(scenario, config)
     types = list_rviz_topics(config)
     assert types.items() <= graph.offered.items()
     poses = {topic for topic, (kind, _) in graph.offered.items() if kind == cdr.POSE}

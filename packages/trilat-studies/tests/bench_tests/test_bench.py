@@ -40,19 +40,13 @@ from trilat_studies.bench.bench_plan import (
     build_settings,
     choose_round_trip,
     explain_no_cell,
-    find_stale,
     fingerprint_tuning,
     format_settings,
     read_gains,
     tune_laws,
     write_gains,
 )
-from trilat_studies.bench.bench_results import (
-    LEAST_CONTACT_N,
-    BenchCellResult,
-    BenchRun,
-    build_bench_page,
-)
+from trilat_studies.bench.bench_results import LEAST_CONTACT_N, BenchCellResult, BenchRun
 from trilat_studies.bench.bench_run import (
     MAX_RUN_TICKS,
     BenchRunItem,
@@ -103,7 +97,7 @@ def run_cell(cell: BenchCell) -> BenchRun:
 def encode_files(results: BenchResults) -> list[str]:
     """Returns the page, the table of cells and the table of runs that a benchmark writes."""
     return [
-        build_bench_page(results, "trilat bench"),
+        results.build_page("trilat bench"),
         encode_csv(results.to_rows()),
         results.encode_runs(),
     ]
@@ -284,7 +278,7 @@ def test_a_barely_touched_wall_masks_the_numbers() -> None:
         BenchPlan("round-trips", [cell], [("p_d", "level")]), {(cell.key, 1): run}
     )
     assert results.places[0].compute_mean("error_rad") is None
-    assert "no contact" in build_bench_page(results, "trilat bench")
+    assert "no contact" in results.build_page("trilat bench")
 
 
 def test_a_longer_run_stays_unstable(tmp_path: Path) -> None:
@@ -427,7 +421,7 @@ def test_a_law_without_stable_gains_has_empty_rows(monkeypatch: pytest.MonkeyPat
     plan = plan_bench("round-trips", laws=["p_d", "pd_d"], tasks=["free"], links=["rtt8"])
     assert [cell.law for cell in plan.cells] == ["p_d"]
     run = make_bench_run(plan.cells[0])
-    page = build_bench_page(BenchResults(plan, {(run.cell, 1): run}), "trilat bench")
+    page = BenchResults(plan, {(run.cell, 1): run}).build_page("trilat bench")
     assert "| pd_d (two sites) | no gains |" in page
     with pytest.raises(UsageError, match="no candidate was stable for pd_d"):
         plan_bench("round-trips", laws=["pd_d"], tasks=["free"], links=["rtt8"])
@@ -589,7 +583,7 @@ def test_kept_gains_minimise_error_at_the_margin(tmp_path: Path) -> None:
     write_gains(tuning[:2], file)
     write_gains(tuning[1:], file)
     assert sorted(map(str, read_gains(file).values())) == sorted(map(str, tuning))
-    assert find_stale(tuning) == []
+    assert not any(gains.is_stale for gains in tuning)
 
 
 @pytest.mark.long
@@ -666,7 +660,7 @@ def iterate_shipped_gains() -> Iterator[Any]:
 
 @pytest.mark.parametrize("gains", list(iterate_shipped_gains()))
 def test_shipped_gains_are_up_to_date(gains: TunedGains) -> None:
-    assert find_stale([gains]) == []
+    assert not gains.is_stale
 
 
 @pytest.mark.parametrize(
@@ -682,7 +676,8 @@ def test_gains_come_from_the_next_longer_round_trip(
 def test_gains_of_another_law_or_scenario_are_stale() -> None:
     tuned = plan_small_suite().cells[0].tuned
     other = msgspec.structs.replace(tuned, fingerprint="0" * 16)
-    assert find_stale([other]) == [f"p_d (level, {tuned.round_trip_ms} ms)"]
+    assert other.is_stale
+    assert str(other) == f"p_d (level, {tuned.round_trip_ms} ms)"
 
 
 @pytest.mark.long

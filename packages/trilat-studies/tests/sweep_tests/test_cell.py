@@ -12,7 +12,6 @@ from hypothesis import strategies as st
 from study_builders import Judge, plan_quick_sweep
 from trilat_studies.sweep import sweep_cell
 from trilat_studies.sweep.sweep_cell import CellClass, apply_diff, diff_lines
-from trilat_studies.sweep.sweep_results import build_sim_command
 from trilat_studies.sweep.sweep_run import CellItem
 
 from tests.own_laws import CompiledPD
@@ -38,7 +37,7 @@ def test_command_of_cell_runs_its_scenario_and_length(tmp_path: Path, judge: Jud
     plan = plan_quick_sweep(tmp_path, *overrides, laws=["p_d"], over=["link.delay_ms=0,20"])
     cell = plan.cell(1)
     CellItem(plan, cell, 1).run()
-    command = build_sim_command(plan, cell.overrides, 1, 0.25, "a b.mcap")
+    command = plan.build_sim_command(cell.overrides, 1, 0.25, "a b.mcap")
     arguments = shlex.split(command)
     assert arguments[:3] == ["trilat", "sim", str(tmp_path / "trio.toml")]
     assert arguments[-6:] == ["--seed", "1", "--duration", "0.25", "-o", "a b.mcap"]

@@ -1,7 +1,6 @@
 """Theory on a map: conditions in closed form and lines column by column, both independent of the runs."""
 
 from dataclasses import replace
-from functools import partial
 from itertools import product
 from typing import Any
 
@@ -9,22 +8,15 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from study_builders import MAP_KEYS, make_map_rows
+from study_builders import make_map_rows
+from trilat_studies.run_commands import format_override_value
 from trilat_studies.sweep.stability_map import (
     MapLine,
     PlaneAxis,
     StabilityCriterion,
     StabilityMap,
-    find_criterion_edge,
-    load_grid_scenario,
-    make_panel_loader,
-    trace_linear_analysis,
 )
-from trilat_studies.sweep.sweep_plan import (
-    format_override,
-    format_override_value,
-    plan_sweep,
-)
+from trilat_studies.sweep.sweep_plan import plan_sweep
 from trilat_studies.sweep.sweep_results import SweepResults
 
 from trilat_net.analysis.theory.linear_edge import GrowthColumn, iterate_linear_edges
@@ -72,10 +64,9 @@ def test_lines_depend_on_neither_runs_nor_processes() -> None:
 
 def test_short_delays_have_the_condition_as_line() -> None:
     """The mode at the edge is slow against 1/T there, and the condition exact: within 2 % at 100 ms."""
-    at = partial(load_grid_scenario, plan_sweep("p_d_margin"), (), *MAP_KEYS)
     damping = PlaneAxis("control.d", (0.46, 0.48, 0.50, 0.52), "d")
     scenarios = [at(100.0, d) for d in damping.values]
-    line, _ = trace_linear_analysis(
+    line, _ = MapLine.trace_linear_analysis(
         [GrowthColumn.compute(scenarios, "control.d", damping.values)] * 2, damping
     )
     assert line is not None
@@ -85,10 +76,9 @@ def test_short_delays_have_the_condition_as_line() -> None:
 @pytest.mark.long
 def test_coarse_map_has_the_exact_linear_line() -> None:
     """From 0.6 on another mode is the rightmost; a straight line between 0.2 and 0.7 would pass 0.593."""
-    at = partial(load_grid_scenario, plan_sweep("p_d_margin"), (), *MAP_KEYS)
     damping = PlaneAxis("control.d", (0.2, 0.7, 1.2), "d")
     scenarios = [at(100.0, d) for d in damping.values]
-    line, _ = trace_linear_analysis(
+    line, _ = MapLine.trace_linear_analysis(
         [GrowthColumn.compute(scenarios, "control.d", damping.values)] * 2, damping
     )
     edge = next(iterate_linear_edges(scenarios[0], "control.d", 0.2, 1.2), None)
@@ -128,7 +118,7 @@ def test_place_of_panel_is_cell_of_plan() -> None:
             if p.settings == (("law", cell.law), ("link.playout_ms", playout))
         )
 
-        at = make_panel_loader(plan, panel, plane.x.key, plane.y.key)
+        at = panel.make_loader(plan, plane.x.key, plane.y.key)
         delay, damping = cell.values[:2]
         assert isinstance(delay, float)
         assert isinstance(damping, float)
@@ -141,8 +131,7 @@ def test_place_of_panel_is_cell_of_plan() -> None:
 def test_a_numeric_override_is_that_number(value: float, text: str) -> None:
     assert format_override_value(value) == text
     assert float(format_override_value(value)) == value
-    assert format_override("a.b", value) == f"a.b={text}"
-    assert format_override("link.order", "in_order") == "link.order=in_order"
+    assert format_override_value("in_order") == "in_order"
 
 
 DELAY = PlaneAxis("link.delay_ms", (0.0, 100.0, 200.0, 300.0, 400.0, 800.0), "delay (ms)")
@@ -199,7 +188,7 @@ def test_a_condition_holds_without_any_reserve(root: float, power: float, sign: 
         gap = value - root
         return spare(sign * float(np.sign(gap)) * abs(gap) ** power)
 
-    edge = find_criterion_edge(condition, -60.0, 60.0)
+    edge = StabilityCriterion.find_edge(condition, -60.0, 60.0)
     assert edge is not None
     assert abs(condition(edge).excess) <= 1e-5 * 120.0**power
 
@@ -210,7 +199,7 @@ def test_whole_number_keys_have_no_points_between() -> None:
             raise ScenarioError("is a whole number")
         return spare(value - 2.5)
 
-    assert find_criterion_edge(condition, 0.0, 7.0) is None
+    assert StabilityCriterion.find_edge(condition, 0.0, 7.0) is None
 
 
 def grows(growth_per_s: list[float], edges: dict[int, float] | None = None) -> GrowthColumn:
@@ -222,7 +211,7 @@ def test_the_linear_line_is_where_nothing_grows() -> None:
     """Real parts vanish along y = 0.4 x: positive below, negative above."""
     side = PlaneAxis("y", (0.0, 1.0, 2.0), "y")
     columns = [grows([0.4 * x - y for y in side.values]) for x in (0.0, 1.0, 2.0, 3.0)]
-    line, remarks = trace_linear_analysis(columns, side)
+    line, remarks = MapLine.trace_linear_analysis(columns, side)
     assert line is not None
     assert not remarks
     assert np.allclose([line.crossings(n, side)[0] for n in (1, 2, 3)], [0.4, 0.8, 1.2])
@@ -230,7 +219,7 @@ def test_the_linear_line_is_where_nothing_grows() -> None:
 
 def test_a_column_may_be_crossed_again_and_again() -> None:
     side = PlaneAxis("y", (0.0, 1.0, 2.0, 3.0), "y")
-    line, _ = trace_linear_analysis(
+    line, _ = MapLine.trace_linear_analysis(
         [grows([-1.0, 1.0, 3.0, -1.0]), grows([-1.0, 1.0, 1.0, -1.0], {0: 0.9})], side
     )
     assert line is not None
@@ -244,14 +233,14 @@ def test_columns_are_crossed_at_edges_however_close(shares: list[float], sign: f
     side = PlaneAxis("y", tuple(map(float, range(len(shares) + 1))), "y")
     edges = {n: n + share for n, share in enumerate(shares)}
     column = grows([sign * (-1.0) ** n for n in range(len(shares) + 1)], edges)
-    line, _ = trace_linear_analysis([column] * 2, side)
+    line, _ = MapLine.trace_linear_analysis([column] * 2, side)
     assert line is not None
     assert line.crossings(0, side) == pytest.approx([*edges.values()], abs=1e-6)
 
 
 def test_without_motion_no_line_is_crossed() -> None:
     side = PlaneAxis("y", (0.0, 1.0, 2.0), "y")
-    line, _ = trace_linear_analysis(
+    line, _ = MapLine.trace_linear_analysis(
         [grows([-np.inf, 1.0, -1.0]), grows([np.nan, 1.0, -1.0])], side
     )
     assert line is not None
@@ -261,10 +250,15 @@ def test_without_motion_no_line_is_crossed() -> None:
 def test_without_change_there_is_no_line() -> None:
     why = ["nobody knows the delay"]
     side = PlaneAxis("y", (0.0, 1.0), "y")
-    line, remarks = trace_linear_analysis([GrowthColumn([np.nan, np.nan], {}, why)] * 2, side)
+    line, remarks = MapLine.trace_linear_analysis(
+        [GrowthColumn([np.nan, np.nan], {}, why)] * 2, side
+    )
     assert line is None
     assert remarks == why
-    assert trace_linear_analysis([grows([-1.0, -2.0]), grows([-1.0, -3.0])], side) == (None, [])
+    assert MapLine.trace_linear_analysis([grows([-1.0, -2.0]), grows([-1.0, -3.0])], side) == (
+        None,
+        [],
+    )
 
 
 GAIN = st.floats(0.1, 50.0)

@@ -17,11 +17,11 @@ from trilat_studies.sweep.edge_refinement import (
     UNDECIDED,
     UNSTABLE,
     EdgeRefinement,
-    choose_side,
 )
 from trilat_studies.sweep.stability_map import StabilityMap
+from trilat_studies.sweep.sweep_axis import SweepAxis
 from trilat_studies.sweep.sweep_cell import CellClass, CellResult
-from trilat_studies.sweep.sweep_plan import SweepPlan, parse_axis, plan_sweep
+from trilat_studies.sweep.sweep_plan import SweepPlan, plan_sweep
 from trilat_studies.sweep.sweep_results import RESULTS_FILE
 from trilat_studies.sweep.sweep_run import open_sweep_folder
 
@@ -40,7 +40,7 @@ def small_plan() -> SweepPlan:
 def grid(x: int, y: int, refine: int) -> SweepPlan:
     """Returns a plan with so many values on its axes."""
     axes = (f"link.delay_ms=0:{x - 1}:1", f"control.d=0.001:{y / 1000}:0.001")
-    return small_plan()._replace(axes=tuple(map(parse_axis, axes)), refine=refine)
+    return small_plan()._replace(axes=tuple(map(SweepAxis.parse, axes)), refine=refine)
 
 
 def refine_all(plan: SweepPlan, side_at: Side) -> tuple[np.ndarray, np.ndarray]:
@@ -107,10 +107,10 @@ def test_cells_without_a_side_draw_no_edge() -> None:
 
 
 def test_a_cell_has_the_side_of_most_runs() -> None:
-    assert choose_side(stable=0, decided=0) == UNDECIDED
-    assert choose_side(stable=1, decided=2) == UNDECIDED
-    assert choose_side(stable=2, decided=3) == STABLE
-    assert choose_side(stable=1, decided=3) == UNSTABLE
+    assert EdgeRefinement.choose_side(stable=0, decided=0) == UNDECIDED
+    assert EdgeRefinement.choose_side(stable=1, decided=2) == UNDECIDED
+    assert EdgeRefinement.choose_side(stable=2, decided=3) == STABLE
+    assert EdgeRefinement.choose_side(stable=1, decided=3) == UNSTABLE
 
 
 def judge_by_line(text: str, longest_s: float) -> CellResult:

@@ -13,10 +13,11 @@ from study_builders import (
     make_exponent_plane,
     make_map_rows,
     plan_quick_sweep,
+    read_tables,
     run_plan,
 )
 from trilat_studies.sweep import prepare_sweep_folder
-from trilat_studies.sweep.map_page import draw_stability_map, tabulate_edges
+from trilat_studies.sweep.map_page import MapReport
 from trilat_studies.sweep.stability_map import MapPlane, StabilityMap
 from trilat_studies.sweep.sweep_plan import SweepPlan, plan_sweep
 from trilat_studies.sweep.sweep_results import SweepResults, read_results
@@ -75,10 +76,10 @@ def test_zero_line_is_the_linear_analysis_edge(chart: StabilityMap) -> None:
 
 def test_page_shows_exponents_zero_verdicts_and_theory(chart: StabilityMap) -> None:
     """The table of edges has the zero of the exponents beside the interval of the verdicts."""
-    table = tabulate_edges(chart.plane, chart.plane.panels[0], chart.lines[0])
-    assert table.headers[1:4] == ("edge of d (N m s/rad)", "stable is", "edge of the verdicts")
-    assert [row[0] for row in table.rows] == ["200", "250"]
-    for row, n in zip(table.rows, range(2), strict=True):
+    _, (heads, *rows) = read_tables(MapReport(chart).build_page("map.png"))
+    assert heads[1:4] == ("edge of d (N m s/rad)", "stable is", "edge of the verdicts")
+    assert [row[0] for row in rows] == ["200", "250"]
+    for row, n in zip(rows, range(2), strict=True):
         (zero,) = chart.lines[0][0].crossings(n, chart.plane.y)
         assert row[1:3] == (f"{zero:.4g}", "above")
         low, high = map(float, row[3].split(" to "))
@@ -87,7 +88,8 @@ def test_page_shows_exponents_zero_verdicts_and_theory(chart: StabilityMap) -> N
 
 def test_a_cell_without_growth_or_decay_is_white() -> None:
     """Four fifths of the exponents are paler than the ends of the bar."""
-    figure = draw_stability_map(make_exponent_plane(), ((),), FigureSize.for_print(3.5))
+    chart = StabilityMap(make_exponent_plane(), ((),), (), (), "map")
+    figure = MapReport(chart).draw(FigureSize.for_print(3.5))
     mesh: Any = next(
         collection
         for collection in figure.axes[0].collections

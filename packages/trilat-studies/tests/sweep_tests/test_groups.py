@@ -3,7 +3,7 @@
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from trilat_studies.sweep.cell_groups import CellGroups, find_cell_groups
+from trilat_studies.sweep.cell_groups import CellGroups
 from trilat_studies.sweep.sweep_plan import plan_sweep
 
 
@@ -39,7 +39,7 @@ def test_every_cell_is_in_one_group(sizes: list[int], data: st.DataObject) -> No
 def test_axes_that_change_structure_split_cells(
     over: list[str], laws: list[str], groups: int, keys: tuple[str, ...] | None
 ) -> None:
-    cell_groups = find_cell_groups(plan_sweep("free", over=over, laws=laws))
+    cell_groups = CellGroups.of_plan(plan_sweep("free", over=over, laws=laws))
     assert cell_groups.group_count == groups
     assert keys is None or cell_groups.keys == keys
     assert bool(cell_groups.sentence) == (groups > 1)
@@ -49,6 +49,6 @@ def test_axes_that_change_structure_split_cells(
 def test_cells_of_one_structure_run_together() -> None:
     """The axis that changes the structure is the last one, which varies fastest in the grid."""
     plan = plan_sweep("free", over=["control.Kd=2:4:1", "sites.s.rate_hz=1000,500"])
-    cells = list(find_cell_groups(plan).iterate_cells(plan.shape))
+    cells = list(CellGroups.of_plan(plan).iterate_cells(plan.shape))
     rates_hz = [plan.cell(number).values[1] for number in cells]
     assert rates_hz == [1000.0] * 3 + [500.0] * 3

@@ -14,7 +14,6 @@ from trilat_studies.sweep.margin_search import (
     KeyMargin,
     SearchRange,
     SweepMargins,
-    search_margins,
 )
 from trilat_studies.sweep.stability_map import StabilityEdge
 from trilat_studies.sweep.sweep_cell import CellClass, CellResult
@@ -56,7 +55,7 @@ def without_roots(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.mark.usefixtures("judge_by_line")
 def test_a_place_has_its_edge_beside_theory() -> None:
-    (point,) = search_margins(plan_margin_sweep("link.delay_ms=200"), WITHIN, 1)
+    (point,) = SweepMargins.search(plan_margin_sweep("link.delay_ms=200"), WITHIN, 1).found
     assert point.cell.values == (200.0,)
     (span,) = point.margin.spans
     assert span.low <= 1.0 <= span.high
@@ -67,7 +66,7 @@ def test_a_place_has_its_edge_beside_theory() -> None:
 
 @pytest.mark.usefixtures("judge_by_line", "without_roots")
 def test_seeds_are_places_where_links_are_random() -> None:
-    lossy = search_margins(plan_margin_sweep("link.loss=0,0.1", seeds=2), WITHIN, 1)
+    lossy = SweepMargins.search(plan_margin_sweep("link.loss=0,0.1", seeds=2), WITHIN, 1).found
     assert [(point.cell.values, point.seed) for point in lossy] == [
         ((0.0,), 1),
         ((0.1,), 1),
@@ -86,7 +85,9 @@ def test_the_number_of_processes_changes_nothing() -> None:
         over=["link.delay_ms=100,400", within.format_axis()],
         longest_s=1.0,
     )
-    assert search_margins(plan, within, 1) == search_margins(plan, within, 2)
+    assert (
+        SweepMargins.search(plan, within, 1).found == SweepMargins.search(plan, within, 2).found
+    )
 
 
 @pytest.mark.usefixtures("judge_by_line", "without_roots")
@@ -94,7 +95,10 @@ def test_whole_number_keys_are_searched_in_integers() -> None:
     """The judge gives 300 Hz and 50 Hz the same verdict; no value between whole numbers may be run."""
     within = SearchRange("rate_hz", 50.0, 300.0, 0.005)
     plan = plan_sweep("p_d_margin", over=["link.delay_ms=100,200", within.format_axis()])
-    assert [margin.margin.stable for margin in search_margins(plan, within, 1)] == [True, True]
+    assert [margin.margin.stable for margin in SweepMargins.search(plan, within, 1).found] == [
+        True,
+        True,
+    ]
 
 
 def make_point_margin(*spans: StabilityEdge, stable: bool | None = None) -> GridPointMargin:

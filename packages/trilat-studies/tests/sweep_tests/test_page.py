@@ -16,15 +16,12 @@ from study_builders import (
     judge_by_condition,
     make_gapped_plane,
     make_map_plane,
+    read_tables,
 )
 from trilat_studies.sweep.fixed_gains import describe_fixed_gains
 from trilat_studies.sweep.map_page import (
     CLASS_COLOURS,
-    build_map_page,
-    draw_stability_map,
-    tabulate_classes,
-    tabulate_edges,
-    write_map,
+    MapReport,
 )
 from trilat_studies.sweep.stability_map import CELL_CLASSES, MapLine, MapPlane, StabilityMap
 from trilat_studies.sweep.sweep_cell import CellClass
@@ -51,7 +48,7 @@ def chart() -> StabilityMap:
 
 
 def test_folder_has_a_picture_vector_and_page(chart: StabilityMap, tmp_path: Path) -> None:
-    paths = write_map(chart, tmp_path)
+    paths = MapReport(chart).write(tmp_path)
     assert [path.name for path in paths] == ["map.png", "map.svg", "map.pdf", "map.md"]
     # 3.5 in, 300 pixels to the inch
     assert int.from_bytes(paths[0].read_bytes()[16:20], "big") == 1050
@@ -63,13 +60,13 @@ def test_equal_results_give_equal_bytes(chart: StabilityMap, tmp_path: Path) -> 
     other_folder = tmp_path / "again"
     other_folder.mkdir()
     for file, same_file in zip(
-        write_map(chart, tmp_path), write_map(chart, other_folder), strict=True
+        MapReport(chart).write(tmp_path), MapReport(chart).write(other_folder), strict=True
     ):
         assert file.read_bytes() == same_file.read_bytes()
 
 
 def test_the_page_shows_commands_lines_and_remarks(chart: StabilityMap) -> None:
-    text = build_map_page(chart, "map.png")
+    text = MapReport(chart).build_page("map.png")
     assert text.startswith("# P+d\n")
     assert "trilat sweep a\ntrilat map\n```" in text
     assert "![map](map.png)" in text
@@ -78,20 +75,26 @@ def test_the_page_shows_commands_lines_and_remarks(chart: StabilityMap) -> None:
     assert "## playout 0 ms" in text
 
 
+def read_map_tables(plane: MapPlane, *lines: MapLine) -> list[list[tuple[str, ...]]]:
+    """Returns the tables of the page of a map: that of the classes, then that of the edges."""
+    chart = StabilityMap(plane, (lines,), (), (), "map")
+    return read_tables(MapReport(chart).build_page("map.png"))
+
+
 def test_counts_are_of_all_runs() -> None:
     plane = make_map_plane(lambda _x, _y, seed: list(CellClass)[seed - 1], seeds=3)
-    assert tabulate_classes(plane).rows == [("all", "25", "25", "25", "0")]
+    _, *rows = read_map_tables(plane)[0]
+    assert rows == [("all", "25", "25", "25", "0")]
 
 
 def test_an_edge_stands_beside_each_lines_difference() -> None:
     """A row has the measured edge, then each line's edge and its distance from the middle."""
-    plane = make_map_plane()
-    table = tabulate_edges(plane, plane.panels[0], (EXACT, HALF))
+    _, (heads, *rows) = read_map_tables(make_map_plane(), EXACT, HALF)
     measured_heads = ("delay (ms)", "edge of d (N m s/rad)", "stable is")
     line_heads = ("d = 5 T", "difference", "half of it", "difference")
-    assert table.headers == (*measured_heads, *line_heads)
-    assert [row[0] for row in table.rows] == ["100", "200", "300", "400"]
-    for row in table.rows:
+    assert heads == (*measured_heads, *line_heads)
+    assert [row[0] for row in rows] == ["100", "200", "300", "400"]
+    for row in rows:
         low, high = map(float, row[1].split(" to "))
         assert row[2] == "above"
         assert low <= float(row[3]) <= high
@@ -104,16 +107,14 @@ def test_an_edge_stands_beside_each_lines_difference() -> None:
 
 
 def test_a_missing_line_has_no_difference() -> None:
-    plane = make_map_plane()
-    table = tabulate_edges(
-        plane, plane.panels[0], (EXACT._replace(excess=np.full((5, 5), np.nan)),)
-    )
-    assert all(row[-2:] == ("-", "-") for row in table.rows)
+    missing_line = EXACT._replace(excess=np.full((5, 5), np.nan))
+    _, (_, *rows) = read_map_tables(make_map_plane(), missing_line)
+    assert [row[-2:] for row in rows] == [("-", "-")] * 4
 
 
 def test_a_map_without_an_edge_has_no_table() -> None:
     plane = make_map_plane(lambda *_, **__: CellClass.CONVERGED)
-    assert tabulate_edges(plane, plane.panels[0], (EXACT,)).rows == []
+    assert len(read_map_tables(plane, EXACT)) == 1  # only that of the classes
 
 
 LINE = MapLine("$d$", "d", "", SPARE_DAMPING, 0)
@@ -121,9 +122,8 @@ LINE = MapLine("$d$", "d", "", SPARE_DAMPING, 0)
 
 def figure(plane: MapPlane, width_in: float = 3.5, lines: tuple[MapLine, ...] = ()) -> Figure:
     """Draws the map of a plane, with the same lines in each panel."""
-    return draw_stability_map(
-        plane, [lines] * len(plane.panels), FigureSize.for_print(width_in)
-    )
+    chart = StabilityMap(plane, (lines,) * len(plane.panels), (), (), "map")
+    return MapReport(chart).draw(FigureSize.for_print(width_in))
 
 
 def meshes(figure_of_map: Figure) -> list[QuadMesh]:
@@ -259,9 +259,8 @@ FIXED = ("p_d: K 10, gravity 1", "adaptive: Lambda 1, Kp 1, Kd 3, Gamma 1, theta
 def test_a_caption_covers_no_label(panels: tuple[float, ...], width_in: float) -> None:
     """The gains below the panels stand apart from every label and inside the figure."""
     plane = make_map_plane(link__playout_ms=panels)
-    figure = draw_stability_map(
-        plane, [()] * len(plane.panels), FigureSize.for_print(width_in), FIXED
-    )
+    chart = StabilityMap(plane, ((),) * len(plane.panels), (), (), "map", FIXED)
+    figure = MapReport(chart).draw(FigureSize.for_print(width_in))
     figure.draw_without_rendering()
     (caption,) = figure.texts[:1]
     box = caption.get_window_extent()

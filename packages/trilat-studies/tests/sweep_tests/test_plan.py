@@ -9,7 +9,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from study_builders import SHORT, plan_quick_sweep
-from trilat_studies.sweep.sweep_plan import SweepPlan, list_axes, parse_axis, plan_sweep
+from trilat_studies.sweep.sweep_axis import SweepAxis
+from trilat_studies.sweep.sweep_plan import SweepPlan, plan_sweep
 
 from tests.laws import Adaptive
 from trilat_net.errors import ScenarioError, UsageError
@@ -60,19 +61,23 @@ def test_values_by_key_equal_axes_as_texts(
         "control.d": np.array(counts) if as_array else counts,
         "link.order": ["newest", "in_order"],
     }
-    first, second, third = map(parse_axis, list_axes(over))
+    first, second, third = map(SweepAxis.parse, SweepAxis.list_descriptions(over))
     assert [first.value(n) for n in range(len(delays))] == delays
     assert [second.value(n) for n in range(len(counts))] == counts
-    assert third == parse_axis("link.order=newest,in_order")
-    assert list_axes("link.delay_ms=0:400:50") == list_axes({"link.delay_ms": "0:400:50"})
+    assert third == SweepAxis.parse("link.order=newest,in_order")
+    assert SweepAxis.list_descriptions("link.delay_ms=0:400:50") == SweepAxis.list_descriptions(
+        {"link.delay_ms": "0:400:50"}
+    )
 
 
 def test_laws_may_be_classes_and_vectors_single_values() -> None:
-    laws, poses = list_axes({"control.law": [Adaptive, "p_d"], "sites.s.q0_rad": np.eye(2)})
+    laws, poses = SweepAxis.list_descriptions(
+        {"control.law": [Adaptive, "p_d"], "sites.s.q0_rad": np.eye(2)}
+    )
     assert laws == 'control.law="tests.laws:Adaptive",p_d'
-    assert len(parse_axis(laws).texts) == len(parse_axis(poses).texts) == 2
+    assert len(SweepAxis.parse(laws).texts) == len(SweepAxis.parse(poses).texts) == 2
     with pytest.raises(ScenarioError, match="cannot be a value in a scenario"):
-        list_axes({"control.d": [None]})
+        SweepAxis.list_descriptions({"control.d": [None]})
 
 
 @given(number=st.integers(0, 23), seed=st.integers(1, 3))
@@ -169,42 +174,42 @@ def test_a_range_is_whole_steps_from_its_start(
     first: Decimal, step: Decimal, count: int, beyond: Decimal
 ) -> None:
     last = first + (count - 1 + beyond) * step
-    axis = parse_axis(f"control.d={first}:{last}:{step}")
+    axis = SweepAxis.parse(f"control.d={first}:{last}:{step}")
     assert len(axis.texts) == count
     assert axis.numeric
     values = [Decimal(text) for text in axis.texts]
     assert values == [first + n * step for n in range(count)]
     assert [axis.value(n) for n in range(count)] == [float(value) for value in values]
-    downwards = parse_axis(f"control.d={values[-1]}:{first}:{-step}")
+    downwards = SweepAxis.parse(f"control.d={values[-1]}:{first}:{-step}")
     assert [Decimal(text) for text in downwards.texts] == values[::-1]
 
 
 def test_an_end_on_the_grid_is_included() -> None:
-    assert list(parse_axis("a=0:1:0.3333333333").texts)[-1] == "0.9999999999"
-    assert list(parse_axis("a=0:0.9999999999:0.25").texts)[-1] == "1.00"
+    assert list(SweepAxis.parse("a=0:1:0.3333333333").texts)[-1] == "0.9999999999"
+    assert list(SweepAxis.parse("a=0:0.9999999999:0.25").texts)[-1] == "1.00"
 
 
 def test_written_exponents_keep_whole_numbers_whole() -> None:
-    assert list(parse_axis("rate_hz=1e2:3e2:1e2").texts) == ["100", "200", "300"]
-    assert list(parse_axis("a=1e-7:2e-7:1e-7").texts) == ["0.0000001", "0.0000002"]
+    assert list(SweepAxis.parse("rate_hz=1e2:3e2:1e2").texts) == ["100", "200", "300"]
+    assert list(SweepAxis.parse("a=1e-7:2e-7:1e-7").texts) == ["0.0000001", "0.0000002"]
 
 
 def test_a_list_may_hold_words_numbers_and_tables() -> None:
-    axis = parse_axis(" link.order = newest, in_order ")
+    axis = SweepAxis.parse(" link.order = newest, in_order ")
     assert (axis.description, axis.key, axis.texts) == (
         "link.order=newest, in_order",
         "link.order",
         ("newest", "in_order"),
     )
     assert (axis.numeric, axis.value(1)) == (False, "in_order")
-    assert parse_axis("a=1,2.5,1e3").numeric
-    assert parse_axis("a=true,false").value(0) == "true"
-    assert parse_axis("q0_rad=[0.1,0.2],[0.3,0.4]").texts == ("[0.1,0.2]", "[0.3,0.4]")
-    assert parse_axis('a="x:y,z",{b="]:,"}').texts == ('"x:y,z"', '{b="]:,"}')
+    assert SweepAxis.parse("a=1,2.5,1e3").numeric
+    assert SweepAxis.parse("a=true,false").value(0) == "true"
+    assert SweepAxis.parse("q0_rad=[0.1,0.2],[0.3,0.4]").texts == ("[0.1,0.2]", "[0.3,0.4]")
+    assert SweepAxis.parse('a="x:y,z",{b="]:,"}').texts == ('"x:y,z"', '{b="]:,"}')
 
 
 def test_huge_ranges_take_no_memory() -> None:
-    axis = parse_axis("a=0:1e8:0.001")
+    axis = SweepAxis.parse("a=0:1e8:0.001")
     assert len(axis.texts) == 10**11 + 1
     assert axis.texts[10**11] == "100000000.000"
 

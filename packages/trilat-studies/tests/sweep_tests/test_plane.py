@@ -16,8 +16,8 @@ from study_builders import (
     make_map_rows,
 )
 from trilat_studies.sweep.stability_map import CELL_CLASSES, MapPlane, PlaneAxis, StabilityEdge
+from trilat_studies.sweep.sweep_axis import label_axis, label_setting
 from trilat_studies.sweep.sweep_cell import CellClass
-from trilat_studies.sweep.sweep_plan import label_axis, label_setting
 
 from trilat_net.errors import UsageError
 from trilat_net.scenario import load_scenario

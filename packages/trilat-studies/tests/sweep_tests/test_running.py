@@ -10,11 +10,7 @@ from study_builders import DELAYS, Judge, StopError, plan_quick_sweep, run_plan,
 from trilat_studies.sweep import prepare_sweep_folder, read_results, run_sweep
 from trilat_studies.sweep.sweep_cell import RUN_CLASSES
 from trilat_studies.sweep.sweep_plan import plan_sweep
-from trilat_studies.sweep.sweep_results import (
-    RESULTS_FILE,
-    describe_sweep_plan,
-    summarize_sweep,
-)
+from trilat_studies.sweep.sweep_results import RESULTS_FILE
 from trilat_studies.sweep.sweep_run import DurationEstimate, open_sweep_folder
 
 from trilat_net.errors import LogRefused, UsageError
@@ -141,7 +137,7 @@ def test_only_cells_that_cannot_run_are_refused(tmp_path: Path, judge: Judge) ->
     assert re.match(name, refused["reasons"])
     assert read_results(folder.path).rows == results.rows
     assert len(judge.texts) == 8
-    first, second, *_ = summarize_sweep(results)
+    first, second, *_ = results.summarize()
     assert first.endswith(", 1 refused")
     assert re.match(f"  {name}", second)
 
@@ -190,7 +186,7 @@ def test_the_opening_names_axes_laws_and_seeds(tmp_path: Path) -> None:
         seeds=10,
         longest_s=1.0,
     )
-    assert describe_sweep_plan(sweep) == [
+    assert sweep.describe() == [
         "trio: 174 cells (29 x 3 x laws pd_d, adaptive), 10 seeds each where anything is random",
         "  over control.Kd=0.2:3:0.1: 0.2, 0.3, ..., 3.0",
         "  over link.delay_ms=0:40:20: 0, 20, 40",
@@ -204,7 +200,7 @@ def test_a_summary_counts_every_run_once(tmp_path: Path) -> None:
     sweep = plan_quick_sweep(tmp_path, over=["link.loss=0:0.9:0.05"], seeds=8)
     results = run_plan(sweep, tmp_path / "o").results
 
-    first, *others = summarize_sweep(results)
+    first, *others = results.summarize()
     assert first.startswith(f"{1 + 18 * 8} runs of 19 cells: ")
     counts = [int(part.split()[0]) for part in first.partition(": ")[2].split(", ")]
     assert counts == [

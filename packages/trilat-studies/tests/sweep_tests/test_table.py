@@ -21,14 +21,7 @@ from trilat_studies.sweep import prepare_sweep_folder, read_results, result_tabl
 from trilat_studies.sweep.result_table import ResultTable
 from trilat_studies.sweep.sweep_cell import RUN_CLASSES, CellRun, diff_lines
 from trilat_studies.sweep.sweep_plan import SweepPlan, plan_sweep
-from trilat_studies.sweep.sweep_results import (
-    GRID_POINTS_FILE,
-    GridPoint,
-    SweepResults,
-    build_cell_rows,
-    iterate_cells,
-    reproduction_duration_s,
-)
+from trilat_studies.sweep.sweep_results import GRID_POINTS_FILE, SweepResults
 
 from trilat_net.errors import UsageError
 from trilat_net.work.intervals import wilson_interval
@@ -38,9 +31,10 @@ ORDERS = "link.order=newest,in_order"
 
 def encode_runs(plan: SweepPlan, runs: Iterable[CellRun]) -> str:
     """Returns the table of finished runs as text, as a sweep writes it."""
-    cells = iterate_cells(plan, {(run.cell, run.seed): run for run in runs})
-    rows = (row for cell_runs in cells for row in build_cell_rows(plan, cell_runs))
-    return "".join(ResultTable(plan).encode(rows))
+    table = ResultTable(plan)
+    cells = table.iterate_cells({(run.cell, run.seed): run for run in runs})
+    rows = (row for cell_runs in cells for row in table.build_rows(cell_runs))
+    return "".join(table.encode(rows))
 
 
 @pytest.fixture(scope="module")
@@ -215,7 +209,7 @@ def test_a_diverged_run_gets_time_to_diverge_again(tmp_path: Path) -> None:
     sweep = plan_quick_sweep(tmp_path, over=[DELAYS])
     outcomes = [make_cell_result(str(n)) for n in range(100)]
     for outcome in outcomes:
-        duration_s = reproduction_duration_s(sweep, outcome)
+        duration_s = sweep.reproduction_duration_s(outcome)
         if outcome.diverged_s is None:
             assert duration_s == outcome.ran_s
         else:
@@ -260,15 +254,16 @@ def test_a_damaged_table_is_refused(
 
 
 @pytest.fixture
-def points(tmp_path: Path, judge: Judge) -> list[GridPoint]:
-    """The grid points of a sweep in which twelve seeds of random cells are judged by chance."""
+def random_sweep(tmp_path: Path, judge: Judge) -> SweepResults:
+    """The results of a sweep in which twelve seeds of random cells are judged by chance."""
     sweep = plan_quick_sweep(tmp_path, over=["link.loss=0:0.5:0.1", DELAYS], seeds=12)
     results = run_plan(sweep, tmp_path / "o").results
     assert len(judge.texts) == 3 + 15 * 12
-    return results.list_grid_points()
+    return results
 
 
-def test_every_run_is_counted_once(points: list[GridPoint]) -> None:
+def test_every_run_is_counted_once(random_sweep: SweepResults) -> None:
+    points = random_sweep.list_grid_points()
     assert [point.cell for point in points] == list(range(18))
     assert [sum(point.counts) for point in points] == [1] * 3 + [12] * 15
     for point in points:
@@ -279,10 +274,10 @@ def test_every_run_is_counted_once(points: list[GridPoint]) -> None:
         assert point.interval == wilson_interval(converged, converged + bounded + diverged)
 
 
-def test_random_cells_have_rows_of_shares(points: list[GridPoint], tmp_path: Path) -> None:
+def test_random_cells_have_rows_of_shares(random_sweep: SweepResults, tmp_path: Path) -> None:
     with (tmp_path / "o" / GRID_POINTS_FILE).open(newline="") as stream:
         lines = list(csv.DictReader(stream))
-    for line, point in zip(lines, points, strict=True):
+    for line, point in zip(lines, random_sweep.list_grid_points(), strict=True):
         row = {
             name: float(text) if text and name != "law" else None for name, text in line.items()
         }

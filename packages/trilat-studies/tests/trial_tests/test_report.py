@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from study_builders import make_trial_result
 from trilat_studies.measure_run import ExpectationResult
-from trilat_studies.trials import MAX_FAILURES_SHOWN, TrialReport, format_margin
+from trilat_studies.trials import MAX_FAILURES_SHOWN, TrialReport
 
 
 def outcome(margin: float, key: str = "rms_error_max_rad") -> ExpectationResult:
@@ -104,8 +104,11 @@ def test_the_lines_of_a_table_are_aligned() -> None:
 
 
 def test_a_margin_is_a_percentage_with_its_sign() -> None:
-    assert [format_margin(m) for m in (None, 0.0, 0.2, -0.05, 0.0012, -2192.87)] == [
-        "",
+    margins = (0.0, 0.2, -0.05, 0.0012, -2192.87)
+    reports = [TrialReport([make_trial_result(1, outcome(m))], 1.0) for m in margins]
+    (unknown,) = TrialReport([make_trial_result(1, GOOD)], 1.0).rows()
+    assert unknown.cells()[5] == ""
+    assert [row.cells()[5] for report in reports for row in report.rows()] == [
         "+0.0 %",
         "+20 %",
         "-5.0 %",

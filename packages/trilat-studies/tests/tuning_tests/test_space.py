@@ -11,7 +11,7 @@ from trilat_studies.tuning.search_space import (
     DEFAULT_LAWS,
     SEARCH_SPACES,
     ModelInformation,
-    select_search_spaces,
+    SearchSpace,
     weigh_joints,
 )
 
@@ -131,7 +131,7 @@ def test_every_choice_within_ranges_is_a_valid_arm(armature_kg_m2: float, scheme
 
 
 def test_the_usual_laws_take_any_number_of_sites() -> None:
-    assert [space.law for space in select_search_spaces((), make_trio_scenario())] == list(
+    assert [space.law for space in SearchSpace.select((), make_trio_scenario())] == list(
         DEFAULT_LAWS
     )
 
@@ -154,7 +154,7 @@ def test_the_usual_laws_take_any_number_of_sites() -> None:
 )
 def test_untunable_settings_are_refused(law: str, facts: list[str]) -> None:
     with pytest.raises(UsageError) as refused:
-        select_search_spaces([law], make_trio_scenario())
+        SearchSpace.select([law], make_trio_scenario())
     assert all(fact in str(refused.value) for fact in facts)
 
 
@@ -163,8 +163,8 @@ def test_force_reflection_is_refused_for_three_sites() -> None:
         ScenarioError,
         match="between one master and one slave; this scenario has 3 sites, 2 of them",
     ):
-        select_search_spaces(["p_d", "p_f"], load_scenario("free"))
-    assert [space.law for space in select_search_spaces(["p_f"], load_scenario("contact"))] == [
+        SearchSpace.select(["p_d", "p_f"], load_scenario("free"))
+    assert [space.law for space in SearchSpace.select(["p_f"], load_scenario("contact"))] == [
         "p_f"
     ]
 

@@ -11,7 +11,7 @@ from trilat_studies.tuning import TuningResult
 from trilat_studies.tuning.candidate import CandidateClass, CandidateScore
 from trilat_studies.tuning.search_space import SEARCH_SPACES
 from trilat_studies.tuning.tuning_plan import CandidateSearch, Objective, find_pareto_front
-from trilat_studies.tuning.tuning_report import tabulate_front, tabulate_laws, write_tuning
+from trilat_studies.tuning.tuning_report import TuningReport
 
 from trilat_net.scenario import load_scenario
 
@@ -172,7 +172,7 @@ def result_folder(
 ) -> Path:
     """The folder of the result."""
     folder = tmp_path_factory.mktemp("written")
-    names = sorted(path.name for path in write_tuning(tuning_result, folder))
+    names = sorted(path.name for path in TuningReport(tuning_result).write(folder))
     assert names == ["front.json", "front.md", "front.pdf", "front.png"]
     return folder
 
@@ -216,7 +216,7 @@ def test_the_page_shows_procedure_search_and_commands(
 
 
 def test_the_table_of_laws_counts_every_run(tuning_result: TuningResult) -> None:
-    table = tabulate_laws(tuning_result)
+    table = next(tuning_result.blocks())
     places = [table.headers.index(outcome.word) for outcome in CandidateClass]
     for row in table.rows:
         assert sum(int(row[place]) for place in places) == int(row[1]) == 6
@@ -226,9 +226,9 @@ def test_long_fronts_are_shortened_between_both_ends(tuning_result: TuningResult
     """A table of three points has the first, the middle and the last point of the front."""
     gains = tuning_result.found[0].tried[0]
     search = make_search("adaptive", gains, points=5)
-    rows = tabulate_front(tuning_result, search, 3).rows
+    rows = TuningReport(tuning_result).tabulate_front(search, 3).rows
     assert [row[0].rstrip("*") for row in rows] == ["adaptive 1", "adaptive 3", "adaptive 5"]
-    assert len(tabulate_front(tuning_result, search).rows) == 5
+    assert len(TuningReport(tuning_result).tabulate_front(search).rows) == 5
 
     empty_search = make_search("adaptive", gains, points=0)
-    assert tabulate_front(tuning_result, empty_search, 3).rows == []
+    assert TuningReport(tuning_result).tabulate_front(empty_search, 3).rows == []

@@ -27,7 +27,7 @@ from trilat_net.files import write_whole
 from trilat_net.presentation import FigureSize, style
 from trilat_net.work import MeanInterval, encode_csv
 
-from .bench_results import BenchCellResult, BenchResults, build_bench_page, name_law
+from .bench_results import BenchCellResult, BenchResults, name_law
 
 FIGURES_OF_BENCH = {
     "stable": ("worst judgement of the runs", ""),
@@ -291,7 +291,7 @@ def write_bench(results: BenchResults, folder: Path, command: str) -> list[Path]
         pictures[f"bench-{name}.png"] = label
 
     texts = {
-        "bench.md": build_bench_page(results, command, pictures),
+        "bench.md": results.build_page(command, pictures),
         "places.csv": encode_csv(results.to_rows()),
         "runs.csv": results.encode_runs(),
     }

@@ -30,7 +30,6 @@ import msgspec
 
 from trilat_net.errors import UsageError, suggest_nearest
 from trilat_net.files import write_whole
-from trilat_net.laws import complementary_shares
 from trilat_net.scenario import BUILT_IN, GRID_LOSSES_PERCENT, GRID_ROUND_TRIPS_MS
 from trilat_net.work import Progress, Workers, ignore_progress
 
@@ -111,12 +110,14 @@ def _build_dominance(a: float) -> dict[str, dict[str, float]]:
         The factors other than 0, by the name of the arm and by the name of the arm that it
         follows.
     """
-    names = ("m1", "m2", "s")
-    matrix = complementary_shares(a).tolist()
+    factors_by_arm = {
+        "m1": {"m2": 1.0 - a, "s": a},
+        "m2": {"m1": a, "s": 1.0 - a},
+        "s": {"m1": a, "m2": 1.0 - a},
+    }
     dominance = {}
-    for name, factors in zip(names, matrix, strict=True):
-        factors_by_peer = zip(names, factors, strict=True)
-        dominance[name] = {peer: factor for peer, factor in factors_by_peer if factor}
+    for name, factors in factors_by_arm.items():
+        dominance[name] = {peer: factor for peer, factor in factors.items() if factor}
     return dominance
 
 
@@ -411,6 +412,14 @@ class TunedGains(msgspec.Struct, frozen=True):
         """
         return self.form, self.law, self.round_trip_ms
 
+    @property
+    def is_stale(self) -> bool:
+        """True if the law or the scenario has changed since these gains were tuned.
+
+        The law then has to be tuned again, see `fingerprint_tuning`.
+        """
+        return fingerprint_tuning(*self.key) != self.fingerprint
+
     def __str__(self) -> str:
         return f"{self.law} ({self.form}, {self.round_trip_ms} ms)"
 
@@ -505,24 +514,6 @@ def read_gains(path: Path = GAINS_FILE) -> dict[tuple[str, str, int], TunedGains
     return {gains.key: gains for gains in entries}
 
 
-def find_stale(entries: Iterable[TunedGains]) -> list[str]:
-    """Lists the tuned gains that are out of date.
-
-    Gains are out of date if the law or the scenario has changed since the tuning, see
-    `fingerprint_tuning`.
-
-    Args:
-        entries: The gains to check.
-
-    Returns:
-        A text for each entry that is out of date, such as "wave (three, 68 ms)". Empty if all
-        entries are up to date.
-    """
-    return [
-        str(gains) for gains in entries if fingerprint_tuning(*gains.key) != gains.fingerprint
-    ]
-
-
 def choose_round_trip(mean_ms: float) -> int:
     """Returns the tuned round trip, in ms, whose gains a link with a given round trip uses.
 
@@ -593,7 +584,7 @@ def tune_laws(
     Returns:
         The gains of every law at every round trip.
     """
-    known_by_key = {gains.key: gains for gains in known if not find_stale([gains])}
+    known_by_key = {gains.key: gains for gains in known if not gains.is_stale}
     tuned: list[TunedGains] = []
     total = len(TUNED_ROUND_TRIPS_MS) * sum(map(len, laws_by_form.values()))
     for form, laws in laws_by_form.items():

@@ -412,6 +412,41 @@ class BenchResults(Result):
         ]
         return encode_csv(rows, [*_CELL_COLUMNS, *BenchRun.__struct_fields__])
 
+    def build_page(self, command: str, pictures: Mapping[str, str] = {}) -> str:
+        """Composes the Markdown page that reports the results of the benchmark.
+
+        Args:
+            command: The command that writes the page, which is shown at its top.
+            pictures: Subject of each picture, by the name of its file in the folder of the
+                page.
+        """
+        parts = [
+            f"# The suite: {self.plan.study}",
+            f"    {command}",
+            "\n".join(f"- {line}" for line in _describe_bench(self)),
+            _tabulate_verdicts(self).markdown(),
+            f"{OPEN_MARK}: some run is open. {UNSTABLE_MARK}: some run is not stable. "
+            "+-: 95 % interval over the seeds of a link.",
+        ]
+
+        parts += [f"![{text}]({name})" for name, text in pictures.items()]
+
+        for task in self.plan.tasks:
+            parts.append(f"## {task}: properties")
+            parts.append(_tabulate_properties(self, task).markdown())
+
+        for task, quantity in _list_quantities(self):
+            parts.append(f"## {task}: {QUANTITIES[quantity]}")
+            parts.append(_tabulate_quantity(self, task, quantity).markdown())
+
+        if self.plan.study == "round-trips":
+            parts.append("## Delay against loss")
+            parts.append(_tabulate_round_trips(self).markdown())
+
+        parts.append("## Gains")
+        parts.append(_tabulate_gains(self).markdown())
+        return "\n\n".join(parts) + "\n"
+
 
 def _list_used_gains(results: BenchResults) -> list[TunedGains]:
     """Returns the tuned gains with which the control laws were simulated, without repetitions.
@@ -781,44 +816,6 @@ def _tabulate_gains(results: BenchResults) -> TextTable:
         )
     headers = ("law", "tuned at, ms", "gains", "stable", "without margin")
     return TextTable(headers, rows, align="lrlrr")
-
-
-def build_bench_page(
-    results: BenchResults, command: str, pictures: Mapping[str, str] = {}
-) -> str:
-    """Composes the Markdown page that reports the results of the benchmark.
-
-    Args:
-        results: Results of the suite or of a part of it.
-        command: The command that writes the page, which is shown at its top.
-        pictures: Subject of each picture, by the name of its file in the folder of the page.
-    """
-    parts = [
-        f"# The suite: {results.plan.study}",
-        f"    {command}",
-        "\n".join(f"- {line}" for line in _describe_bench(results)),
-        _tabulate_verdicts(results).markdown(),
-        f"{OPEN_MARK}: some run is open. {UNSTABLE_MARK}: some run is not stable. "
-        "+-: 95 % interval over the seeds of a link.",
-    ]
-
-    parts += [f"![{text}]({name})" for name, text in pictures.items()]
-
-    for task in results.plan.tasks:
-        parts.append(f"## {task}: properties")
-        parts.append(_tabulate_properties(results, task).markdown())
-
-    for task, quantity in _list_quantities(results):
-        parts.append(f"## {task}: {QUANTITIES[quantity]}")
-        parts.append(_tabulate_quantity(results, task, quantity).markdown())
-
-    if results.plan.study == "round-trips":
-        parts.append("## Delay against loss")
-        parts.append(_tabulate_round_trips(results).markdown())
-
-    parts.append("## Gains")
-    parts.append(_tabulate_gains(results).markdown())
-    return "\n\n".join(parts) + "\n"
 
 
 _FORMER_KEYS = ("reflected", "reflected_half", "observed", "least_j")

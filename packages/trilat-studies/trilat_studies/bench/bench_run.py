@@ -60,7 +60,7 @@ from trilat_net.work import (
 )
 
 from ..measure_run import RecordBatch, WholeRun, describe_program
-from ..side_by_side import RunKind, count_reasons, prepare_kinds
+from ..side_by_side import RunKind, prepare_kinds
 from ..tuning.candidate import TuningScenario
 from .bench_plan import (
     SHORTER_REACH,
@@ -912,7 +912,8 @@ def run_bench(
         done = journal.done
         pending = [item for item in items if (item.cell.key, item.seed) not in done]
         side_by_side = _choose_lanes(pending)
-        alone = count_reasons(side_by_side.get(_find_kind(item), "") for item in pending)
+        obstacles = (side_by_side.get(_find_kind(item), "") for item in pending)
+        alone = Counter(filter(None, obstacles))
         items = [
             item._replace(is_side_by_side=_find_kind(item) in side_by_side) for item in items
         ]

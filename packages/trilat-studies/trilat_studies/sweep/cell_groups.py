@@ -20,7 +20,7 @@ from trilat_net.errors import ScenarioError, count_nouns
 from trilat_net.execution import FusedRun
 
 from . import sweep_cell
-from .sweep_plan import SweepPlan, spread_indices
+from .sweep_plan import SweepPlan
 
 LAW_KEY = "law"
 """Name of the dimension of the control laws."""
@@ -40,6 +40,39 @@ class CellGroups(NamedTuple):
 
     keys: tuple[str, ...]
     parts: tuple[tuple[Sequence[int], ...], ...]
+
+    @classmethod
+    def of_plan(cls, plan: SweepPlan) -> "CellGroups":
+        """Groups the cells of a sweep by the structure of their scenarios.
+
+        Scenarios along each axis are compared, with the other axes at their first values. Up to
+        32 values of an axis are checked, since a grid may be large. If they differ and the axis
+        has more values, each of its values is a group of its own.
+
+        Args:
+            plan: The sweep: its scenario, axes, control laws and seeds.
+        """
+        names = (LAW_KEY, *(axis.key for axis in plan.axes))
+        keys = []
+        parts: list[tuple[Sequence[int], ...]] = []
+        for dimension, (name, count) in enumerate(zip(names, plan.shape, strict=True)):
+            checked = plan.list_checked_indices(dimension)
+            indices_by_structure: dict[Hashable, list[int]] = {}
+            for index in checked:
+                structure = _find_structure(plan, dimension, index) if count > 1 else None
+                indices_by_structure.setdefault(structure, []).append(index)
+
+            if len(indices_by_structure) == 1:
+                parts.append((range(count),))
+                continue
+
+            keys.append(name)
+            if len(checked) == count:
+                parts.append(tuple(map(tuple, indices_by_structure.values())))
+            else:
+                # the structure of values that were not checked is unknown
+                parts.append(tuple((index,) for index in range(count)))
+        return cls(tuple(keys), tuple(parts))
 
     @property
     def group_count(self) -> int:
@@ -79,39 +112,6 @@ class CellGroups(NamedTuple):
                 for count, index in zip(shape, indices, strict=True):
                     number = number * count + index
                 yield number
-
-
-def find_cell_groups(plan: SweepPlan) -> CellGroups:
-    """Groups the cells of a sweep by the structure of their scenarios.
-
-    Scenarios along each axis are compared, with the other axes at their first values. Up to 32
-    values of an axis are checked, since a grid may be large. If they differ and the axis has
-    more values, each of its values is a group of its own.
-
-    Args:
-        plan: The sweep: its scenario, axes, control laws and seeds.
-    """
-    names = (LAW_KEY, *(axis.key for axis in plan.axes))
-    keys = []
-    parts: list[tuple[Sequence[int], ...]] = []
-    for dimension, (name, count) in enumerate(zip(names, plan.shape, strict=True)):
-        checked = spread_indices(count)
-        indices_by_structure: dict[Hashable, list[int]] = {}
-        for index in checked:
-            structure = _find_structure(plan, dimension, index) if count > 1 else None
-            indices_by_structure.setdefault(structure, []).append(index)
-
-        if len(indices_by_structure) == 1:
-            parts.append((range(count),))
-            continue
-
-        keys.append(name)
-        if len(checked) == count:
-            parts.append(tuple(map(tuple, indices_by_structure.values())))
-        else:
-            # the structure of values that were not checked is unknown
-            parts.append(tuple((index,) for index in range(count)))
-    return CellGroups(tuple(keys), tuple(parts))
 
 
 def _find_structure(plan: SweepPlan, dimension: int, index: int) -> Hashable:

@@ -20,7 +20,7 @@ from collections.abc import Iterator, Mapping
 import numpy as np
 from numpy.typing import NDArray
 
-from .sweep_plan import SweepPlan, list_refined_axes
+from .sweep_plan import SweepPlan
 
 _Sides = NDArray[np.int8]
 
@@ -28,20 +28,6 @@ NOT_KNOWN = -1
 """Side of a cell that has not run, or that is not a valid scenario."""
 UNSTABLE, STABLE, UNDECIDED = range(3)
 """Sides of the stability edge."""
-
-
-def choose_side(*, stable: int, decided: int) -> int:
-    """Returns whether a cell is stable, unstable or undecided, by the majority of its runs.
-
-    The result is one of the constants `STABLE`, `UNSTABLE` and `UNDECIDED`.
-
-    Args:
-        stable: Number of stable runs of the cell.
-        decided: Number of runs that are stable or not stable.
-    """
-    if 2 * stable == decided:
-        return UNDECIDED  # without a decided run, or without a majority
-    return STABLE if 2 * stable > decided else UNSTABLE
 
 
 class EdgeRefinement:
@@ -57,7 +43,7 @@ class EdgeRefinement:
 
     def __init__(self, plan: SweepPlan) -> None:
         # The law is the first dimension of the grid.
-        self._dimensions = [1 + n for n in list_refined_axes(plan.axes)]
+        self._dimensions = [1 + n for n in plan.refined_axes]
         self._shape = plan.shape
         self._halvings = plan.refine
         self._level = 0
@@ -113,6 +99,20 @@ class EdgeRefinement:
             along_edge += 3 * sum(lines)
         cells = len(self.list_coarse_cells()) + panels * along_edge
         return min(math.prod(self._shape), cells)
+
+    @staticmethod
+    def choose_side(*, stable: int, decided: int) -> int:
+        """Returns whether a cell is stable, unstable or undecided, by the majority of its runs.
+
+        The result is one of the constants `STABLE`, `UNSTABLE` and `UNDECIDED`.
+
+        Args:
+            stable: Number of stable runs of the cell.
+            decided: Number of runs that are stable or not stable.
+        """
+        if 2 * stable == decided:
+            return UNDECIDED  # without a decided run, or without a majority
+        return STABLE if 2 * stable > decided else UNSTABLE
 
     def _iterate_panels(self) -> Iterator[tuple[int | slice, ...]]:
         """Yields an index of the grid for each panel, which has all values of the refined axes.

@@ -123,80 +123,145 @@ _COLOUR_BAR_IN = 0.6
 """Width of the colour bar with its labels."""
 
 
-def draw_stability_map(
-    plane: MapPlane,
-    lines: Sequence[Sequence[MapLine]],
-    form: FigureSize,
-    fixed: Sequence[str] = (),
-) -> Figure:
-    """Draws a stability map, which shows with which parameters a scenario is stable.
-
-    The map is a coloured grid. A sweep with more than two parameters has several panels, each
-    with the same two axes.
+class MapReport:
+    """Figure and page of a stability map, which shows where a scenario is stable.
 
     Args:
-        plane: Axes of the map, and the results of the runs in each panel.
-        lines: For each panel, the lines that separate stable from unstable parameters, such as
-            limits from theory.
-        form: Width, type sizes and resolution of the figure.
-        fixed: Gains that all runs have in common, one text per control law, for the caption.
+        chart: The results of the runs, the lines from theory, and the texts of the map.
     """
-    count = len(plane.panels)
-    columns = _count_columns(count, form)
-    rows = math.ceil(count / columns)
-    caption = _wrap_caption(fixed, form)
-    panel_height_in = _choose_panel_height_in(plane, columns)
-    caption_height_in = _CAPTION_LINE_IN * len(caption)
-    height_in = 0.95 + rows * panel_height_in + caption_height_in
-    shares_labels = columns * rows > 1
-    has_colour_bar = plane.has_exponents or plane.seeds > 1
 
-    with style.styled_figure(form, height_in) as figure:
-        x_label_options: dict[str, Any] = {}
-        if caption:
-            caption_top = _write_caption(figure, caption, height_in, shares_labels)
-            x_label_options = {"y": caption_top, "va": "bottom"}
-        panel_grid = style.add_panels(figure, rows, columns, sharex=True, sharey=True)
-        grid: list[Any] = list(panel_grid.flat)
-        for axes in grid[count:]:
-            axes.set_axis_off()  # positions of the grid without a panel
+    def __init__(self, chart: StabilityMap) -> None:
+        self._chart = chart
 
-        titles_in = form.width_in - _COLOUR_BAR_IN * has_colour_bar
-        title_letters = round(titles_in * _TITLE_LETTERS_PER_IN / columns)
-        for axes, panel, panel_lines in zip(grid, plane.panels, lines, strict=False):
-            _draw_panel(axes, plane, panel, panel_lines)
-            title = panel.title
-            if len(title) > title_letters:
-                title = title.replace(", ", ",\n")
-            axes.set_title(title)
-        has_y_axis = bool(plane.y.key)
-        for n, axes in enumerate(grid[:count]):
-            _set_scale(axes, plane)
-            is_left = n % columns == 0
-            is_bottom = n + columns >= count
-            axes.tick_params(labelleft=is_left and has_y_axis)
-            axes.tick_params(labelbottom=is_bottom)
+    def draw(self, form: FigureSize) -> Figure:
+        """Draws a stability map, which shows with which parameters a scenario is stable.
 
-        if shares_labels:
-            figure.supxlabel(plane.x.label, fontsize=8.0, **x_label_options)
-            figure.supylabel(plane.y.label, fontsize=8.0)
-        else:
-            first_axes = grid[0]
-            first_axes.set_xlabel(plane.x.label)
-            first_axes.set_ylabel(plane.y.label)
-        if has_colour_bar:
-            _draw_colour_bar(figure, grid, plane)
-        _draw_legend(figure, plane, lines)
+        The map is a coloured grid. A sweep with more than two parameters has several panels,
+        each with the same two axes.
 
-        # Drawing computes the layout. The resulting size of a cell decides whether the counts
-        # fit into it.
-        canvas = FigureCanvasAgg(figure)
-        figure.draw(canvas.get_renderer())  # type: ignore[no-untyped-call]
-        shows_shares = plane.seeds > 1 and not plane.has_exponents
-        if shows_shares:
-            for axes, panel in zip(grid, plane.panels, strict=False):
-                _draw_counts(axes, plane, panel)
-    return figure
+        Args:
+            form: Width, type sizes and resolution of the figure.
+        """
+        plane = self._chart.plane
+        lines = self._chart.lines
+        count = len(plane.panels)
+        columns = _count_columns(count, form)
+        rows = math.ceil(count / columns)
+        caption = _wrap_caption(self._chart.fixed, form)
+        panel_height_in = _choose_panel_height_in(plane, columns)
+        caption_height_in = _CAPTION_LINE_IN * len(caption)
+        height_in = 0.95 + rows * panel_height_in + caption_height_in
+        shares_labels = columns * rows > 1
+        has_colour_bar = plane.has_exponents or plane.seeds > 1
+
+        with style.styled_figure(form, height_in) as figure:
+            x_label_options: dict[str, Any] = {}
+            if caption:
+                caption_top = _write_caption(figure, caption, height_in, shares_labels)
+                x_label_options = {"y": caption_top, "va": "bottom"}
+            panel_grid = style.add_panels(figure, rows, columns, sharex=True, sharey=True)
+            grid: list[Any] = list(panel_grid.flat)
+            for axes in grid[count:]:
+                axes.set_axis_off()  # positions of the grid without a panel
+
+            titles_in = form.width_in - _COLOUR_BAR_IN * has_colour_bar
+            title_letters = round(titles_in * _TITLE_LETTERS_PER_IN / columns)
+            for axes, panel, panel_lines in zip(grid, plane.panels, lines, strict=False):
+                _draw_panel(axes, plane, panel, panel_lines)
+                title = panel.title
+                if len(title) > title_letters:
+                    title = title.replace(", ", ",\n")
+                axes.set_title(title)
+            has_y_axis = bool(plane.y.key)
+            for n, axes in enumerate(grid[:count]):
+                _set_scale(axes, plane)
+                is_left = n % columns == 0
+                is_bottom = n + columns >= count
+                axes.tick_params(labelleft=is_left and has_y_axis)
+                axes.tick_params(labelbottom=is_bottom)
+
+            if shares_labels:
+                figure.supxlabel(plane.x.label, fontsize=8.0, **x_label_options)
+                figure.supylabel(plane.y.label, fontsize=8.0)
+            else:
+                first_axes = grid[0]
+                first_axes.set_xlabel(plane.x.label)
+                first_axes.set_ylabel(plane.y.label)
+            if has_colour_bar:
+                _draw_colour_bar(figure, grid, plane)
+            _draw_legend(figure, plane, lines)
+
+            # Drawing computes the layout. The resulting size of a cell decides whether the
+            # counts fit into it.
+            canvas = FigureCanvasAgg(figure)
+            figure.draw(canvas.get_renderer())  # type: ignore[no-untyped-call]
+            shows_shares = plane.seeds > 1 and not plane.has_exponents
+            if shows_shares:
+                for axes, panel in zip(grid, plane.panels, strict=False):
+                    _draw_counts(axes, plane, panel)
+        return figure
+
+    def write(self, folder: Path, width_in: float = COLUMN_IN) -> list[Path]:
+        """Writes the figure and the Markdown page of a stability map into an existing folder.
+
+        A stability map shows with which parameters a scenario is stable.
+
+        Args:
+            folder: The folder.
+            width_in: Width of the figure, in inches.
+
+        Returns:
+            The paths of the three picture files and of the page.
+
+        Raises:
+            UsageError: A figure in print cannot have this width. It must be as wide as one or
+                two columns of a page.
+        """
+        form = FigureSize.for_print(width_in)
+        figure = self.draw(form)
+        picture_names = ("map.png", "map.svg", "map.pdf")
+        picture_paths = [folder / name for name in picture_names]
+        page_path = folder / "map.md"
+        for path in picture_paths:
+            style.write_figure(figure, path, _DPI)
+        page = self.build_page(picture_names[0])
+        write_whole(page_path, page)
+        return [*picture_paths, page_path]
+
+    def build_page(self, picture: str) -> str:
+        """Composes the Markdown page of a stability map.
+
+        The page has the commands that create the map, the picture, the number of runs of each
+        class, notes, and for each panel a table of the measured edges of stability.
+
+        Args:
+            picture: File name of the picture.
+
+        Returns:
+            The text of the page.
+        """
+        chart = self._chart
+        commands = "\n".join(chart.commands)
+        class_table = _tabulate_classes(chart.plane)
+        parts = [
+            f"# {chart.title}",
+            f"```sh\n{commands}\n```",
+            f"![map]({picture})",
+            class_table.markdown(),
+        ]
+
+        notes = _list_notes(chart)
+        if notes:
+            note_lines = [f"- {note}" for note in notes]
+            parts.append("\n".join(note_lines))
+
+        for panel, lines in zip(chart.plane.panels, chart.lines, strict=True):
+            table = _tabulate_edges(chart.plane, panel, lines)
+            if table.rows:
+                if panel.title:
+                    parts.append(f"## {panel.title}")
+                parts.append(table.markdown())
+        return "\n\n".join(parts) + "\n"
 
 
 def _count_columns(panels: int, form: FigureSize) -> int:
@@ -718,71 +783,6 @@ _DPI = 300
 """Resolution of map.png, and of the cells in the other files, in pixels per inch."""
 
 
-def write_map(chart: StabilityMap, folder: Path, width_in: float = COLUMN_IN) -> list[Path]:
-    """Writes the figure and the Markdown page of a stability map into an existing folder.
-
-    A stability map shows with which parameters a scenario is stable.
-
-    Args:
-        chart: The results of the runs, the lines from theory, and the texts of the map.
-        folder: The folder.
-        width_in: Width of the figure, in inches.
-
-    Returns:
-        The paths of the three picture files and of the page.
-
-    Raises:
-        UsageError: A figure in print cannot have this width. It must be as wide as one or two
-            columns of a page.
-    """
-    form = FigureSize.for_print(width_in)
-    figure = draw_stability_map(chart.plane, chart.lines, form, chart.fixed)
-    picture_names = ("map.png", "map.svg", "map.pdf")
-    picture_paths = [folder / name for name in picture_names]
-    page_path = folder / "map.md"
-    for path in picture_paths:
-        style.write_figure(figure, path, _DPI)
-    page = build_map_page(chart, picture_names[0])
-    write_whole(page_path, page)
-    return [*picture_paths, page_path]
-
-
-def build_map_page(chart: StabilityMap, picture: str) -> str:
-    """Composes the Markdown page of a stability map.
-
-    The page has the commands that create the map, the picture, the number of runs of each
-    class, notes, and for each panel a table of the measured edges of stability.
-
-    Args:
-        chart: The map.
-        picture: File name of the picture.
-
-    Returns:
-        The text of the page.
-    """
-    commands = "\n".join(chart.commands)
-    class_table = tabulate_classes(chart.plane)
-    parts = [
-        f"# {chart.title}",
-        f"```sh\n{commands}\n```",
-        f"![map]({picture})",
-        class_table.markdown(),
-    ]
-
-    notes = _list_notes(chart)
-    if notes:
-        note_lines = [f"- {note}" for note in notes]
-        parts.append("\n".join(note_lines))
-
-    for panel, lines in zip(chart.plane.panels, chart.lines, strict=True):
-        table = tabulate_edges(chart.plane, panel, lines)
-        if table.rows:
-            if panel.title:
-                parts.append(f"## {panel.title}")
-            parts.append(table.markdown())
-    return "\n\n".join(parts) + "\n"
-
-
 def _list_notes(chart: StabilityMap) -> list[str]:
     """Returns the notes below a map: the origin of its lines, and gains that were not swept.
 
@@ -823,7 +823,7 @@ def _describe_refined_cells(plane: MapPlane) -> str:
     return f"{ran} of {count_nouns(cells, 'cell')} ran"
 
 
-def tabulate_classes(plane: MapPlane) -> TextTable:
+def _tabulate_classes(plane: MapPlane) -> TextTable:
     """Returns a table of how many runs of a stability map ended stable, diverged, and so on.
 
     Args:
@@ -838,7 +838,7 @@ def tabulate_classes(plane: MapPlane) -> TextTable:
     return TextTable(("runs", *CELL_CLASSES), rows)
 
 
-def tabulate_edges(plane: MapPlane, panel: MapPanel, lines: Sequence[MapLine]) -> TextTable:
+def _tabulate_edges(plane: MapPlane, panel: MapPanel, lines: Sequence[MapLine]) -> TextTable:
     """Returns a table that compares the measured edges of stability with theory.
 
     The table has one row per measured edge of the panel. For each line from theory it has the

@@ -31,10 +31,12 @@ from trilat_net.results import Result
 from trilat_net.scenario import Scenario
 from trilat_net.work import Progress, Workers, ignore_progress, open_worker_pool
 
+from ..run_commands import format_override_value
 from . import sweep_cell
 from .fixed_gains import FAIR_COMPARISON, describe_fixed_gains
-from .stability_map import StabilityCriterion, StabilityEdge, find_criterion_edge
-from .sweep_plan import SweepCell, SweepPlan, format_override, format_override_value, label_axis
+from .stability_map import StabilityCriterion, StabilityEdge
+from .sweep_axis import label_axis
+from .sweep_plan import SweepCell, SweepPlan
 
 SCAN_POINTS = 9
 """Number of values of the scan. It detects islands of stability that are wider than an eighth
@@ -298,54 +300,6 @@ class GridPointMargin(NamedTuple):
     closed: float | None
 
 
-def search_margins(
-    plan: SweepPlan,
-    within: SearchRange,
-    jobs: int | None = None,
-    progress: Progress = ignore_progress,
-    on: Workers = None,
-) -> list[GridPointMargin]:
-    """Finds the limits of stability along one scenario key, at each grid point of a sweep.
-
-    A grid point is a combination of the other swept parameters. A limit, called edge, is a
-    value of the key at which runs change from stable to not stable or back.
-
-    Args:
-        plan: The sweep. Its last axis must be the searched key with two values, the ends of the
-            range, as from `SearchRange.format_axis`.
-        within: The searched key and its range.
-        jobs: Number of worker processes. If `None`, all cores are used.
-        progress: Function that is called with the number of finished grid points and of all
-            grid points.
-        on: Workers to use instead of processes on this computer.
-
-    Returns:
-        The edges of each grid point and random seed, in the order of the grid.
-
-    Raises:
-        ScenarioError: The scenario is not valid at a value of the range.
-        RunFailed: A worker process died.
-    """
-    searches = []
-    # The last axis changes fastest from cell to cell. It is the searched key with two values,
-    # the ends of the range, so each grid point of the other axes has two neighbouring cells.
-    for number in range(0, plan.cells, 2):
-        cell_at_low_end = plan.cell(number)
-        grid_point = cell_at_low_end._replace(
-            values=cell_at_low_end.values[:-1],  # without the value of the searched key
-            overrides=cell_at_low_end.overrides[:-1],
-        )
-        # If nothing is random, all seeds give the same result.
-        is_random = plan.scenario(*cell_at_low_end.overrides).random
-        seeds = plan.seeds if is_random else plan.seeds[:1]
-        searches += [_MarginItem(plan, grid_point, seed, within) for seed in seeds]
-
-    # The workers need the files of control laws that users wrote.
-    laws = list_imported_code([plan.base])
-    with open_worker_pool(jobs, on, most=len(searches), laws=laws) as pool:
-        return pool.map(_search_margin_task, searches, progress)
-
-
 def _search_margin_task(task: _MarginItem) -> GridPointMargin:
     """Finds the limits of stability at one grid point of a sweep, by runs and by theory.
 
@@ -369,7 +323,7 @@ def _search_margin_task(task: _MarginItem) -> GridPointMargin:
         Args:
             value: Value of the scenario key along which the limit of stability is searched.
         """
-        override = format_override(key, value)
+        override = f"{key}={format_override_value(value)}"
         return task.plan.scenario(*task.cell.overrides, override, f"seed={task.seed}")
 
     def is_stable(value: float) -> bool | None:
@@ -391,7 +345,7 @@ def _search_margin_task(task: _MarginItem) -> GridPointMargin:
     except ScenarioError:
         whole = True  # the key takes whole numbers only
     margin = KeyMargin.search(is_stable, low, high, tolerance, whole=whole)
-    closed = find_criterion_edge(
+    closed = StabilityCriterion.find_edge(
         lambda value: StabilityCriterion.evaluate(load(value)), low, high
     )
     linear, remark = GrowthColumn.find_crossings(load(high), key, low, high)
@@ -424,12 +378,60 @@ class SweepMargins(Result):
         plan: The sweep. Its last axis is the searched key with two values, the ends of the
             range.
         within: The searched key and its range.
-        found: The limits at each grid point and for each seed.
+        found: The limits at each grid point and for each seed, in the order of the grid.
     """
 
     plan: SweepPlan
     within: SearchRange
     found: list[GridPointMargin]
+
+    @classmethod
+    def search(
+        cls,
+        plan: SweepPlan,
+        within: SearchRange,
+        jobs: int | None = None,
+        progress: Progress = ignore_progress,
+        on: Workers = None,
+    ) -> "SweepMargins":
+        """Finds the limits of stability along one scenario key, at each grid point of a sweep.
+
+        A grid point is a combination of the other swept parameters. A limit, called edge, is a
+        value of the key at which runs change from stable to not stable or back.
+
+        Args:
+            plan: The sweep. Its last axis must be the searched key with two values, the ends of
+                the range, as from `SearchRange.format_axis`.
+            within: The searched key and its range.
+            jobs: Number of worker processes. If `None`, all cores are used.
+            progress: Function that is called with the number of finished grid points and of all
+                grid points.
+            on: Workers to use instead of processes on this computer.
+
+        Raises:
+            ScenarioError: The scenario is not valid at a value of the range.
+            RunFailed: A worker process died.
+        """
+        searches = []
+        # The last axis changes fastest from cell to cell. It is the searched key with two
+        # values, the ends of the range, so each grid point of the other axes has two
+        # neighbouring cells.
+        for number in range(0, plan.cells, 2):
+            cell_at_low_end = plan.cell(number)
+            grid_point = cell_at_low_end._replace(
+                values=cell_at_low_end.values[:-1],  # without the value of the searched key
+                overrides=cell_at_low_end.overrides[:-1],
+            )
+            # If nothing is random, all seeds give the same result.
+            is_random = plan.scenario(*cell_at_low_end.overrides).random
+            seeds = plan.seeds if is_random else plan.seeds[:1]
+            searches += [_MarginItem(plan, grid_point, seed, within) for seed in seeds]
+
+        # The workers need the files of control laws that users wrote.
+        laws = list_imported_code([plan.base])
+        with open_worker_pool(jobs, on, most=len(searches), laws=laws) as pool:
+            found = pool.map(_search_margin_task, searches, progress)
+        return cls(plan, within, found)
 
     @property
     def command(self) -> str:

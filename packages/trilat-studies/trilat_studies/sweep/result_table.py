@@ -1,7 +1,8 @@
 """Writes and reads results.csv, the table of a sweep with one row per run, row by row.
 
 A sweep may have millions of runs, whose rows need more memory than a machine has. Therefore,
-rows are written one by one, and a large table stays in its file while it is used.
+rows are written one by one, and a large table stays in its file while it is used. `ResultTable`
+builds the row of a finished run, with the command that repeats the run.
 
 Invariant:
     - Reading the CSV table restores all numbers bit for bit.
@@ -17,10 +18,12 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, overload
 
+import msgspec
+
 from trilat_net.errors import UsageError
 from trilat_net.work import encode_csv
 
-from .sweep_cell import CellResult, apply_diff, diff_lines
+from .sweep_cell import CellResult, CellRun, apply_diff, diff_lines
 from .sweep_plan import SweepPlan
 
 ResultRow = Mapping[str, Any]
@@ -42,16 +45,23 @@ trace exceeds the default limit of the csv module, 131 072 characters.
 """
 
 
-def iterate_csv(rows: Iterable[Mapping[str, Any]], columns: Sequence[str]) -> Iterator[str]:
+def encode_table(
+    rows: Iterable[Mapping[str, Any]], column_types: Mapping[str, type]
+) -> Iterator[str]:
     """Yields a table as CSV text line by line, so that a large table needs little memory.
 
     Args:
         rows: The rows, as values by column.
-        columns: The columns.
+        column_types: The columns in their order, each with the type of its values.
+
+    Yields:
+        The header, and the text of each row. Numbers can be read from it bit for bit.
     """
+    columns = list(column_types)
     yield encode_csv([], columns)
     for row in rows:
-        yield encode_csv([row], columns, header=False)
+        texts = {name: _format_cell(row[name], kind) for name, kind in column_types.items()}
+        yield encode_csv([texts], columns, header=False)
 
 
 class ResultTable:
@@ -79,14 +89,13 @@ class ResultTable:
         Args:
             rows: The runs, one mapping from columns to values per run.
         """
-        yield from iterate_csv(map(self._format_row, rows), self.columns)
+        column_types = {**self._kinds, _SCENARIO_COLUMN: str}
+        yield from encode_table(map(self._add_changes, rows), column_types)
 
-    def _format_row(self, row: ResultRow) -> dict[str, str]:
-        """Returns the texts of a run's row in the CSV table, by column."""
-        line = {name: format_table_cell(row[name], kind) for name, kind in self._kinds.items()}
+    def _add_changes(self, row: ResultRow) -> ResultRow:
+        """Returns a row with the column that stands for its scenario in the CSV table."""
         changes = diff_lines(row["scenario"], self._plan.base.text)
-        line[_SCENARIO_COLUMN] = json.dumps(changes, ensure_ascii=False)
-        return line
+        return {**row, _SCENARIO_COLUMN: json.dumps(changes, ensure_ascii=False)}
 
     def parse(self, line: Mapping[str, str]) -> ResultRow:
         """Returns the results in one line of a CSV table, with the scenario's full text.
@@ -104,6 +113,79 @@ class ResultTable:
                 row[axis.key] = value
         row["scenario"] = apply_diff(json.loads(line[_SCENARIO_COLUMN]), self._plan.base.text)
         return row
+
+    def read_rows(self, file: Path) -> Sequence[ResultRow]:
+        """Reads the results of a parameter sweep. The rows of a large table stay in the file.
+
+        Args:
+            file: The CSV table.
+
+        Raises:
+            UsageError: The table cannot be read.
+        """
+        rows = StoredRows(file, self)
+        return list(rows) if len(rows) <= ROWS_IN_MEMORY else rows
+
+    def iterate_cells(self, done: Mapping[tuple[int, int], CellRun]) -> Iterator[list[CellRun]]:
+        """Yields the finished runs of each cell, ordered by cell and then by seed.
+
+        Worker processes finish in any order, on which the results must not depend.
+
+        Args:
+            done: The finished runs, by cell and seed.
+        """
+        seeds = self._plan.seeds
+        cells: Iterable[int] = (cell for cell, _ in done)
+        if len(seeds) > 1:
+            cells = set(cells)  # a cell has an entry for each seed
+        for cell in sorted(cells):
+            yield [done[cell, seed] for seed in seeds if (cell, seed) in done]
+
+    def build_rows(self, runs: Sequence[CellRun]) -> Iterator[ResultRow]:
+        """Yields the results of one combination of swept parameters, one row per simulation.
+
+        Args:
+            runs: All finished runs of the cell.
+        """
+        for entry in runs:
+            # The log of a cell with a single run needs no seed in its name.
+            suffix = f"-seed-{entry.seed}" if len(runs) > 1 else ""
+            yield self._build_row(entry, f"cell-{entry.cell}{suffix}.mcap")
+
+    def _build_row(self, entry: CellRun, log: str) -> ResultRow:
+        """Returns the table row of a finished simulation, with the command that repeats it.
+
+        The row has the parameter values (cell) and the results.
+
+        Args:
+            entry: The run.
+            log: Name of the log that the command in the row records.
+        """
+        plan = self._plan
+        cell = plan.cell(entry.cell)
+        command = plan.build_sim_command(
+            overrides=cell.overrides,
+            seed=entry.seed,
+            duration_s=plan.reproduction_duration_s(entry.outcome),
+            log=log,
+        )
+
+        axis_keys = [axis.key for axis in plan.axes]
+        axis_values = dict(zip(axis_keys, cell.values, strict=True))
+
+        scenario_text = apply_diff(entry.scenario, plan.base.text)
+        return {
+            "cell": cell.number,
+            **axis_values,
+            "law": entry.law,
+            "seed": entry.seed,
+            "random": entry.random,
+            **entry.metrics,
+            **msgspec.to_builtins(entry.outcome),
+            "scenario_sha256": entry.sha256,
+            "command": command,
+            "scenario": scenario_text,
+        }
 
 
 class StoredRows(Sequence[ResultRow]):
@@ -225,20 +307,6 @@ class StoredRows(Sequence[ResultRow]):
             ) from None
 
 
-def read_rows(file: Path, plan: SweepPlan) -> Sequence[ResultRow]:
-    """Reads the results of a parameter sweep. The rows of a large table stay in the file.
-
-    Args:
-        file: The CSV table.
-        plan: The sweep: its scenario, axes, control laws and seeds.
-
-    Raises:
-        UsageError: The table cannot be read.
-    """
-    rows = StoredRows(file, ResultTable(plan))
-    return list(rows) if len(rows) <= ROWS_IN_MEMORY else rows
-
-
 def _read_next(reader: Iterator[list[str]]) -> list[str] | None:
     """Reads the next row of a CSV table, whose cells may hold the whole text of a scenario.
 
@@ -260,7 +328,7 @@ def _list_result_columns(plan: SweepPlan) -> dict[str, type]:
 
     The column with the scenario is not listed, because it needs special treatment.
     """
-    column_types = {**list_axis_columns(plan), "seed": int, "random": bool}
+    column_types = {**plan.list_axis_columns(), "seed": int, "random": bool}
     # All fields of a result are numbers, except those whose types are corrected below.
     number_columns = (*plan.metrics, *CellResult.__struct_fields__)
     column_types |= dict.fromkeys(number_columns, float)
@@ -269,20 +337,7 @@ def _list_result_columns(plan: SweepPlan) -> dict[str, type]:
     return column_types | {"extended": int}
 
 
-def list_axis_columns(plan: SweepPlan) -> dict[str, type]:
-    """Returns the columns of a CSV table that identify a combination of swept parameters.
-
-    The columns are the number of the combination, the value of each axis, and the control law.
-    Each column has the type with which the table is read again.
-    """
-    column_types: dict[str, type] = {"cell": int}
-    for axis in plan.axes:
-        column_types[axis.key] = float if axis.numeric else str
-    column_types["law"] = str
-    return column_types
-
-
-def format_table_cell(value: Any, kind: type) -> str:
+def _format_cell(value: Any, kind: type) -> str:
     """Converts a value to a field of a CSV table, from which numbers can be read bit for bit.
 
     Args:
@@ -297,7 +352,7 @@ def format_table_cell(value: Any, kind: type) -> str:
 
 
 def _parse_cell(text: str, kind: type) -> Any:
-    """Converts a field of a sweep's CSV table to a value; the inverse of `format_table_cell`.
+    """Converts a field of a sweep's CSV table to a value; the inverse of `_format_cell`.
 
     Args:
         text: Text of the cell.

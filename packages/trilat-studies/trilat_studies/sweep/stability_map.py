@@ -44,9 +44,11 @@ from trilat_net.scenario import (
 )
 from trilat_net.work import Progress, Workers, ignore_progress, open_worker_pool
 
+from ..run_commands import format_override_value
 from .fixed_gains import describe_fixed_gains
+from .sweep_axis import label_axis, label_setting
 from .sweep_cell import RUN_CLASSES, CellClass
-from .sweep_plan import SweepPlan, format_override, label_axis, label_setting
+from .sweep_plan import SweepPlan
 from .sweep_results import SweepResults
 
 RunCounts = NDArray[np.int64]
@@ -271,6 +273,29 @@ class MapPanel(NamedTuple):
                 filled = np.where(np.isfinite(interpolated), interpolated, filled)
             exponents_per_s = filled
         return self._replace(counts=self.counts[rows, columns], exponents_per_s=exponents_per_s)
+
+    def make_loader(self, plan: SweepPlan, x: str, y: str) -> "PanelLoader":
+        """Returns a function that loads the scenario at any point of a panel.
+
+        The lines from theory also need scenarios between the grid points of the sweep. The
+        function can be pickled, so that other processes can call it.
+
+        Args:
+            plan: The sweep: its scenario, axes, control laws and seeds.
+            x: Scenario key of the horizontal axis.
+            y: Scenario key of the vertical axis.
+
+        Returns:
+            Function of the values of x and y that returns the scenario.
+        """
+        settings = dict(self.settings)
+        only_law = next(iter(plan.laws), "")
+        law = settings.pop(LAW_AXIS, only_law)
+        overrides = [*plan.laws.get(law, ())]
+        overrides += [
+            f"{key}={format_override_value(value)}" for key, value in settings.items()
+        ]
+        return partial(_load_grid_scenario, plan, tuple(overrides), x, y)
 
 
 class MapPlane(NamedTuple):
@@ -577,6 +602,46 @@ class StabilityCriterion(NamedTuple):
         if any(arm.chain is not None for arm in scenario.arms.values()):
             return None  # the other criterion holds only for the planar arm with two joints
         return _evaluate_sampling_criterion(scenario)
+
+    @staticmethod
+    def find_edge(
+        criterion: "Callable[[float], StabilityCriterion | None]", low: float, high: float
+    ) -> float | None:
+        """Finds the value of a parameter at which a stability condition is just met.
+
+        The value is located with Brent's method.
+
+        Args:
+            criterion: Function that evaluates the criterion at a value. It may raise
+                ScenarioError for a value that is not valid, such as a fraction where a whole
+                number is needed.
+            low: Lower end of the searched interval.
+            high: Upper end of the searched interval.
+
+        Returns:
+            The value. `None` if the criterion has the same sign at both ends, or if it does not
+            apply to a value between them.
+        """
+        # imported late: SciPy costs half a second, and most commands do not need it
+        from scipy.optimize import brentq
+
+        def excess(value: float) -> float:
+            """Returns the margin of the condition at a value, negative if it is violated."""
+            evaluated = criterion(value)
+            if evaluated is None:
+                raise ScenarioError("no criterion covers it")
+            return evaluated.excess
+
+        tolerance = 1e-8 * (high - low)
+        try:
+            met_at_low = excess(low) > 0.0
+            met_at_high = excess(high) > 0.0
+            if met_at_low == met_at_high:
+                return None
+            edge = brentq(excess, low, high, xtol=tolerance, maxiter=_MAX_ROOT_STEPS)
+            return float(edge)
+        except ScenarioError:
+            return None
 
 
 def _evaluate_damping_criterion(scenario: Scenario) -> StabilityCriterion | None:
@@ -1038,7 +1103,7 @@ class MapLine(NamedTuple):
                 excess.append(value)
             edges: dict[int, float] = {}
             for n in _find_sign_changes(excess):
-                edge = find_criterion_edge(evaluate, y.values[n], y.values[n + 1])
+                edge = StabilityCriterion.find_edge(evaluate, y.values[n], y.values[n + 1])
                 if edge is not None:
                     edges[n] = edge
             column = _place_zeros(y.values, excess, edges)
@@ -1055,6 +1120,46 @@ class MapLine(NamedTuple):
             rank=0,
         )
         return line if line.crosses_map else None
+
+    @classmethod
+    def trace_linear_analysis(
+        cls, columns: Sequence[GrowthColumn], y: PlaneAxis
+    ) -> "tuple[MapLine | None, list[str]]":
+        """Finds the line of the linear analysis, on one side of which the loop is stable.
+
+        On this line of a map panel, small motions of the linearised control loop neither grow
+        nor decay: the real part of the rightmost characteristic root is zero. The line is
+        described by the decay rate of the motions at the grid points, in 1/s, which is the
+        negative of the growth rate. It is positive on the stable side, see `MapLine.excess`.
+
+        Args:
+            columns: Linear analysis of each column of the panel (grid points with the same x),
+                in the order of x. It contains growth rates, and precise positions of the limit.
+            y: Vertical axis.
+
+        Returns:
+            The line, or `None` if it does not cross the panel; and remarks of the analysis for
+            the reader of the map, without duplicates.
+        """
+        decay_columns = []
+        all_remarks = list[str]()
+        for column in columns:
+            # A growth rate of -infinity means that nothing moves. The grid point is then on
+            # neither side.
+            decay_per_s = [np.nan if np.isinf(rate) else -rate for rate in column.growth_per_s]
+            # The drawn line must pass through the precise positions of the limit.
+            placed_decay_per_s = _place_zeros(y.values, decay_per_s, column.edges)
+            decay_columns.append(placed_decay_per_s)
+            all_remarks.extend(column.remarks)
+        distinct_remarks = list(dict.fromkeys(all_remarks))  # in their order
+        line = MapLine(
+            label=LINEAR_ANALYSIS,
+            text=LINEAR_ANALYSIS,
+            about=_ABOUT_ROOTS,
+            excess=np.array(decay_columns).T,
+            rank=1,  # line style; 0 is that of the closed form
+        )
+        return line if line.crosses_map else None, distinct_remarks
 
 
 ZERO_EXPONENT = "exponent = 0"
@@ -1091,46 +1196,6 @@ def _trace_zero_exponent(plane: MapPlane, panel: MapPanel) -> MapLine | None:
         rank=-1,
     )
     return line if line.crosses_map else None
-
-
-def trace_linear_analysis(
-    columns: Sequence[GrowthColumn], y: PlaneAxis
-) -> tuple[MapLine | None, list[str]]:
-    """Finds the line of the linear analysis, on one side of which the loop is stable.
-
-    On this line of a map panel, small motions of the linearised control loop neither grow nor
-    decay: the real part of the rightmost characteristic root is zero. The line is described by
-    the decay rate of the motions at the grid points, in 1/s, which is the negative of the
-    growth rate. It is positive on the stable side, see `MapLine.excess`.
-
-    Args:
-        columns: Linear analysis of each column of the panel (grid points with the same x), in
-            the order of x. It contains growth rates, and precise positions of the limit.
-        y: Vertical axis.
-
-    Returns:
-        The line, or `None` if it does not cross the panel; and remarks of the analysis for the
-        reader of the map, without duplicates.
-    """
-    decay_columns = []
-    all_remarks = list[str]()
-    for column in columns:
-        # A growth rate of -infinity means that nothing moves. The grid point is then on neither
-        # side.
-        decay_per_s = [np.nan if np.isinf(rate) else -rate for rate in column.growth_per_s]
-        # The drawn line must pass through the precise positions of the limit.
-        placed_decay_per_s = _place_zeros(y.values, decay_per_s, column.edges)
-        decay_columns.append(placed_decay_per_s)
-        all_remarks.extend(column.remarks)
-    distinct_remarks = list(dict.fromkeys(all_remarks))  # in their order
-    line = MapLine(
-        label=LINEAR_ANALYSIS,
-        text=LINEAR_ANALYSIS,
-        about=_ABOUT_ROOTS,
-        excess=np.array(decay_columns).T,
-        rank=1,  # line style; 0 is that of the closed form
-    )
-    return line if line.crosses_map else None, distinct_remarks
 
 
 def _find_sign_changes(values: Sequence[float]) -> list[int]:
@@ -1193,45 +1258,6 @@ def _place_zeros(
         scale = 1.0 - 1.0 / fraction
         placed[n + 1] = placed[n] * scale
     return placed
-
-
-def find_criterion_edge(
-    criterion: Callable[[float], StabilityCriterion | None], low: float, high: float
-) -> float | None:
-    """Finds the value of a parameter at which a stability condition is just met.
-
-    The value is located with Brent's method.
-
-    Args:
-        criterion: Function that evaluates the criterion at a value. It may raise ScenarioError
-            for a value that is not valid, such as a fraction where a whole number is needed.
-        low: Lower end of the searched interval.
-        high: Upper end of the searched interval.
-
-    Returns:
-        The value. `None` if the criterion has the same sign at both ends, or if it does not
-        apply to a value between them.
-    """
-    # imported late: SciPy costs half a second, and most commands do not need it
-    from scipy.optimize import brentq
-
-    def excess(value: float) -> float:
-        """Returns the margin of the condition at a value, negative if it is violated."""
-        evaluated = criterion(value)
-        if evaluated is None:
-            raise ScenarioError("no criterion covers it")
-        return evaluated.excess
-
-    tolerance = 1e-8 * (high - low)
-    try:
-        met_at_low = excess(low) > 0.0
-        met_at_high = excess(high) > 0.0
-        if met_at_low == met_at_high:
-            return None
-        edge = brentq(excess, low, high, xtol=tolerance, maxiter=_MAX_ROOT_STEPS)
-        return float(edge)
-    except ScenarioError:
-        return None
 
 
 LAW_AXIS = "law"
@@ -1311,7 +1337,7 @@ class StabilityMap(NamedTuple):
         if not y.key or len(y.values) < 2:
             return stability_map
 
-        loaders = [make_panel_loader(plan, panel, x.key, y.key) for panel in plane.panels]
+        loaders = [panel.make_loader(plan, x.key, y.key) for panel in plane.panels]
         fine = _choose_columns(loaders, x, y)
         panel_lines = []
         for panel, load in zip(plane.panels, loaders, strict=True):
@@ -1331,7 +1357,7 @@ class StabilityMap(NamedTuple):
             # The results come in the order of the tasks, panel by panel and column by column.
             for lines in panel_lines:
                 panel_columns = [next(columns) for _ in fine.values]
-                line, line_remarks = trace_linear_analysis(panel_columns, y)
+                line, line_remarks = MapLine.trace_linear_analysis(panel_columns, y)
                 lines.append(None if line is None else line.thin_out(fine))
                 remarks += line_remarks
 
@@ -1454,30 +1480,7 @@ def _analyse_column(task: tuple[PanelLoader, float, PlaneAxis]) -> GrowthColumn:
     return GrowthColumn.compute(scenarios, y.key, y.values)
 
 
-def make_panel_loader(plan: SweepPlan, panel: MapPanel, x: str, y: str) -> PanelLoader:
-    """Returns a function that loads the scenario at any point of a panel.
-
-    The lines from theory also need scenarios between the grid points of the sweep. The function
-    can be pickled, so that other processes can call it.
-
-    Args:
-        plan: The sweep: its scenario, axes, control laws and seeds.
-        panel: Panel of the map, a grid of runs over x and y.
-        x: Scenario key of the horizontal axis.
-        y: Scenario key of the vertical axis.
-
-    Returns:
-        Function of the values of x and y that returns the scenario.
-    """
-    settings = dict(panel.settings)
-    only_law = next(iter(plan.laws), "")
-    law = settings.pop(LAW_AXIS, only_law)
-    overrides = [*plan.laws.get(law, ())]
-    overrides += [format_override(key, value) for key, value in settings.items()]
-    return partial(load_grid_scenario, plan, tuple(overrides), x, y)
-
-
-def load_grid_scenario(
+def _load_grid_scenario(
     plan: SweepPlan, fixed: Sequence[str], x: str, y: str, x_value: float, y_value: float
 ) -> Scenario:
     """Returns the scenario of a sweep with given values of the two parameters on a map's axes.
@@ -1496,6 +1499,6 @@ def load_grid_scenario(
     Raises:
         ScenarioError: The scenario is not valid with these values.
     """
-    x_override = format_override(x, x_value)
-    y_override = format_override(y, y_value)
+    x_override = f"{x}={format_override_value(x_value)}"
+    y_override = f"{y}={format_override_value(y_value)}"
     return plan.scenario(*fixed, x_override, y_override)

@@ -17,7 +17,7 @@ import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from enum import StrEnum
 from itertools import chain
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import msgspec
 
@@ -27,7 +27,6 @@ from trilat_net.analysis import (
     GrowthColumn,
     RunEnd,
     Stability,
-    TwinGrowth,
     find_run_roots,
     judge_virtual_run,
 )
@@ -35,11 +34,6 @@ from trilat_net.execution import FusedRun
 from trilat_net.own_code import ImportedLaw
 from trilat_net.results import finite_or_none
 from trilat_net.scenario import Scenario, parse_scenario
-
-from ..measure_run import refuse_live_only
-
-if TYPE_CHECKING:
-    from trilat_net.core import RunGroup
 
 
 class CellClass(StrEnum):
@@ -124,7 +118,7 @@ class CellResult(msgspec.Struct, frozen=True):
         walls_j: See `RunTotals`.
         reasons: Reasons why the run is undecided, or why its cell was rejected, as a string.
         exponent_per_s: Growth exponent over the scenario's duration, from twins (repetitions
-            with a small push), in 1/s, see `measure_exponent`. `None` if there were no twins,
+            with a small push), in 1/s, see `sweep_run`. `None` if there were no twins,
             or if no twin moved. In a sweep that is judged linearly, it is the real part of the
             rightmost root.
         stability: The decision whether the run is stable, as in the stability certificate.
@@ -177,6 +171,34 @@ class CellResult(msgspec.Struct, frozen=True):
             reasons=reasons,
         )
 
+    @classmethod
+    def judge_linearly(cls, scenario: Scenario) -> "CellResult":
+        """Decides without a simulation whether a parameter combination is stable.
+
+        The linearised control loop is stable if the real parts of all its characteristic roots
+        are negative. The result is undecided if the scenario has no linear loop, or if nothing
+        moves.
+
+        Args:
+            scenario: Scenario of the cell.
+        """
+        column = GrowthColumn.compute([scenario], "", [0.0], at_mean_pose=True)
+        (rate_per_s,) = column.growth_per_s
+        remarks = "; ".join(column.remarks)
+        if math.isnan(rate_per_s):
+            return cls.unsimulated(CellClass.UNDECIDED, remarks)
+        if math.isinf(rate_per_s):
+            return cls.unsimulated(CellClass.UNDECIDED, "nothing moves in the linear loop")
+
+        verdict = CellClass.DIVERGED if rate_per_s > 0.0 else CellClass.CONVERGED
+        basis = "Floquet multipliers" if column.is_sampled else "characteristic roots"
+        reasons = [f"{basis} of the linear loop", *column.remarks]
+        return msgspec.structs.replace(
+            cls.unsimulated(verdict, ""),
+            exponent_per_s=rate_per_s,
+            rests_on="; ".join(reasons),
+        )
+
     @property
     def is_conclusive(self) -> bool:
         """True if a longer run would very probably end in the same way.
@@ -204,12 +226,6 @@ class CellResult(msgspec.Struct, frozen=True):
         )
 
 
-TWINS_OF_A_CELL = 4
-"""Number of twins of a run, which are repetitions with a small push.
-
-The pushes act on all joints at once, on single joints and, under the adaptive law, on the
-estimates.
-"""
 FLAT_LOG_CHANGE = 0.02
 """Largest change of the logarithm of an amplitude over half a run that counts as constant."""
 
@@ -224,9 +240,9 @@ def check_sweepable(scenario: Scenario) -> None:
         scenario: The scenario.
 
     Raises:
-        ScenarioError: See `refuse_live_only` and `FusedRun.check_scenario`.
+        ScenarioError: See `Scenario.refuse_live_only` and `FusedRun.check_scenario`.
     """
-    refuse_live_only(scenario)
+    scenario.refuse_live_only()
     FusedRun.check_scenario(scenario)
 
 
@@ -372,89 +388,26 @@ def classify_cells(scenarios: Iterable[Scenario], longest_s: float) -> Iterator[
     for group in RunGroup.divide(runs):
         for index in group.members:
             obstacles[index] = group.obstacle
-        _run_group(group, cells)
+        # Cells of a group have the same duration, and are extended to the same times.
+        running_cells = [cells[index] for index in group.members]
+        group.advance_to(running_cells[0].duration_s)
+        for cell in running_cells:
+            cell.note_first_end()
+        while unfinished := _list_unfinished(running_cells):
+            group.keep(unfinished)
+            running_cells = [running_cells[position] for position in unfinished]
+            end_s = running_cells[0].find_next_end()
+            assert end_s is not None
+            group.advance_to(end_s)
+            for cell in running_cells:
+                cell.note_extension(end_s)
     for cell, obstacle in zip(cells, obstacles, strict=True):
         yield _JudgedCell(cell.judge(), obstacle)
 
 
-def _run_group(group: "RunGroup", cells: Sequence[_CellInProgress]) -> None:
-    """Runs the cells of a group side by side, and extends those that are not conclusive.
-
-    A run is conclusive if a longer run would end in the same way. Finished cells leave the
-    group, and the others continue to twice the duration.
-
-    Args:
-        group: Group of the runs of some cells. They have the same duration.
-        cells: All cells.
-    """
-    running_cells = [cells[index] for index in group.members]
-    group.advance_to(running_cells[0].duration_s)
-    for cell in running_cells:
-        cell.note_first_end()
-    while True:
-        next_ends_s = [cell.find_next_end() for cell in running_cells]
-        unfinished = [
-            position for position, end_s in enumerate(next_ends_s) if end_s is not None
-        ]
-        if not unfinished:
-            return
-        group.keep(unfinished)
-        running_cells = [running_cells[position] for position in unfinished]
-        # Cells with the same duration are extended to the same times.
-        end_s = running_cells[0].find_next_end()
-        assert end_s is not None
-        group.advance_to(end_s)
-        for cell in running_cells:
-            cell.note_extension(end_s)
-
-
-def measure_exponent(scenario: Scenario) -> float | None:
-    """Measures the growth exponent of a run, the rate at which small disturbances grow.
-
-    A twin is a second execution of the run with a small push. The difference between the twin
-    and the run changes as exp(exponent t), where t is the time, see `analysis.twin_growth`.
-    Several twins are run. The result is the largest of their rates over the later part of the
-    run, the part over which runs are judged.
-
-    Args:
-        scenario: Scenario of the run.
-
-    Returns:
-        The exponent in 1/s, negative if disturbances decay. `None` if no push had an effect.
-    """
-    run = FusedRun(scenario, SETTLED_ERROR_RAD)
-    run.advance_to(scenario.duration_s)
-    end = RunEnd.of_run(run, scenario)
-    twins = TwinGrowth.of_scenario(scenario, end, run.ran_s, TWINS_OF_A_CELL)
-    rates_per_s = [push.rate_per_s for push in twins.pushes]
-    return max(filter(math.isfinite, rates_per_s), default=None)
-
-
-def judge_linearly(scenario: Scenario) -> CellResult:
-    """Decides without a simulation whether a parameter combination is stable.
-
-    The linearised control loop is stable if the real parts of all its characteristic roots are
-    negative. The result is undecided if the scenario has no linear loop, or if nothing moves.
-
-    Args:
-        scenario: Scenario of the cell.
-    """
-    column = GrowthColumn.compute([scenario], "", [0.0], at_mean_pose=True)
-    (rate_per_s,) = column.growth_per_s
-    remarks = "; ".join(column.remarks)
-    if math.isnan(rate_per_s):
-        return CellResult.unsimulated(CellClass.UNDECIDED, remarks)
-    if math.isinf(rate_per_s):
-        return CellResult.unsimulated(CellClass.UNDECIDED, "nothing moves in the linear loop")
-
-    verdict = CellClass.DIVERGED if rate_per_s > 0.0 else CellClass.CONVERGED
-    basis = "Floquet multipliers" if column.is_sampled else "characteristic roots"
-    reasons = [f"{basis} of the linear loop", *column.remarks]
-    return msgspec.structs.replace(
-        CellResult.unsimulated(verdict, ""),
-        exponent_per_s=rate_per_s,
-        rests_on="; ".join(reasons),
-    )
+def _list_unfinished(cells: Sequence[_CellInProgress]) -> list[int]:
+    """Returns the positions of the cells whose runs are not conclusive and must continue."""
+    return [position for position, cell in enumerate(cells) if cell.find_next_end() is not None]
 
 
 def _chatters(scenario: Scenario, run: FusedRun) -> bool:

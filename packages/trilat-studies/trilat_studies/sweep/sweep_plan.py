@@ -2,297 +2,30 @@
 
 For example, the text "link.delay_ms=0:400:50" makes the network delay an axis of the grid, with
 the values 0 to 400 ms. One combination of the values of all axes and of a control law is called
-a cell. Each cell is run once per random seed. This module parses the axes, laws and seeds,
-combines them with the scenario, and checks the result before anything runs.
+a cell. Each cell is run once per random seed. This module combines the axes, laws and seeds
+with the scenario, and checks the result before anything runs. `SweepAxis` parses an axis.
 
 Invariant:
     - A plan that cannot run is rejected before the first run.
     - Cells are numbered row by row. A cell is computed from the plan and its number, so a large
       grid need not be stored.
-    - The value of an axis is the text of an override, as a user would write it.
-    - Ranges are counted in decimal numbers: 0.2:3:0.1 contains 0.3, not 0.30000000000000004.
 """
 
 import math
-import tomllib
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from decimal import Decimal, InvalidOperation
 from itertools import product
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import numpy as np
-
 from trilat_net.analysis import LogMetrics
 from trilat_net.errors import ScenarioError, UsageError, count_nouns, suggest_nearest
-from trilat_net.fields import split_unit
 from trilat_net.own_code import allow_own_code, name_law_classes
-from trilat_net.scenario import LAWS, ExperimentText, Scenario, is_number
+from trilat_net.scenario import LAWS, ExperimentText, Scenario
 
-from ..run_commands import format_command, format_toml_value, set_options
+from ..run_commands import format_command, format_override_value, set_options
 from . import sweep_cell
-
-_ON_GRID = Decimal("1e-9")
-"""Largest distance, in steps, at which a value counts as equal to the end of a range."""
-_KEYS_WITH_OPTIONS = {
-    "seed": "seeds have their own option, as in --seeds 1..20",
-    "duration_s": "the duration of a cell depends on its verdict: --duration sets the first "
-    "duration, --longest the limit",
-}
-"""Keys that cannot be swept, each with the option that sets the key instead."""
-_MAX_AXIS_VALUES = 10**12
-"""Largest number of values of an axis."""
-_VALUES_EXAMPLE = "as in KEY=0:1600:50 (from, to, step) or KEY=1,2,5"
-"""Example of an axis for error messages."""
-
-
-class _Steps:
-    """Sequence of equally spaced numbers, as texts.
-
-    A text is created only when it is accessed, because a list of all values of a long range
-    might not fit into memory.
-
-    Args:
-        first: First value.
-        step: Difference between neighbouring values.
-        count: Number of values.
-    """
-
-    def __init__(self, first: Decimal, step: Decimal, count: int) -> None:
-        self._first = first
-        self._step = step
-        self._count = count
-
-    def __len__(self) -> int:
-        return self._count
-
-    def __getitem__(self, index: int) -> str:
-        n = range(self._count)[index]  # range checks the bounds and resolves negative indices
-        return f"{self._first + n * self._step:f}"
-
-
-class _SweepAxis(NamedTuple):
-    """One swept scenario key with its values, as in "link.delay_ms=0:400:50".
-
-    Attributes:
-        description: The axis as the user wrote it, as "KEY=a:b:step" or "KEY=v1,v2,v3".
-        key: Scenario key that the axis varies.
-        texts: Values of the axis, as texts that follow "KEY=" in an override.
-    """
-
-    description: str
-    key: str
-    texts: tuple[str, ...] | _Steps
-
-    def value(self, number: int) -> float | str:
-        """Returns the value of the swept key at an index, such as 50.0 for a delay.
-
-        Args:
-            number: Index of the value, from 0.
-
-        Returns:
-            A float if the value is a number. Otherwise its text.
-        """
-        text = self.texts[number]
-        value = _parse_value(text)
-        return float(value) if is_number(value) else text
-
-    @property
-    def numeric(self) -> bool:
-        """True if all values of a swept parameter are numbers, as an axis of a map needs."""
-        if isinstance(self.texts, _Steps):
-            return True
-        return all(is_number(_parse_value(text)) for text in self.texts)
-
-    def override(self, number: int) -> str:
-        """Returns the text that sets one value of a swept parameter, as in "link.delay_ms=50".
-
-        Args:
-            number: Index of the value, from 0.
-        """
-        return f"{self.key}={self.texts[number]}"
-
-
-def parse_axis(description: str) -> _SweepAxis:
-    """Parses a swept parameter, as a user writes it, such as "link.delay_ms=0:200:10".
-
-    Args:
-        description: Either "KEY=a:b:step", a range that includes b if a whole number of steps
-            leads to it; or "KEY=v1,v2,v3", a list of numbers, words or other TOML values.
-
-    Raises:
-        ScenarioError: The key or the values are missing, or the values are not valid.
-    """
-    key, equals, text = (part.strip() for part in str(description).partition("="))
-    if not equals or not key:
-        raise ScenarioError(
-            f"--over must have the form KEY=VALUES, {_VALUES_EXAMPLE}, not {description!r}"
-        )
-    if key in _KEYS_WITH_OPTIONS:
-        raise ScenarioError(f"cannot be an axis: {_KEYS_WITH_OPTIONS[key]}", path=key)
-
-    parts = _split_outside_brackets(text, ":")
-    if len(parts) not in (1, 3):
-        example = _VALUES_EXAMPLE.removeprefix("as in ")
-        raise ScenarioError(
-            f"the values must have a form such as {example}, not {text!r}", path=key
-        )
-
-    texts: tuple[str, ...] | _Steps
-    if len(parts) == 1:
-        texts = _parse_list(key, text)
-    else:
-        first, last, step = (_parse_decimal(key, part) for part in parts)
-        texts = _build_range(key, first, last, step)
-    return _SweepAxis(f"{key}={text}", key, texts)
-
-
-def list_axes(over: str | Sequence[str] | Mapping[str, Any]) -> list[str]:
-    """Converts swept parameters, as a Python program may give them, to texts KEY=VALUES.
-
-    Args:
-        over: One text, a list of texts, or a mapping from keys to values. The values are a
-            list, an array, or the text after "KEY=".
-
-    Returns:
-        Texts for `parse_axis`.
-    """
-    if isinstance(over, Mapping):
-        return [f"{key}={_join_values(values)}" for key, values in over.items()]
-    return list(over) if isinstance(over, list | tuple) else [str(over)]
-
-
-def _join_values(values: Any) -> str:
-    """Returns the values of a swept parameter as the text after "KEY=" in a command.
-
-    Args:
-        values: Finished text, a list, an array or a single value. A string that is a word, such
-            as in_order, stays without quotation marks.
-    """
-    if isinstance(values, str):
-        return values
-    entries = values if isinstance(values, list | tuple) else np.atleast_1d(values)
-    texts = list[str]()
-    for entry in entries:
-        is_word = isinstance(entry, str) and entry.isidentifier()
-        texts.append(entry if is_word else format_toml_value(entry))
-    return ",".join(texts)
-
-
-def _build_range(key: str, first: Decimal, last: Decimal, step: Decimal) -> _Steps:
-    """Returns the values of a swept parameter that is written as "first:last:step".
-
-    Args:
-        key: Scenario key of the axis, for error messages.
-        first: First value.
-        last: Largest possible value, or the smallest value if the step is negative.
-        step: Difference between neighbouring values.
-
-    Raises:
-        ScenarioError: The step is 0 or has the wrong sign, or there are too many values.
-    """
-    if step == 0:
-        raise ScenarioError(f"a step of 0 does not lead from {first:f} to {last:f}", path=key)
-    has_wrong_sign = (last - first) * step < 0
-    if has_wrong_sign:
-        suggestion = f"{min(first, last):f}:{max(first, last):f}:{abs(step):f}"
-        problem = f"a step of {step:f} does not lead from {first:f} to {last:f}"
-        raise ScenarioError(f"is empty: {problem}; did you mean {suggestion}?", path=key)
-    count = int((last - first) / step + _ON_GRID) + 1
-    if count > _MAX_AXIS_VALUES:
-        raise ScenarioError(f"has {Decimal(count):.3g} values: take a larger step", path=key)
-    return _Steps(first, step, count)
-
-
-def _parse_decimal(key: str, text: str) -> Decimal:
-    """Returns a number of a range as an exact decimal number.
-
-    Args:
-        key: Scenario key of the axis, for error messages.
-        text: Text of the number.
-
-    Raises:
-        ScenarioError: The text is not a number, or the number is not finite or out of range.
-    """
-    text = text.strip()
-    try:
-        number = Decimal(text)
-    except InvalidOperation:
-        problem = (
-            f"a range a:b:step must consist of numbers, and {text!r} is not a number; "
-            "list words as in KEY=first,second"
-        )
-        raise ScenarioError(problem, path=key) from None
-
-    if not number.is_finite():
-        raise ScenarioError(f"a range must consist of finite numbers, not {text!r}", path=key)
-    size = abs(number)
-    if size > Decimal("1e18") or 0 < size < Decimal("1e-18"):
-        raise ScenarioError(
-            f"the magnitudes in a range must be from 1e-18 to 1e18, not {text}", path=key
-        )
-    return number
-
-
-def _parse_list(key: str, text: str) -> tuple[str, ...]:
-    """Splits the values of a swept parameter, written as "v1,v2,v3", into separate texts.
-
-    Args:
-        key: Scenario key of the axis, for error messages.
-        text: Text of the list.
-
-    Raises:
-        ScenarioError: A value is empty, is not finite, or appears twice.
-    """
-    texts = tuple(part.strip() for part in _split_outside_brackets(text, ","))
-    if "" in texts:
-        raise ScenarioError(f"is empty: list the values, {_VALUES_EXAMPLE}", path=key)
-    values = list[Any]()
-    for value_text in texts:
-        value = _parse_value(value_text)
-        if value in values:
-            raise ScenarioError(f"has {value_text} twice", path=key)
-        if isinstance(value, float) and not math.isfinite(value):
-            raise ScenarioError(f"must be finite numbers, not {value_text}", path=key)
-        values.append(value)
-    return texts
-
-
-def _split_outside_brackets(text: str, separator: str) -> list[str]:
-    """Splits a text at the separators that stand outside of brackets and quotation marks.
-
-    A value of a list may itself be a list or a text that contains the separator.
-    """
-    parts = [""]
-    open_brackets = 0
-    open_quote = ""  # the quotation mark that is open; empty outside of quotation marks
-    for letter in text:
-        if open_quote:
-            open_quote = "" if letter == open_quote else open_quote
-        elif letter in "\"'":
-            open_quote = letter
-        if not open_quote:
-            open_brackets += (letter in "[{") - (letter in "]}")
-
-        is_separator = letter == separator and not open_brackets and not open_quote
-        if is_separator:
-            parts.append("")
-        else:
-            parts[-1] += letter
-    return parts
-
-
-def _parse_value(text: str) -> Any:
-    """Returns the value that a text represents: 0.2 for "0.2", True for "true".
-
-    A text that is not valid TOML, such as gamma without quotes, is returned unchanged.
-    """
-    try:
-        return tomllib.loads(f"value = {text}")["value"]
-    except tomllib.TOMLDecodeError:
-        return text
-
+from .sweep_axis import SweepAxis
 
 MAX_SEEDS = 100_000
 """Largest number of seeds of a sweep."""
@@ -356,7 +89,7 @@ class SweepPlan(NamedTuple):
     written: ExperimentText
     overrides: tuple[str, ...]
     base: Scenario
-    axes: tuple[_SweepAxis, ...]
+    axes: tuple[SweepAxis, ...]
     laws: dict[str, tuple[str, ...]]
     seeds: tuple[int, ...]
     longest_s: float
@@ -387,6 +120,33 @@ class SweepPlan(NamedTuple):
     def cells(self) -> int:
         """Number of combinations of all swept parameter values and control laws."""
         return math.prod(self.shape)
+
+    @property
+    def refined_axes(self) -> list[int]:
+        """Indices of the axes along which a refined sweep halves its steps.
+
+        These are the first two axes whose values are numbers.
+        """
+        numeric = [
+            index
+            for index, axis in enumerate(self.axes)
+            if axis.numeric and len(axis.texts) > 1
+        ]
+        return numeric[:_REFINED_AXES]
+
+    def list_checked_indices(self, dimension: int) -> list[int]:
+        """Returns the indices of the values that are checked before a sweep runs.
+
+        At most `_CHECKED_VALUES` indices, including the first and the last one, are spread
+        evenly over the values. A grid may be too large to check every cell.
+
+        Args:
+            dimension: Dimension of the grid, see `shape`.
+        """
+        count = self.shape[dimension]
+        checked = min(count, _CHECKED_VALUES)
+        intervals = max(1, checked - 1)
+        return [index * (count - 1) // intervals for index in range(checked)]
 
     def cell(self, number: int) -> SweepCell:
         """Returns a combination of parameter values and control law by its number.
@@ -479,7 +239,7 @@ class SweepPlan(NamedTuple):
 
         written = ExperimentText(facts["source"], facts["text"], folder)
         texts = tuple(facts["overrides"])
-        axes = tuple(map(parse_axis, facts["over"]))
+        axes = tuple(map(SweepAxis.parse, facts["over"]))
         loaded = _load_base(written, texts, axes, facts["laws"])
         base = allow_own_code(loaded.scenario)
         laws = {law: _list_law_overrides(written, texts, loaded, law) for law in facts["laws"]}
@@ -529,6 +289,100 @@ class SweepPlan(NamedTuple):
             arguments += ["--longest", format_override_value(self.longest_s)]
         return format_command("sweep", self.written.label, *arguments, *more)
 
+    def list_totals(self) -> list[str]:
+        """Lists the measured quantities whose means over the seeds a sweep computes.
+
+        These are the totals of every run, such as the RMS error, and the metrics that the sweep
+        requested.
+        """
+        keys = (*sweep_cell.TOTAL_KEYS, *self.metrics)
+        return list(dict.fromkeys(keys))
+
+    def reproduction_duration_s(self, outcome: sweep_cell.CellResult) -> float:
+        """Returns the duration with which a run must be started to reproduce its row, in s.
+
+        A run that diverged, which means that an arm left its limits, ended before its planned
+        duration. It is started with the planned duration, and will end early again. Every
+        extension of an undecided run doubles the planned duration.
+
+        Args:
+            outcome: Result of the run.
+        """
+        if outcome.diverged_s is None:
+            return outcome.ran_s
+        extended_s = self.base.duration_s * 2.0**outcome.extended
+        planned_s = min(self.longest_s, extended_s)
+        return max(outcome.ran_s, planned_s)
+
+    def build_sim_command(
+        self, overrides: Sequence[str], seed: int, duration_s: float, log: str
+    ) -> str:
+        """Returns the shell command that repeats one simulation of a sweep and records a log.
+
+        Args:
+            overrides: Overrides KEY=VALUE that turn the swept scenario into the scenario of the
+                run.
+            seed: Seed of the run.
+            duration_s: Duration of the run, in s.
+            log: Name of the log.
+        """
+        kept_overrides = list[str]()
+        for override in (*self.overrides, *overrides):
+            key, _, _ = override.partition("=")
+            # Seed and duration have their own options in the command.
+            if key.strip() not in ("seed", "duration_s"):
+                kept_overrides.append(override)
+        source = self.written.label
+        set_arguments = set_options(kept_overrides)
+        run_arguments = ["--seed", str(seed), "--duration", f"{duration_s:.12g}"]
+        return format_command("sim", source, *set_arguments, *run_arguments, "-o", log)
+
+    def describe(self) -> list[str]:
+        """Returns lines that state the number of simulations and the values of a sweep."""
+        axis_sizes = [str(len(axis.texts)) for axis in self.axes]
+        sizes = " x ".join(axis_sizes) or "1"
+        laws = f" x laws {', '.join(self.laws)}" if self.laws else ""
+        seed_count = len(self.seeds)
+        if seed_count == 1:
+            seeds = f"seed {self.seeds[0]}"
+        else:
+            seeds = f"{count_nouns(seed_count, 'seed')} each where anything is random"
+        cells = count_nouns(self.cells, "cell")
+        lines = [f"{self.base.name}: {cells} ({sizes}{laws}), {seeds}"]
+
+        for axis in self.axes:
+            texts = axis.texts
+            count = len(texts)
+            if count > 4:
+                values = [texts[0], texts[1], "...", texts[-1]]
+            else:
+                values = [texts[n] for n in range(count)]
+            lines.append(f"  over {axis.description}: {', '.join(values)}")
+
+        first_s = self.base.duration_s
+        longest_s = self.longest_s
+        extended = f", undecided runs up to {longest_s:g} s" if longest_s > first_s else ""
+        if self.refine:
+            steps = count_nouns(1 << self.refine, "cell")
+            times = count_nouns(self.refine, "time")
+            lines.append(f"  steps of {steps}, halved {times} along the stability edge")
+        if self.judge == "linear":
+            return [*lines, "  judged by the roots of the linear loop, without runs"]
+        twins = ", judged by twins" if self.judge == "twins" else ""
+        return [*lines, f"  {first_s:g} s each{extended}{twins}"]
+
+    def list_axis_columns(self) -> dict[str, type]:
+        """Returns the columns of a CSV table that identify a combination of swept parameters.
+
+        The columns are the number of the combination, the value of each axis, and the control
+        law. Each column has the type with which the table is read again.
+        """
+        column_types: dict[str, type] = {"cell": int}
+        for axis in self.axes:
+            column_types[axis.key] = float if axis.numeric else str
+        column_types["law"] = str
+        return column_types
+
 
 def plan_sweep(
     source: str | Path | Mapping[str, Any] | Scenario,
@@ -559,7 +413,7 @@ def plan_sweep(
     """
     written = ExperimentText.read(source)
     texts = tuple(overrides)
-    axes = tuple(map(parse_axis, list_axes(over)))
+    axes = tuple(map(SweepAxis.parse, SweepAxis.list_descriptions(over)))
     law_list = [laws] if isinstance(laws, str | type) else laws
     law_names = list(map(name_law_classes, law_list))
     for law in law_names:
@@ -618,18 +472,6 @@ _REFINED_AXES = 2
 """Largest number of axes that are refined: a map has two axes."""
 
 
-def list_refined_axes(axes: Sequence[_SweepAxis]) -> list[int]:
-    """Returns the indices of the axes that are refined where the results of neighbours differ.
-
-    These are the first two axes whose values are numbers.
-
-    Args:
-        axes: All axes of the sweep.
-    """
-    numeric = [n for n, axis in enumerate(axes) if axis.numeric and len(axis.texts) > 1]
-    return numeric[:_REFINED_AXES]
-
-
 def _check_refinement(plan: SweepPlan) -> None:
     """Checks that a sweep can be refined as often as its plan states.
 
@@ -639,7 +481,7 @@ def _check_refinement(plan: SweepPlan) -> None:
     """
     if not 0 <= plan.refine <= MOST_HALVINGS:
         raise UsageError(f"--refine must be from 0 to {MOST_HALVINGS}, not {plan.refine}")
-    if plan.refine and not list_refined_axes(plan.axes):
+    if plan.refine and not plan.refined_axes:
         raise UsageError(
             "--refine needs an axis with several numbers, as in --over KEY=a:b:step"
         )
@@ -710,7 +552,7 @@ class _Base(NamedTuple):
 def _load_base(
     written: ExperimentText,
     overrides: Sequence[str],
-    axes: Sequence[_SweepAxis],
+    axes: Sequence[SweepAxis],
     laws: Sequence[str],
 ) -> _Base:
     """Loads the scenario of a sweep before its axes and laws are applied.
@@ -812,7 +654,7 @@ def _check_axes(plan: SweepPlan, law_index: int) -> None:
     last_cell = [law_index, *(len(axis.texts) - 1 for axis in plan.axes)]
     for dimension, axis in enumerate(plan.axes, 1):
         value_of_digest: dict[str, str] = {}
-        for index in spread_indices(len(axis.texts)):
+        for index in plan.list_checked_indices(dimension):
             indices = first_cell.copy()
             indices[dimension] = index
             try:
@@ -855,20 +697,6 @@ def _is_valid(plan: SweepPlan, indices: Sequence[int]) -> bool:
     return True
 
 
-def spread_indices(count: int) -> list[int]:
-    """Returns the indices of the values of an axis that are checked before a sweep runs.
-
-    At most `_CHECKED_VALUES` indices, including the first and the last one, are spread evenly
-    over `count` values. A grid may be too large to check every cell.
-
-    Args:
-        count: Number of values.
-    """
-    checked = min(count, _CHECKED_VALUES)
-    intervals = max(1, checked - 1)
-    return [index * (count - 1) // intervals for index in range(checked)]
-
-
 def _load_cell(plan: SweepPlan, indices: Sequence[int]) -> Scenario:
     """Loads the scenario of one combination of swept parameters.
 
@@ -893,125 +721,3 @@ def _load_cell(plan: SweepPlan, indices: Sequence[int]) -> Scenario:
         problem = f"with law {cell.law}: {error.problem}" if cell.law else error.problem
         raise ScenarioError(problem, path=error.path, source=plan.written.label) from None
     return scenario
-
-
-_GAINS = {
-    "K": "N m/rad",
-    "d": "N m s/rad",
-    "Kp": "N m s/rad",
-    "Kd": "N m s/rad",
-    "Lambda": "1/s",
-}
-"""Units of the gains, whose keys do not end in a unit."""
-
-
-def label_axis(key: str, scenario: Scenario | None = None) -> str:
-    """Returns the label of an axis in a figure, such as "delay (ms)" for link.delay_ms.
-
-    If links draw their delays at random, the delay is called stated, because the age of the
-    samples in use is smaller: a newer sample may overtake an older one.
-
-    Args:
-        key: Scenario key of the axis.
-        scenario: Scenario in which the names of operators and walls are looked up.
-    """
-    quantity, unit = _describe_key(key, scenario)
-    if scenario is not None and key.startswith("link") and key.endswith("delay_ms"):
-        _, *names, _ = key.split(".")
-        links = [scenario.links[name] for name in names or scenario.links]
-        if any(link.random and link.moments().deviation_ms > 0.0 for link in links):
-            quantity = f"stated {quantity}"
-    return f"{quantity} ({unit})" if unit else quantity
-
-
-def label_setting(key: str, value: Any, scenario: Scenario | None = None) -> str:
-    """Returns a setting as a label with unit, such as "delay 200 ms" for link.delay_ms = 200.
-
-    Args:
-        key: Scenario key.
-        value: Value of the key.
-        scenario: Scenario in which the names of operators and walls are looked up.
-    """
-    quantity, unit = _describe_key(key, scenario)
-    if isinstance(value, bool):
-        text = str(value).lower()
-    elif is_number(value):
-        text = f"{value:g}"
-    else:
-        text = str(value).replace("_", " ")
-    return " ".join(part for part in (quantity, text, unit) if part)
-
-
-def _describe_key(key: str, scenario: Scenario | None = None) -> tuple[str, str]:
-    """Splits the name of a setting, such as delay_ms, into a name and a unit for labels.
-
-    Args:
-        key: Scenario key, such as "sites.s.control.K" or "link.delay_ms".
-        scenario: Scenario in which the names of operators and walls are looked up.
-
-    Returns:
-        The name in words, such as "K of s", and the unit, which is empty if the setting has no
-        unit.
-    """
-    *tables, name = key.split(".")
-    subscript = ""
-    if name.isdigit() and tables:  # an element of a list over joints or parameters
-        subscript = f"[{name}]"
-        name = tables.pop()
-    quantity, unit = split_unit(name)
-    is_symbol = not unit and len(name) <= 3
-    if is_symbol:
-        quantity = name  # symbols such as Kp keep their capital letters
-    owner = _describe_owner(tables, scenario)
-    return f"{quantity}{subscript}{owner}", _GAINS.get(name) or unit.replace("^2", "²")
-
-
-def _describe_owner(tables: list[str], scenario: Scenario | None) -> str:
-    """Returns the phrase of a label that names the site, link or actor of a setting.
-
-    Args:
-        tables: Names of the tables that contain the key, from the outermost table.
-        scenario: Scenario in which the kind of an operator or a wall is looked up.
-
-    Returns:
-        A string such as " of s". Empty if the key applies to all sites or links.
-    """
-    match tables:
-        case ["sites", site, ("hands" | "environment") as group, number]:
-            kind = "hand" if group == "hands" else "environment"
-            if scenario is not None and site in scenario.sites and number.isdigit():
-                actors = getattr(scenario.sites[site], group)
-                if int(number) < len(actors):
-                    tag = actors[int(number)].__struct_config__.tag
-                    kind = str(tag).replace("_", " ")
-            return f", {kind} of {site}"
-        case ["sites", site, *_]:
-            return f" of {site}"
-        case ["links", link, *_]:
-            return f" {link}"
-        case ["dominance", site]:
-            return f"'s share in {site}"
-        case _:
-            return ""
-
-
-def format_override(key: str, value: Any) -> str:
-    """Returns the text KEY=VALUE that changes one setting of a scenario.
-
-    Args:
-        key: Scenario key.
-        value: A number, which parses back to exactly this number, or a text.
-    """
-    text = format_override_value(value) if is_number(value) else value
-    return f"{key}={text}"
-
-
-def format_override_value(value: float) -> str:
-    """Returns the text of a number that parses back to exactly this number.
-
-    Whole numbers have no decimal point.
-
-    Args:
-        value: The number.
-    """
-    return repr(value).removesuffix(".0")

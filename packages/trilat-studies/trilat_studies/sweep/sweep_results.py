@@ -1,8 +1,9 @@
 """Stores and summarises the results of a sweep over a grid of parameters.
 
 A sweep runs a scenario at every point of the grid. One point of the grid, called a cell, is run
-once per random seed. This module turns the finished runs into a CSV table with one row per run.
-It also combines the runs of a cell, prints a summary, and finds the command that repeats a run.
+once per random seed. This module reads the table of a finished sweep, which has one row per
+run. It combines the runs of a cell, composes a summary, and finds the command that repeats a
+run.
 
 Invariant:
     - The bytes of the result files depend only on the runs, and not on the time or the number
@@ -17,7 +18,7 @@ Invariant:
 import json
 import math
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import groupby
 from pathlib import Path
@@ -32,22 +33,12 @@ from trilat_net.results import Result
 from trilat_net.scenario import ExperimentText
 from trilat_net.work import MeanInterval, wilson_interval
 
-from ..run_commands import format_command, set_options
-from .result_table import (
-    ResultRow,
-    StoredRows,
-    format_table_cell,
-    iterate_csv,
-    list_axis_columns,
-    read_rows,
-)
+from ..run_commands import format_command
+from .result_table import ResultRow, ResultTable, StoredRows, encode_table
 from .sweep_cell import (
     RUN_CLASSES,
-    TOTAL_KEYS,
     CellClass,
     CellResult,
-    CellRun,
-    apply_diff,
 )
 from .sweep_plan import SweepPlan
 
@@ -78,8 +69,8 @@ class SweepResults(Result):
 
         The first lines describe the sweep, the following lines summarise its results.
         """
-        yield from describe_sweep_plan(self.plan)
-        yield from summarize_sweep(self)
+        yield from self.plan.describe()
+        yield from self.summarize()
 
     def to_rows(self) -> Sequence[ResultRow]:
         """Returns the table of all runs, one row per run, ordered by cell and then by seed.
@@ -124,12 +115,12 @@ class SweepResults(Result):
         """
         return msgspec.convert(row, CellResult)
 
-    def iterate_grid_points(self) -> "Iterator[GridPoint]":
+    def iterate_grid_points(self) -> "Iterator[_GridPoint]":
         """Yields the summary of each combination of swept parameters.
 
         `list_grid_points` returns the same summaries as a list.
         """
-        totals = list_totals(self.plan)
+        totals = self.plan.list_totals()
         groups = groupby(self.rows, key=lambda row: (row["cell"], row["law"]))
         for (cell, law), group in groups:
             rows = list(group)
@@ -142,7 +133,7 @@ class SweepResults(Result):
                 values = [row.get(key) for row in rows_within_limits]
                 means.append(MeanInterval.of_values(values))
             class_counts = [counts[verdict.value] for verdict in RUN_CLASSES]
-            yield GridPoint(
+            yield _GridPoint(
                 cell=cell,
                 law=law,
                 values=self.plan.cell(cell).values,
@@ -150,7 +141,7 @@ class SweepResults(Result):
                 means=tuple(means),
             )
 
-    def list_grid_points(self) -> "list[GridPoint]":
+    def list_grid_points(self) -> "list[_GridPoint]":
         """Summarises the simulations of a sweep that differ only in their random seeds.
 
         Returns:
@@ -192,11 +183,89 @@ class SweepResults(Result):
         name = f"cell-{row['cell']}-seed-{row['seed']}"
         file = folder / f"{name}.toml"
         write_whole(file, row["scenario"])
-        duration_s = reproduction_duration_s(plan, self.outcome(row))
+        duration_s = plan.reproduction_duration_s(self.outcome(row))
         options = ["--duration", f"{duration_s:.12g}", "-o", f"{name}.mcap"]
         command = format_command("sim", str(file), *options)
         note = f"{source} has changed since the sweep, or is missing; as it ran: {file}"
         return command, note
+
+    def encode_grid_points(self) -> Iterator[str]:
+        """Encodes the grid points as a CSV table, with one line per point.
+
+        A line contains the number of the cell, its axis values and law, the number of runs of
+        each class, the fraction of stable runs with its 95 % interval, and the means of the
+        measured quantities with their intervals.
+
+        Yields:
+            The header, and the text of each line.
+        """
+        plan = self.plan
+        column_types = plan.list_axis_columns()
+        column_types["runs"] = int
+        column_types |= {verdict.value: int for verdict in RUN_CLASSES}
+        share_columns = ("stable_share", "stable_share_low", "stable_share_high")
+        column_types |= dict.fromkeys(share_columns, float)
+        for key in plan.list_totals():
+            column_types |= {f"{key}_{field}": float for field in MeanInterval._fields}
+
+        def list_values(point: _GridPoint) -> dict[str, Any]:
+            """Returns the values of one line of the CSV table, by column, of a grid point."""
+            decided = point.decided
+            stable_share = point.stable / decided if decided else None
+            # The values must be in the order of the columns above.
+            values: list[Any] = [point.cell, *point.values, point.law]
+            values += [sum(point.counts), *point.counts]
+            values += [stable_share, *point.interval]
+            for mean in point.means:
+                values += mean or (None, None)
+            return dict(zip(column_types, values, strict=True))
+
+        yield from encode_table(map(list_values, self.iterate_grid_points()), column_types)
+
+    def summarize(self) -> Iterator[str]:
+        """Yields the lines of the summary that is printed after a sweep.
+
+        The lines state how many runs each class has, how many runs were extended, the ranges of
+        the measured quantities, the growth exponents, and the differences between seeds. Lines
+        about quantities that the sweep does not have are left out.
+        """
+        plan = self.plan
+        tally = _tally_rows(self)
+        verdict_texts = []
+        for verdict in CellClass:
+            count = tally.counts[verdict.value]
+            if count or verdict is not CellClass.REFUSED:
+                verdict_texts.append(f"{count} {verdict.value}")
+        runs = count_nouns(len(self.rows), "run")
+        cells = count_nouns(plan.cells, "cell")
+        yield f"{runs} of {cells}: {', '.join(verdict_texts)}"
+        yield from tally.refusals
+
+        if tally.extended:
+            first_s = plan.base.duration_s
+            yield (
+                f"{tally.extended} were undecided after {first_s:g} s and continued, "
+                f"the longest to {tally.longest_s:g} s"
+            )
+
+        ranges = []
+        for key, (name, unit) in _list_quantities(plan).items():
+            value_range = tally.ranges[key]
+            if value_range.count:
+                text = f"{name} {value_range.low:.3g} to {value_range.high:.3g} {unit}"
+                ranges.append(text.rstrip())
+        if ranges:
+            yield f"within their limits {tally.within_limits}: {', '.join(ranges)}"
+
+        rates = tally.exponents
+        if rates.count:
+            interval = f"{rates.low:+.3g} to {rates.high:+.3g} /s"
+            is_linear = plan.judge == "linear"
+            name = "growth rates of the linear loop" if is_linear else GROWTH_EXPONENTS
+            yield f"{name} {interval}: {rates.positive} of {rates.count} grow"
+
+        if len(plan.seeds) > 1:
+            yield from _summarize_seeds(self, tally.not_random)
 
 
 def read_results(path: Path) -> SweepResults:
@@ -224,125 +293,14 @@ def read_results(path: Path) -> SweepResults:
     except (OSError, ValueError, KeyError, TypeError):
         raise UsageError(f"{plan_file} cannot be read as the plan of a sweep") from None
 
-    return SweepResults(plan, read_rows(file, plan))
-
-
-def iterate_cells(
-    plan: SweepPlan, done: Mapping[tuple[int, int], CellRun]
-) -> Iterator[list[CellRun]]:
-    """Yields the finished runs of each cell, ordered by cell and then by seed.
-
-    Worker processes finish in any order, on which the results must not depend.
-
-    Args:
-        plan: The sweep: its scenario, axes, control laws and seeds.
-        done: The finished runs, by cell and seed.
-    """
-    cells: Iterable[int] = (cell for cell, _ in done)
-    if len(plan.seeds) > 1:
-        cells = set(cells)  # a cell has an entry for each seed
-    for cell in sorted(cells):
-        yield [done[cell, seed] for seed in plan.seeds if (cell, seed) in done]
-
-
-def build_cell_rows(plan: SweepPlan, runs: Sequence[CellRun]) -> Iterator[ResultRow]:
-    """Yields the results of one combination of swept parameters, one row per simulation.
-
-    Args:
-        plan: The sweep: its scenario, axes, control laws and seeds.
-        runs: All finished runs of the cell.
-    """
-    for entry in runs:
-        # The log of a cell with a single run needs no seed in its name.
-        suffix = f"-seed-{entry.seed}" if len(runs) > 1 else ""
-        yield _build_row(plan, entry, f"cell-{entry.cell}{suffix}.mcap")
-
-
-def _build_row(plan: SweepPlan, entry: CellRun, log: str) -> ResultRow:
-    """Returns the table row of a finished simulation, with the command that repeats it.
-
-    The row has the parameter values (cell) and the results.
-
-    Args:
-        plan: The sweep: its scenario, axes, control laws and seeds.
-        entry: The run.
-        log: Name of the log that the command in the row records.
-    """
-    cell = plan.cell(entry.cell)
-    command = build_sim_command(
-        plan=plan,
-        overrides=cell.overrides,
-        seed=entry.seed,
-        duration_s=reproduction_duration_s(plan, entry.outcome),
-        log=log,
-    )
-
-    axis_keys = [axis.key for axis in plan.axes]
-    axis_values = dict(zip(axis_keys, cell.values, strict=True))
-
-    scenario_text = apply_diff(entry.scenario, plan.base.text)
-    return {
-        "cell": cell.number,
-        **axis_values,
-        "law": entry.law,
-        "seed": entry.seed,
-        "random": entry.random,
-        **entry.metrics,
-        **msgspec.to_builtins(entry.outcome),
-        "scenario_sha256": entry.sha256,
-        "command": command,
-        "scenario": scenario_text,
-    }
-
-
-def build_sim_command(
-    plan: SweepPlan, overrides: Sequence[str], seed: int, duration_s: float, log: str
-) -> str:
-    """Returns the shell command that repeats one simulation of a sweep and records a log.
-
-    Args:
-        plan: The sweep: its scenario, axes, control laws and seeds.
-        overrides: Overrides KEY=VALUE that turn the swept scenario into the scenario of the
-            run.
-        seed: Seed of the run.
-        duration_s: Duration of the run, in s.
-        log: Name of the log.
-    """
-    kept_overrides = list[str]()
-    for override in (*plan.overrides, *overrides):
-        key, _, _ = override.partition("=")
-        # Seed and duration have their own options in the command.
-        if key.strip() not in ("seed", "duration_s"):
-            kept_overrides.append(override)
-    source = plan.written.label
-    set_arguments = set_options(kept_overrides)
-    run_arguments = ["--seed", str(seed), "--duration", f"{duration_s:.12g}"]
-    return format_command("sim", source, *set_arguments, *run_arguments, "-o", log)
-
-
-def reproduction_duration_s(plan: SweepPlan, outcome: CellResult) -> float:
-    """Returns the duration with which a run must be started to reproduce its row, in s.
-
-    A run that diverged, which means that an arm left its limits, ended before its planned
-    duration. It is started with the planned duration, and will end early again. Every extension
-    of an undecided run doubles the planned duration.
-
-    Args:
-        plan: The sweep: its scenario, axes, control laws and seeds.
-        outcome: Result of the run.
-    """
-    if outcome.diverged_s is None:
-        return outcome.ran_s
-    extended_s = plan.base.duration_s * 2.0**outcome.extended
-    planned_s = min(plan.longest_s, extended_s)
-    return max(outcome.ran_s, planned_s)
+    return SweepResults(plan, ResultTable(plan).read_rows(file))
 
 
 GRID_POINTS_FILE = "places.csv"
 """Name of the table of grid points in the folder of a sweep."""
 
 
-class GridPoint(NamedTuple):
+class _GridPoint(NamedTuple):
     """Summary of all runs with the same parameter values, which differ only in their seeds.
 
     Attributes:
@@ -351,8 +309,9 @@ class GridPoint(NamedTuple):
         values: Value of the cell on each axis.
         counts: Number of runs of each class, such as converged or diverged, in the order of
             `RUN_CLASSES`.
-        means: Mean, with its 95 % interval, of each quantity of `list_totals`, over the runs
-            that stayed within the limits of their arms. `None` for fewer than two such runs.
+        means: Mean, with its 95 % interval, of each quantity of `SweepPlan.list_totals`, over
+            the runs that stayed within the limits of their arms. `None` for fewer than two such
+            runs.
     """
 
     cell: int
@@ -395,59 +354,6 @@ class GridPoint(NamedTuple):
         return wilson_interval(self.stable, self.decided)
 
 
-def list_totals(plan: SweepPlan) -> list[str]:
-    """Lists the measured quantities whose means over the seeds a sweep computes.
-
-    These are the totals of every run, such as the RMS error, and the metrics that the sweep
-    requested.
-
-    Args:
-        plan: The sweep: its scenario, axes, control laws and seeds.
-    """
-    keys = (*TOTAL_KEYS, *plan.metrics)
-    return list(dict.fromkeys(keys))
-
-
-def encode_grid_points(plan: SweepPlan, points: Iterable[GridPoint]) -> Iterator[str]:
-    """Encodes grid points as a CSV table, with one line per point.
-
-    A line contains the number of the cell, its axis values and law, the number of runs of each
-    class, the fraction of stable runs with its 95 % interval, and the means of the measured
-    quantities with their intervals.
-
-    Args:
-        plan: The sweep: its scenario, axes, control laws and seeds.
-        points: The grid points, in the order of the lines.
-
-    Yields:
-        The header, and the text of each line.
-    """
-    column_types = list_axis_columns(plan)
-    column_types["runs"] = int
-    column_types |= {verdict.value: int for verdict in RUN_CLASSES}
-    share_columns = ("stable_share", "stable_share_low", "stable_share_high")
-    column_types |= dict.fromkeys(share_columns, float)
-    for key in list_totals(plan):
-        column_types |= {f"{key}_{field}": float for field in MeanInterval._fields}
-
-    def format_point(point: GridPoint) -> dict[str, str]:
-        """Returns the texts of one line of the CSV table, by column, for one grid point."""
-        decided = point.decided
-        stable_share = point.stable / decided if decided else None
-        # The values must be in the order of the columns above.
-        values: list[Any] = [point.cell, *point.values, point.law]
-        values += [sum(point.counts), *point.counts]
-        values += [stable_share, *point.interval]
-        for mean in point.means:
-            values += mean or (None, None)
-        line = {}
-        for (name, kind), value in zip(column_types.items(), values, strict=True):
-            line[name] = format_table_cell(value, kind)
-        return line
-
-    yield from iterate_csv(map(format_point, points), list(column_types))
-
-
 _TOTALS = {
     "rms_error_rad": ("RMS e", "rad"),
     "effort_nm": ("effort", "N m"),
@@ -460,94 +366,6 @@ _TOTALS = {
 _MAX_CELLS_SHOWN = 8
 """Largest number of doubtful or rejected cells in the summary. The CSV files have all of them.
 """
-
-
-def describe_sweep_plan(plan: SweepPlan) -> list[str]:
-    """Returns lines that tell the user the number of simulations and the values of a sweep.
-
-    Args:
-        plan: The sweep: its scenario, axes, control laws and seeds.
-    """
-    axis_sizes = [str(len(axis.texts)) for axis in plan.axes]
-    sizes = " x ".join(axis_sizes) or "1"
-    laws = f" x laws {', '.join(plan.laws)}" if plan.laws else ""
-    seed_count = len(plan.seeds)
-    if seed_count == 1:
-        seeds = f"seed {plan.seeds[0]}"
-    else:
-        seeds = f"{count_nouns(seed_count, 'seed')} each where anything is random"
-    cells = count_nouns(plan.cells, "cell")
-    lines = [f"{plan.base.name}: {cells} ({sizes}{laws}), {seeds}"]
-
-    for axis in plan.axes:
-        texts = axis.texts
-        count = len(texts)
-        if count > 4:
-            values = [texts[0], texts[1], "...", texts[-1]]
-        else:
-            values = [texts[n] for n in range(count)]
-        lines.append(f"  over {axis.description}: {', '.join(values)}")
-
-    first_s = plan.base.duration_s
-    longest_s = plan.longest_s
-    extended = f", undecided runs up to {longest_s:g} s" if longest_s > first_s else ""
-    if plan.refine:
-        steps = count_nouns(1 << plan.refine, "cell")
-        times = count_nouns(plan.refine, "time")
-        lines.append(f"  steps of {steps}, halved {times} along the stability edge")
-    if plan.judge == "linear":
-        return [*lines, "  judged by the roots of the linear loop, without runs"]
-    twins = ", judged by twins" if plan.judge == "twins" else ""
-    return [*lines, f"  {first_s:g} s each{extended}{twins}"]
-
-
-def summarize_sweep(results: SweepResults) -> Iterator[str]:
-    """Yields the lines of the summary that is printed after a sweep.
-
-    The lines state how many runs each class has, how many runs were extended, the ranges of the
-    measured quantities, the growth exponents, and the differences between seeds. Lines about
-    quantities that the sweep does not have are left out.
-
-    Args:
-        results: Results of the sweep: its plan and one row per run.
-    """
-    plan = results.plan
-    tally = _tally_rows(results)
-    verdict_texts = []
-    for verdict in CellClass:
-        count = tally.counts[verdict.value]
-        if count or verdict is not CellClass.REFUSED:
-            verdict_texts.append(f"{count} {verdict.value}")
-    runs = count_nouns(len(results.rows), "run")
-    cells = count_nouns(plan.cells, "cell")
-    yield f"{runs} of {cells}: {', '.join(verdict_texts)}"
-    yield from tally.refusals
-
-    if tally.extended:
-        first_s = plan.base.duration_s
-        yield (
-            f"{tally.extended} were undecided after {first_s:g} s and continued, the longest "
-            f"to {tally.longest_s:g} s"
-        )
-
-    ranges = []
-    for key, (name, unit) in _list_quantities(plan).items():
-        value_range = tally.ranges[key]
-        if value_range.count:
-            text = f"{name} {value_range.low:.3g} to {value_range.high:.3g} {unit}"
-            ranges.append(text.rstrip())
-    if ranges:
-        yield f"within their limits {tally.within_limits}: {', '.join(ranges)}"
-
-    rates = tally.exponents
-    if rates.count:
-        interval = f"{rates.low:+.3g} to {rates.high:+.3g} /s"
-        is_linear = plan.judge == "linear"
-        name = "growth rates of the linear loop" if is_linear else GROWTH_EXPONENTS
-        yield f"{name} {interval}: {rates.positive} of {rates.count} grow"
-
-    if len(plan.seeds) > 1:
-        yield from _summarize_seeds(results, tally.not_random)
 
 
 GROWTH_EXPONENTS = "growth exponents of small pushes"
@@ -687,16 +505,3 @@ def _summarize_seeds(results: SweepResults, not_random: int) -> Iterator[str]:
     if doubtful_count > _MAX_CELLS_SHOWN:
         hidden = doubtful_count - _MAX_CELLS_SHOWN
         yield f"  and {hidden} more, all in {GRID_POINTS_FILE}"
-
-
-def list_next_commands(folder: Path) -> list[str]:
-    """Suggests shell commands that a user may want after a parameter sweep.
-
-    Args:
-        folder: Folder of the sweep, which the commands name.
-    """
-    command = format_command("sweep", str(folder))
-    return [
-        f"{command} --cell 0      # the command that makes a log of a cell",
-        f"{command} --map         # its map, with the lines of theory",
-    ]

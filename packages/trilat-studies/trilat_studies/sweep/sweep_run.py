@@ -25,7 +25,7 @@ from typing import Any, NamedTuple
 
 import msgspec
 
-from trilat_net.analysis import LogMetrics
+from trilat_net.analysis import SETTLED_ERROR_RAD, LogMetrics, RunEnd, TwinGrowth
 from trilat_net.errors import (
     CodeFailed,
     CodeWithheld,
@@ -55,20 +55,12 @@ from trilat_net.workers import count_cores
 from ..measure_run import describe_program
 from ..side_by_side import LANE_SITE_TICKS
 from . import sweep_cell
-from .cell_groups import find_cell_groups
-from .edge_refinement import NOT_KNOWN, EdgeRefinement, choose_side
-from .result_table import ResultRow, ResultTable, read_rows
+from .cell_groups import CellGroups
+from .edge_refinement import NOT_KNOWN, EdgeRefinement
+from .result_table import ResultRow, ResultTable
 from .sweep_cell import CellClass, CellResult, CellRun
 from .sweep_plan import JUDGES, SweepCell, SweepPlan
-from .sweep_results import (
-    GRID_POINTS_FILE,
-    PLAN_FILE,
-    RESULTS_FILE,
-    SweepResults,
-    build_cell_rows,
-    encode_grid_points,
-    iterate_cells,
-)
+from .sweep_results import GRID_POINTS_FILE, PLAN_FILE, RESULTS_FILE, SweepResults
 
 JOURNAL_FILE = "cells.journal"
 """Name of the journal in the folder of a sweep."""
@@ -397,7 +389,7 @@ class CellItem(NamedTuple):
         try:
             scenario = _build_scenario(self)
             if self.plan.judge == "linear":
-                outcome = sweep_cell.judge_linearly(scenario)
+                outcome = CellResult.judge_linearly(scenario)
             else:
                 outcome = sweep_cell.classify_cell(scenario.text, self.plan.longest_s)
         except CodeWithheld:
@@ -474,6 +466,36 @@ def _build_scenario(task: CellItem) -> Scenario:
     return scenario
 
 
+TWINS_OF_A_CELL = 4
+"""Number of twins of a run, which are repetitions with a small push.
+
+The pushes act on all joints at once, on single joints and, under the adaptive law, on the
+estimates.
+"""
+
+
+def _measure_exponent(scenario: Scenario) -> float | None:
+    """Measures the growth exponent of a run, the rate at which small disturbances grow.
+
+    A twin is a second execution of the run with a small push. The difference between the twin
+    and the run changes as exp(exponent t), where t is the time, see `analysis.twin_growth`.
+    Several twins are run. The result is the largest of their rates over the later part of the
+    run, the part over which runs are judged.
+
+    Args:
+        scenario: Scenario of the run.
+
+    Returns:
+        The exponent in 1/s, negative if disturbances decay. `None` if no push had an effect.
+    """
+    run = FusedRun(scenario, SETTLED_ERROR_RAD)
+    run.advance_to(scenario.duration_s)
+    end = RunEnd.of_run(run, scenario)
+    twins = TwinGrowth.of_scenario(scenario, end, run.ran_s, TWINS_OF_A_CELL)
+    rates_per_s = [push.rate_per_s for push in twins.pushes]
+    return max(filter(math.isfinite, rates_per_s), default=None)
+
+
 def _complete_run(task: CellItem, scenario: Scenario, outcome: CellResult) -> CellRun:
     """Measures the further metrics of a simulation, and returns all of its results.
 
@@ -484,7 +506,7 @@ def _complete_run(task: CellItem, scenario: Scenario, outcome: CellResult) -> Ce
     """
     plan = task.plan
     if plan.judge == "twins":
-        exponent_per_s = sweep_cell.measure_exponent(scenario)
+        exponent_per_s = _measure_exponent(scenario)
         outcome = msgspec.structs.replace(outcome, exponent_per_s=exponent_per_s)
 
     # Metrics that are not fields of the result require a second run, which records a log.
@@ -595,10 +617,9 @@ def run_sweep(
         wall_s = (clock.monotonic_ns() - started_ns) * 1e-9
         alone = _write_table(folder, journal.done)
 
-    results = SweepResults(plan, read_rows(folder.path / RESULTS_FILE, plan))
+    results = SweepResults(plan, ResultTable(plan).read_rows(folder.path / RESULTS_FILE))
     if len(plan.seeds) > 1:
-        points = encode_grid_points(plan, results.iterate_grid_points())
-        _write_lines(folder, GRID_POINTS_FILE, points)
+        _write_lines(folder, GRID_POINTS_FILE, results.encode_grid_points())
     return FinishedSweep(
         results=results,
         folder=folder,
@@ -638,7 +659,7 @@ def _write_table(folder: SweepFolder, done: Mapping[tuple[int, int], CellRun]) -
     Returns:
         The reasons why runs were computed alone, with the number of these runs.
     """
-    plan = folder.plan
+    table = ResultTable(folder.plan)
     reasons: Counter[str] = Counter()
 
     def iterate_rows() -> Iterator[ResultRow]:
@@ -647,11 +668,11 @@ def _write_table(folder: SweepFolder, done: Mapping[tuple[int, int], CellRun]) -
         The function also counts the reasons why some simulations could not run side by side
         with others.
         """
-        for runs in iterate_cells(plan, done):
+        for runs in table.iterate_cells(done):
             reasons.update(run.alone for run in runs if run.alone)
-            yield from build_cell_rows(plan, runs)
+            yield from table.build_rows(runs)
 
-    _write_lines(folder, RESULTS_FILE, ResultTable(plan).encode(iterate_rows()))
+    _write_lines(folder, RESULTS_FILE, table.encode(iterate_rows()))
     return reasons
 
 
@@ -709,7 +730,7 @@ class _SweepWork:
             is_side_by_side = self._choose_lanes(plan.cells)
             cells: Iterable[int] = range(plan.cells)
             if is_side_by_side:
-                groups = find_cell_groups(plan)
+                groups = CellGroups.of_plan(plan)
                 cells = groups.iterate_cells(plan.shape) if groups.keys else cells
             self._execute_cells(cells, plan.cells, 0, is_side_by_side=is_side_by_side)
             return
@@ -831,4 +852,4 @@ def _find_side(plan: SweepPlan, runs: Sequence[CellRun]) -> int:
         exponents_per_s = [outcome.exponent_per_s for outcome in outcomes]
         stable = [None if rate is None else rate <= 0.0 for rate in exponents_per_s]
     decided = [is_stable for is_stable in stable if is_stable is not None]
-    return choose_side(stable=sum(decided), decided=len(decided))
+    return EdgeRefinement.choose_side(stable=sum(decided), decided=len(decided))

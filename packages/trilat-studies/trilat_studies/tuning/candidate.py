@@ -65,7 +65,7 @@ from trilat_net.scenario import (
 )
 from trilat_net.work import MeanInterval
 
-from ..measure_run import RecordBatch, WholeRun, refuse_live_only
+from ..measure_run import RecordBatch, WholeRun
 from ..run_commands import format_command, format_toml_value, set_options
 from .search_space import GainValues, ModelInformation, SearchSpace, SiteControls
 
@@ -87,7 +87,7 @@ def check_comparable(scenario: Scenario) -> None:
     Raises:
         ScenarioError: The scenario is rejected. The message states the reason and a remedy.
     """
-    refuse_live_only(scenario)
+    scenario.refuse_live_only()
     if any(spec.task.shared for spec in scenario.sites.values()):
         raise ScenarioError(
             "laws are compared by the distance between joint angles, but in this scenario the "

@@ -284,6 +284,34 @@ class SearchSpace(NamedTuple):
         facts = _GRAVITY_ONLY if takes_gravity else "what it reads from its argument now"
         return cls(code, knobs, facts)
 
+    @classmethod
+    def select(cls, laws: Sequence[str], scenario: Scenario) -> "list[SearchSpace]":
+        """Returns the gains of the given control laws that are tuned, without repeated laws.
+
+        Args:
+            laws: Names of built-in laws, or classes as in "mylaws:Spring". If empty,
+                `DEFAULT_LAWS` are used.
+            scenario: Scenario in which the laws are compared.
+
+        Raises:
+            UsageError: A law does not exist or has no gains to tune.
+            ScenarioError: A law does not fit the number or the roles of the sites.
+        """
+        names = list(dict.fromkeys(laws)) or list(DEFAULT_LAWS)
+        roles = [spec.role for spec in scenario.sites.values()]
+        for name in names:
+            if ":" in name:
+                continue
+            if name not in SEARCH_SPACES:
+                hint = suggest_nearest(name, list(SEARCH_SPACES))
+                tuned = f"tuned are {', '.join(SEARCH_SPACES)}"
+                raise UsageError(f"--law: there is no law {name!r} to tune{hint}; {tuned}")
+            kind = SEARCH_SPACES[name].kind
+            misfit = "" if kind is None else kind.explain_misfit(roles)
+            if misfit:
+                raise ScenarioError(f"law {name} {misfit}", source=scenario.name)
+        return [SEARCH_SPACES.get(name) or cls.of_user_law(name) for name in names]
+
 
 def _find_longest_round_trip_ms(scenario: Scenario) -> float:
     """Returns the longest mean round trip between two sites, in ms.
@@ -406,34 +434,6 @@ DEFAULT_LAWS = ("adaptive", "adaptive_box", "p_d", "pd_d")
 """Laws that are compared by default. All of them work with any number of sites."""
 PAPER_GAINS: GainValues = {"Lambda": 1.0, "Kp": 1.0, "Kd": 3.0, "Gamma": 1.0}
 """Gains that the paper prints for `adaptive`."""
-
-
-def select_search_spaces(laws: Sequence[str], scenario: Scenario) -> list[SearchSpace]:
-    """Returns the gains of the given control laws that are tuned, without repeated laws.
-
-    Args:
-        laws: Names of built-in laws, or classes as in "mylaws:Spring". If empty, `DEFAULT_LAWS`
-            are used.
-        scenario: Scenario in which the laws are compared.
-
-    Raises:
-        UsageError: A law does not exist or has no gains to tune.
-        ScenarioError: A law does not fit the number or the roles of the sites.
-    """
-    names = list(dict.fromkeys(laws)) or list(DEFAULT_LAWS)
-    roles = [spec.role for spec in scenario.sites.values()]
-    for name in names:
-        if ":" in name:
-            continue
-        if name not in SEARCH_SPACES:
-            hint = suggest_nearest(name, list(SEARCH_SPACES))
-            tuned = f"tuned are {', '.join(SEARCH_SPACES)}"
-            raise UsageError(f"--law: there is no law {name!r} to tune{hint}; {tuned}")
-        kind = SEARCH_SPACES[name].kind
-        misfit = "" if kind is None else kind.explain_misfit(roles)
-        if misfit:
-            raise ScenarioError(f"law {name} {misfit}", source=scenario.name)
-    return [SEARCH_SPACES.get(name) or SearchSpace.of_user_law(name) for name in names]
 
 
 def _parse_user_range(code: str, name: Any, entry: Any) -> _TunedGain:

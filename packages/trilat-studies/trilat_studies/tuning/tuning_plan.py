@@ -53,7 +53,6 @@ from .search_space import (
     SEARCH_SPACES,
     ModelInformation,
     SearchSpace,
-    select_search_spaces,
     weigh_joints,
 )
 
@@ -602,11 +601,11 @@ class TuningResult(Result):
     def blocks(self) -> Iterator[Any]:
         """Yields the text that `trilat compare --tune` prints about the tuning, part by part.
 
-        See `compose_tuning`.
+        See `TuningReport.compose`.
         """
-        from .tuning_report import compose_tuning
+        from .tuning_report import TuningReport
 
-        return compose_tuning(self)
+        return TuningReport(self).compose()
 
     def headline(self) -> str:
         """Returns a sentence with the number of points on the Pareto front of each law.
@@ -819,7 +818,7 @@ def plan_tuning(
     knowledge = ModelInformation.of_gravity(gravity_percent)
     base = TuningScenario.load(source, overrides)
     scenario = base.scenario
-    spaces = select_search_spaces([name_law_classes(law) for law in laws], scenario)
+    spaces = SearchSpace.select([name_law_classes(law) for law in laws], scenario)
     ticks = sum(map(scenario.ticks, scenario.names))
     if ticks > MAX_TICKS:
         problem = (

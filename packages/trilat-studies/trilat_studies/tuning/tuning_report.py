@@ -2,8 +2,8 @@
 
 Before the comparison, the gains of each law were tuned by a search. The figure shows error
 against effort, the RMS motor torque, for the Pareto front of each law: the gains for which no
-other gains of the law are better in both. `write_tuning` writes the files front.json, front.md,
-front.png and front.pdf.
+other gains of the law are better in both. `TuningReport.write` writes the files front.json,
+front.md, front.png and front.pdf.
 
 Invariant:
     - The files depend only on the result. Repeating the same comparison gives equal bytes.
@@ -49,80 +49,240 @@ _MAX_FRONT_ROWS = 8
 """Largest number of points of a front that the terminal shows. The files have all points."""
 
 
-def compose_tuning(tuned: "TuningResult") -> Iterator[Block]:
-    """Yields the text that reports a comparison of tuned control laws on the terminal.
-
-    The text contains a table of the laws, explanations of the classes of behaviour, and the
-    best compromises between error and effort (the Pareto front) of each law. The scores of the
-    published gains, notes, and commands that repeat the best runs follow.
+class TuningReport:
+    """Report of a comparison of tuned control laws: text, tables, page and figure.
 
     Args:
-        tuned: Result of the comparison of control laws.
+        tuned: Result of the comparison.
     """
-    yield tabulate_laws(tuned)
-    yield from (f"  {line}" for line in _list_class_meanings())
-    yield from (f"note: {line}" for line in list_energy_notes(tuned))
-    alone = describe_runs_alone(tuned.alone, tuned.plan.runs)
-    if alone:
-        yield f"note: {alone}"
 
-    for search in tuned.found:
-        if search.front:
-            yield ""
-            yield tabulate_front(tuned, search, _MAX_FRONT_ROWS)
-    yield (
-        "  * no candidate of any law is better in both objectives; of a long front "
-        f"{_MAX_FRONT_ROWS} points are shown"
-    )
+    def __init__(self, tuned: "TuningResult") -> None:
+        self._tuned = tuned
 
-    yield ""
-    yield _tabulate_paper_gains(tuned)
-    for search in tuned.found:
-        for gain in tuned.list_edge_gains(search):
-            yield (
-                f"note: {search.space.law} is best at the edge of the range of {gain}; widen "
-                "the search"
-            )
+    def compose(self) -> Iterator[Block]:
+        """Yields the text that reports a comparison of tuned control laws on the terminal.
 
-    yield ""
-    if not any(search.front for search in tuned.found):
+        The text contains a table of the laws, explanations of the classes of behaviour, and the
+        best compromises between error and effort (the Pareto front) of each law. The scores of
+        the published gains, notes, and commands that repeat the best runs follow.
+        """
+        yield self._tabulate_laws()
+        yield from (f"  {line}" for line in _list_class_meanings())
+        yield from (f"note: {line}" for line in self.list_energy_notes())
+        alone = describe_runs_alone(self._tuned.alone, self._tuned.plan.runs)
+        if alone:
+            yield f"note: {alone}"
+
+        for search in self._tuned.found:
+            if search.front:
+                yield ""
+                yield self.tabulate_front(search, _MAX_FRONT_ROWS)
         yield (
-            "no candidate of any law is stable and at the pose: a longer --duration or a "
-            "larger --budget may show more"
+            "  * no candidate of any law is better in both objectives; of a long front "
+            f"{_MAX_FRONT_ROWS} points are shown"
         )
-        return
-    yield "commands for the last point of each front; front.md has the others:"
-    for search in tuned.found:
-        if search.front:
-            last_point = search.front[-1]
-            yield f"  {tuned.candidate(search, last_point).command}"
 
+        yield ""
+        yield self._tabulate_paper_gains()
+        for search in self._tuned.found:
+            for gain in self._tuned.list_edge_gains(search):
+                yield (
+                    f"note: {search.space.law} is best at the edge of the range of {gain}; "
+                    "widen the search"
+                )
 
-def tabulate_laws(tuned: "TuningResult") -> TextTable:
-    """Returns a table that summarises the search of each law in a row.
+        yield ""
+        if not any(search.front for search in self._tuned.found):
+            yield (
+                "no candidate of any law is stable and at the pose: a longer --duration or a "
+                "larger --budget may show more"
+            )
+            return
+        yield "commands for the last point of each front; front.md has the others:"
+        for search in self._tuned.found:
+            if search.front:
+                last_point = search.front[-1]
+                yield f"  {self._tuned.candidate(search, last_point).command}"
 
-    A row has the number of candidates (choices of gains), the number of candidates of each
-    class, such as stable or diverged, the number of points on the law's Pareto front and on the
-    common front of all laws, and the two ends of the front.
+    def write(self, folder: Path) -> list[Path]:
+        """Writes the results of a comparison into an existing folder.
 
-    Args:
-        tuned: Result of the comparison of control laws.
-    """
-    classes = list(reversed(CandidateClass))
-    objective = f"{tuned.plan.objective} {tuned.plan.objective.unit}"
-    heads = ("law", "tried", *(outcome.word for outcome in classes), "front", "of all")
-    heads += (f"least {objective}", "at effort N m", "least effort N m", f"at {objective}")
+        The files are the results as JSON, a page in Markdown, and the figure of the fronts as
+        PNG and PDF.
 
-    rows = []
-    for search in tuned.found:
-        outcomes = search.outcomes
-        row = [search.space.law, str(len(search.tried))]
-        row += [str(outcomes[outcome]) for outcome in classes]
-        row.append(str(len(search.front)))
-        row.append(str(len(tuned.list_overall_front(search))))
-        row += _format_front_ends(search)
-        rows.append(tuple(row))
-    return TextTable(heads, rows, align="lr")
+        Args:
+            folder: The folder.
+
+        Returns:
+            The paths of the files.
+        """
+        json_path = folder / "front.json"
+        page_path = folder / "front.md"
+        picture_paths = [folder / "front.png", folder / "front.pdf"]
+        text = json.dumps(self._tuned.to_dict(), indent=2, ensure_ascii=False, allow_nan=False)
+        write_whole(json_path, text + "\n")
+        write_whole(page_path, self._build_page())
+        figure = self._draw_front()
+        for path in picture_paths:
+            style.write_figure(figure, path, style.REPORT_DPI)
+        return [json_path, page_path, *picture_paths]
+
+    def list_energy_notes(self) -> list[str]:
+        """Returns notes on energies that a tuning does not check, for laws that declare them.
+
+        The classes depend on the motion of the arms. A run in which a law's declared energy
+        became negative can therefore count as stable here, while its certificate is open.
+        """
+        laws = []
+        for search in self._tuned.found:
+            law = BUILT_IN.get(search.space.law)
+            if callable(getattr(law, "energies", None)):
+                laws.append(search.space.law)
+        if not laws:
+            return []
+        return [
+            f"{', '.join(laws)} declare energies, which `trilat certify` checks and the "
+            f"classes above do not: {ObservedFinding.NEGATIVE.meaning}"
+        ]
+
+    def tabulate_front(self, search: "CandidateSearch", most: int | None = None) -> TextTable:
+        """Returns a table of the candidates on a law's Pareto front, by rising effort.
+
+        A candidate is on the front if no other candidate has both a smaller error and a smaller
+        effort. A * marks the candidates that are also on the common front of all laws.
+
+        Args:
+            search: Search of the law.
+            most: Largest number of rows. If the front is longer, evenly spread points are
+                shown, including the first and the last one. If `None`, all points are shown.
+        """
+        count = len(search.front)
+        shown = count if most is None else min(most, count)
+        # evenly spread, including the first and the last point
+        row_indices = {round(place) for place in np.linspace(0, count - 1, shown)}
+        overall_front = self._tuned.list_overall_front(search)
+        tuned_gains = search.space.knobs
+
+        rows = []
+        for row_index, index in enumerate(search.front):
+            if row_index not in row_indices:
+                continue
+            mark = "*" if index in overall_front else ""
+            gains = [f"{search.tried[index][knob.name]:g}" for knob in tuned_gains]
+            score = _format_score(search.scores[index])
+            rows.append((f"{search.space.law} {row_index + 1}{mark}", *gains, *score))
+
+        heads = [f"{knob.name} {knob.unit}".strip() for knob in tuned_gains]
+        return TextTable(("law", *heads, *_SCORE_HEADS), rows, align="lr")
+
+    def _tabulate_laws(self) -> TextTable:
+        """Returns a table that summarises the search of each law in a row.
+
+        A row has the number of candidates (choices of gains), the number of candidates of each
+        class, such as stable or diverged, the number of points on the law's Pareto front and on
+        the common front of all laws, and the two ends of the front.
+        """
+        classes = list(reversed(CandidateClass))
+        objective = f"{self._tuned.plan.objective} {self._tuned.plan.objective.unit}"
+        heads = ("law", "tried", *(outcome.word for outcome in classes), "front", "of all")
+        heads += (f"least {objective}", "at effort N m", "least effort N m", f"at {objective}")
+
+        rows = []
+        for search in self._tuned.found:
+            outcomes = search.outcomes
+            row = [search.space.law, str(len(search.tried))]
+            row += [str(outcomes[outcome]) for outcome in classes]
+            row.append(str(len(search.front)))
+            row.append(str(len(self._tuned.list_overall_front(search))))
+            row += _format_front_ends(search)
+            rows.append(tuple(row))
+        return TextTable(heads, rows, align="lr")
+
+    def _tabulate_paper_gains(self) -> TextTable:
+        """Returns a table of the scores of the adaptive law with its published gains.
+
+        The gains are printed in the paper from which the law comes. The scores are the error,
+        the effort and the class of behaviour. The table has a row for each variant: with and
+        without information about the arm.
+        """
+        rows = []
+        for result in self._tuned.printed:
+            score = result.score
+            rows.append((result.name, score.outcome.word, *_format_score(score)))
+        return TextTable(("law", "class", *_SCORE_HEADS), rows, align="llr")
+
+    def _build_page(self) -> str:
+        """Composes the Markdown page that reports a comparison of control laws.
+
+        The page contains, for each point of a front, the command that repeats its run.
+
+        Returns:
+            The text of the page.
+        """
+        scenario = self._tuned.plan.base.scenario
+        parts = [
+            f"# {scenario.name}: laws compared fairly",
+            _format_list(describe_procedure(self._tuned.plan)),
+            self._tabulate_laws().markdown(),
+            "Classes, the first that applies:",
+            _format_list([*_list_class_meanings(), *self.list_energy_notes()]),
+            "## Search ranges",
+            _tabulate_search(self._tuned.plan).markdown(),
+            "## Fronts",
+            "A * marks the points that no candidate of any law dominates.",
+        ]
+
+        for search in self._tuned.found:
+            parts.append(f"### {search.space.law}")
+            if search.front:
+                commands = [
+                    self._tuned.candidate(search, index).command for index in search.front
+                ]
+                parts.append(self.tabulate_front(search).markdown())
+                parts.append(_format_code(commands))
+            else:
+                parts.append("No candidate of this law is stable and at the pose.")
+
+        parts.append("## As printed")
+        parts.append(self._tabulate_paper_gains().markdown())
+        parts.append(_format_code([result.candidate.command for result in self._tuned.printed]))
+        return "\n\n".join(parts) + "\n"
+
+    def _draw_front(self) -> Figure:
+        """Draws the Pareto fronts of all laws in one panel, with error against effort.
+
+        The Pareto front of a law contains the best compromises between both. The axes are
+        logarithmic if all numbers are positive.
+        """
+        with style.styled_figure(REPORT_SIZE, _HEIGHT_IN) as figure:
+            figure.set_figwidth(FRONT_WIDTH_IN)
+            axes = figure.add_subplot()
+            handles = [_draw_law(axes, search) for search in self._tuned.found]
+            handles += _draw_paper_gains(axes, self._tuned)
+            axes.set_xlabel("effort (N m)", fontsize=_SIZE_PT)
+            axes.set_ylabel(_LABELS[self._tuned.plan.objective], fontsize=_SIZE_PT)
+            axes.tick_params(labelsize=_SIZE_PT)
+
+            drawn_numbers = [
+                number for line in axes.lines for number in np.ravel(line.get_xydata())
+            ]
+            if not drawn_numbers:
+                style.annotate_empty_panel(axes, "no stable candidate at the pose")
+            elif min(drawn_numbers) > 0.0:
+                axes.set(xscale="log", yscale="log")
+                for axis in (axes.xaxis, axes.yaxis):
+                    style.set_plain_log_axis(axis)
+
+            figure.legend(
+                handles=handles,
+                loc="outside upper center",
+                ncols=2,
+                fontsize=_SIZE_PT,
+                labelspacing=0.3,
+                columnspacing=0.8,
+                handlelength=1.2,
+            )
+        return figure
 
 
 def _format_front_ends(search: "CandidateSearch") -> list[str]:
@@ -163,57 +323,6 @@ def _tabulate_search(plan: "TuningPlan") -> TextTable:
             information = ""
     heads = ("law", "gain", "unit", "from", "to", "information")
     return TextTable(heads, rows, align="lllrrl")
-
-
-def tabulate_front(
-    tuned: "TuningResult", search: "CandidateSearch", most: int | None = None
-) -> TextTable:
-    """Returns a table of the candidates on a law's Pareto front, by rising effort.
-
-    A candidate is on the front if no other candidate has both a smaller error and a smaller
-    effort. A * marks the candidates that are also on the common front of all laws.
-
-    Args:
-        tuned: Result of the comparison of control laws.
-        search: Search of the law.
-        most: Largest number of rows. If the front is longer, evenly spread points are shown,
-            including the first and the last one. If `None`, all points are shown.
-    """
-    count = len(search.front)
-    shown = count if most is None else min(most, count)
-    # evenly spread, including the first and the last point
-    row_indices = {round(place) for place in np.linspace(0, count - 1, shown)}
-    overall_front = tuned.list_overall_front(search)
-    tuned_gains = search.space.knobs
-
-    rows = []
-    for row_index, index in enumerate(search.front):
-        if row_index not in row_indices:
-            continue
-        mark = "*" if index in overall_front else ""
-        gains = [f"{search.tried[index][knob.name]:g}" for knob in tuned_gains]
-        score = _format_score(search.scores[index])
-        rows.append((f"{search.space.law} {row_index + 1}{mark}", *gains, *score))
-
-    heads = [f"{knob.name} {knob.unit}".strip() for knob in tuned_gains]
-    return TextTable(("law", *heads, *_SCORE_HEADS), rows, align="lr")
-
-
-def _tabulate_paper_gains(tuned: "TuningResult") -> TextTable:
-    """Returns a table of the scores of the adaptive law with its published gains.
-
-    The gains are printed in the paper from which the law comes. The scores are the error, the
-    effort and the class of behaviour. The table has a row for each variant: with and without
-    information about the arm.
-
-    Args:
-        tuned: Result of the comparison of control laws.
-    """
-    rows = []
-    for result in tuned.printed:
-        score = result.score
-        rows.append((result.name, score.outcome.word, *_format_score(score)))
-    return TextTable(("law", "class", *_SCORE_HEADS), rows, align="llr")
 
 
 _SCORE_HEADS = ("error rad", "spread rad", "pose rad", "effort N m", "settling s", "clamped %")
@@ -294,28 +403,6 @@ def describe_procedure(plan: "TuningPlan") -> list[str]:
     return lines
 
 
-def list_energy_notes(tuned: "TuningResult") -> list[str]:
-    """Returns notes on energies that a tuning does not check, for laws that declare them.
-
-    The classes depend on the motion of the arms. A run in which a law's declared energy became
-    negative can therefore count as stable here, while its certificate is open.
-
-    Args:
-        tuned: Result of the comparison of control laws.
-    """
-    laws = []
-    for search in tuned.found:
-        law = BUILT_IN.get(search.space.law)
-        if callable(getattr(law, "energies", None)):
-            laws.append(search.space.law)
-    if not laws:
-        return []
-    return [
-        f"{', '.join(laws)} declare energies, which `trilat certify` checks and the classes "
-        f"above do not: {ObservedFinding.NEGATIVE.meaning}"
-    ]
-
-
 def _list_class_meanings() -> list[str]:
     """Returns a line for each class of behaviour, such as stable, with its meaning.
 
@@ -323,45 +410,6 @@ def _list_class_meanings() -> list[str]:
     class that applies.
     """
     return [f"{outcome.word}: {text}" for outcome, text in CLASS_MEANINGS.items()]
-
-
-def _build_tuning_page(tuned: "TuningResult") -> str:
-    """Composes the Markdown page that reports a comparison of control laws.
-
-    The page contains, for each point of a front, the command that repeats its run.
-
-    Args:
-        tuned: Result of the comparison of control laws.
-
-    Returns:
-        The text of the page.
-    """
-    scenario = tuned.plan.base.scenario
-    parts = [
-        f"# {scenario.name}: laws compared fairly",
-        _format_list(describe_procedure(tuned.plan)),
-        tabulate_laws(tuned).markdown(),
-        "Classes, the first that applies:",
-        _format_list([*_list_class_meanings(), *list_energy_notes(tuned)]),
-        "## Search ranges",
-        _tabulate_search(tuned.plan).markdown(),
-        "## Fronts",
-        "A * marks the points that no candidate of any law dominates.",
-    ]
-
-    for search in tuned.found:
-        parts.append(f"### {search.space.law}")
-        if search.front:
-            commands = [tuned.candidate(search, index).command for index in search.front]
-            parts.append(tabulate_front(tuned, search).markdown())
-            parts.append(_format_code(commands))
-        else:
-            parts.append("No candidate of this law is stable and at the pose.")
-
-    parts.append("## As printed")
-    parts.append(_tabulate_paper_gains(tuned).markdown())
-    parts.append(_format_code([result.candidate.command for result in tuned.printed]))
-    return "\n\n".join(parts) + "\n"
 
 
 def _format_list(lines: Sequence[str]) -> str:
@@ -384,46 +432,6 @@ _MARKS = ("o", "s", "^", "D", "v", "P")
 """Markers of the laws."""
 # Labels of the vertical axis.
 _LABELS = {"error": "error (rad)", "settling": "settling time (s)"}
-
-
-def _draw_front(tuned: "TuningResult") -> Figure:
-    """Draws the Pareto fronts of all laws in one panel, with error against effort.
-
-    The Pareto front of a law contains the best compromises between both. The axes are
-    logarithmic if all numbers are positive.
-
-    Args:
-        tuned: Result of the comparison of control laws.
-    """
-    with style.styled_figure(REPORT_SIZE, _HEIGHT_IN) as figure:
-        figure.set_figwidth(FRONT_WIDTH_IN)
-        axes = figure.add_subplot()
-        handles = [_draw_law(axes, search) for search in tuned.found]
-        handles += _draw_paper_gains(axes, tuned)
-        axes.set_xlabel("effort (N m)", fontsize=_SIZE_PT)
-        axes.set_ylabel(_LABELS[tuned.plan.objective], fontsize=_SIZE_PT)
-        axes.tick_params(labelsize=_SIZE_PT)
-
-        drawn_numbers = [
-            number for line in axes.lines for number in np.ravel(line.get_xydata())
-        ]
-        if not drawn_numbers:
-            style.annotate_empty_panel(axes, "no stable candidate at the pose")
-        elif min(drawn_numbers) > 0.0:
-            axes.set(xscale="log", yscale="log")
-            for axis in (axes.xaxis, axes.yaxis):
-                style.set_plain_log_axis(axis)
-
-        figure.legend(
-            handles=handles,
-            loc="outside upper center",
-            ncols=2,
-            fontsize=_SIZE_PT,
-            labelspacing=0.3,
-            columnspacing=0.8,
-            handlelength=1.2,
-        )
-    return figure
 
 
 def _draw_law(axes: Axes, search: "CandidateSearch") -> Line2D:
@@ -493,28 +501,3 @@ def _draw_paper_gains(axes: Axes, tuned: "TuningResult") -> list[Line2D]:
             label += f" ({outcome.word})"
         entries.append(Line2D([], [], label=label, **look))
     return entries
-
-
-def write_tuning(tuned: "TuningResult", folder: Path) -> list[Path]:
-    """Writes the results of a comparison into an existing folder.
-
-    The files are the results as JSON, a page in Markdown, and the figure of the fronts as PNG
-    and PDF.
-
-    Args:
-        tuned: Result of the comparison of control laws.
-        folder: The folder.
-
-    Returns:
-        The paths of the files.
-    """
-    json_path = folder / "front.json"
-    page_path = folder / "front.md"
-    picture_paths = [folder / "front.png", folder / "front.pdf"]
-    text = json.dumps(tuned.to_dict(), indent=2, ensure_ascii=False, allow_nan=False)
-    write_whole(json_path, text + "\n")
-    write_whole(page_path, _build_tuning_page(tuned))
-    figure = _draw_front(tuned)
-    for path in picture_paths:
-        style.write_figure(figure, path, style.REPORT_DPI)
-    return [json_path, page_path, *picture_paths]

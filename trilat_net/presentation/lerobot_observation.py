@@ -92,7 +92,11 @@ def observe_as_plugin(
         records = log[observed_site]
         site_rows = rows[observed_site]
         joints = log.scenario.arms[observed_site].joint_names
-        quantities = {"pos": records.q, "vel": records.qd, "tau_x": records.tau_x}
+        quantities = {
+            "pos": records.q,
+            "vel": records.qd,
+            "tau_x": records.tau_x,
+        }
         for quantity, numbers in quantities.items():
             columns.append(numbers[site_rows])
             names += [f"{observed_site}.{joint}.{quantity}" for joint in joints]
@@ -104,7 +108,8 @@ def observe_as_plugin(
     pose_rate = records.qd[site_rows]
     axes = tuple(log.scenario.arms[site].joint_names)
     if hand.mode != "joint":
-        end_effector = build_arm_rows(log.scenario, site).place_end_effector(pose, pose_rate)
+        arm_rows = build_arm_rows(log.scenario, site)
+        end_effector = arm_rows.place_end_effector(pose, pose_rate)
         pose = end_effector.position
         pose_rate = end_effector.speed
         axes = TASK_AXES[: pose.shape[1]]
@@ -146,7 +151,9 @@ def _compute_pull(hand: LiveHand, vectors: Array, pose: Array, pose_rate: Array)
     if hand.mode != "force":
         stiffness = np.array(settings.K)
         damping = np.array(settings.B)
-        unlimited_force = stiffness * (target - pose) + damping * (target_rate - pose_rate)
+        spring_force = stiffness * (target - pose)
+        damper_force = damping * (target_rate - pose_rate)
+        unlimited_force = spring_force + damper_force
 
     magnitude = np.linalg.norm(unlimited_force, axis=1, keepdims=True)
     is_above_limit = magnitude > settings.limit

@@ -1,0 +1,384 @@
+"""Parses an axis of a sweep, a scenario key with the values that the sweep gives to the key.
+
+A user writes an axis as a text, such as "link.delay_ms=0:400:50". The names and units of a key,
+with which figures and tables label an axis, are defined here as well.
+
+Invariant:
+    - The value of an axis is the text of an override, as a user would write it.
+    - Ranges are counted in decimal numbers: 0.2:3:0.1 contains 0.3, not 0.30000000000000004.
+"""
+
+import math
+import tomllib
+from collections.abc import Mapping, Sequence
+from decimal import Decimal, InvalidOperation
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from trilat_net.errors import ScenarioError
+from trilat_net.fields import split_unit
+from trilat_net.scenario import Scenario, is_number
+
+from ..run_commands import format_toml_value
+
+_ON_GRID = Decimal("1e-9")
+"""Largest distance, in steps, at which a value counts as equal to the end of a range."""
+_KEYS_WITH_OPTIONS = {
+    "seed": "seeds have their own option, as in --seeds 1..20",
+    "duration_s": "the duration of a cell depends on its verdict: --duration sets the first "
+    "duration, --longest the limit",
+}
+"""Keys that cannot be swept, each with the option that sets the key instead."""
+_MAX_AXIS_VALUES = 10**12
+"""Largest number of values of an axis."""
+_VALUES_EXAMPLE = "as in KEY=0:1600:50 (from, to, step) or KEY=1,2,5"
+"""Example of an axis for error messages."""
+
+
+class _Steps:
+    """Sequence of equally spaced numbers, as texts.
+
+    A text is created only when it is accessed, because a list of all values of a long range
+    might not fit into memory.
+
+    Args:
+        first: First value.
+        step: Difference between neighbouring values.
+        count: Number of values.
+    """
+
+    def __init__(self, first: Decimal, step: Decimal, count: int) -> None:
+        self._first = first
+        self._step = step
+        self._count = count
+
+    def __len__(self) -> int:
+        return self._count
+
+    def __getitem__(self, index: int) -> str:
+        n = range(self._count)[index]  # range checks the bounds and resolves negative indices
+        return f"{self._first + n * self._step:f}"
+
+
+class SweepAxis(NamedTuple):
+    """One swept scenario key with its values, as in "link.delay_ms=0:400:50".
+
+    Attributes:
+        description: The axis as the user wrote it, as "KEY=a:b:step" or "KEY=v1,v2,v3".
+        key: Scenario key that the axis varies.
+        texts: Values of the axis, as texts that follow "KEY=" in an override.
+    """
+
+    description: str
+    key: str
+    texts: tuple[str, ...] | _Steps
+
+    def value(self, number: int) -> float | str:
+        """Returns the value of the swept key at an index, such as 50.0 for a delay.
+
+        Args:
+            number: Index of the value, from 0.
+
+        Returns:
+            A float if the value is a number. Otherwise its text.
+        """
+        text = self.texts[number]
+        value = _parse_value(text)
+        return float(value) if is_number(value) else text
+
+    @property
+    def numeric(self) -> bool:
+        """True if all values of a swept parameter are numbers, as an axis of a map needs."""
+        if isinstance(self.texts, _Steps):
+            return True
+        return all(is_number(_parse_value(text)) for text in self.texts)
+
+    def override(self, number: int) -> str:
+        """Returns the text that sets one value of a swept parameter, as in "link.delay_ms=50".
+
+        Args:
+            number: Index of the value, from 0.
+        """
+        return f"{self.key}={self.texts[number]}"
+
+    @classmethod
+    def parse(cls, description: str) -> "SweepAxis":
+        """Parses a swept parameter, as a user writes it, such as "link.delay_ms=0:200:10".
+
+        Args:
+            description: Either "KEY=a:b:step", a range that includes b if a whole number of
+                steps leads to it; or "KEY=v1,v2,v3", a list of numbers, words or other TOML
+                values.
+
+        Raises:
+            ScenarioError: The key or the values are missing, or the values are not valid.
+        """
+        key, equals, text = (part.strip() for part in str(description).partition("="))
+        if not equals or not key:
+            raise ScenarioError(
+                f"--over must have the form KEY=VALUES, {_VALUES_EXAMPLE}, not {description!r}"
+            )
+        if key in _KEYS_WITH_OPTIONS:
+            raise ScenarioError(f"cannot be an axis: {_KEYS_WITH_OPTIONS[key]}", path=key)
+
+        parts = _split_outside_brackets(text, ":")
+        if len(parts) not in (1, 3):
+            example = _VALUES_EXAMPLE.removeprefix("as in ")
+            raise ScenarioError(
+                f"the values must have a form such as {example}, not {text!r}", path=key
+            )
+
+        texts: tuple[str, ...] | _Steps
+        if len(parts) == 1:
+            texts = _parse_list(key, text)
+        else:
+            first, last, step = (_parse_decimal(key, part) for part in parts)
+            texts = _build_range(key, first, last, step)
+        return cls(f"{key}={text}", key, texts)
+
+    @staticmethod
+    def list_descriptions(over: str | Sequence[str] | Mapping[str, Any]) -> list[str]:
+        """Converts swept parameters, as a Python program may give them, to texts KEY=VALUES.
+
+        Args:
+            over: One text, a list of texts, or a mapping from keys to values. The values are a
+                list, an array, or the text after "KEY=".
+
+        Returns:
+            Texts for `parse`.
+        """
+        if isinstance(over, Mapping):
+            return [f"{key}={_join_values(values)}" for key, values in over.items()]
+        return list(over) if isinstance(over, list | tuple) else [str(over)]
+
+
+def _join_values(values: Any) -> str:
+    """Returns the values of a swept parameter as the text after "KEY=" in a command.
+
+    Args:
+        values: Finished text, a list, an array or a single value. A string that is a word, such
+            as in_order, stays without quotation marks.
+    """
+    if isinstance(values, str):
+        return values
+    entries = values if isinstance(values, list | tuple) else np.atleast_1d(values)
+    texts = list[str]()
+    for entry in entries:
+        is_word = isinstance(entry, str) and entry.isidentifier()
+        texts.append(entry if is_word else format_toml_value(entry))
+    return ",".join(texts)
+
+
+def _build_range(key: str, first: Decimal, last: Decimal, step: Decimal) -> _Steps:
+    """Returns the values of a swept parameter that is written as "first:last:step".
+
+    Args:
+        key: Scenario key of the axis, for error messages.
+        first: First value.
+        last: Largest possible value, or the smallest value if the step is negative.
+        step: Difference between neighbouring values.
+
+    Raises:
+        ScenarioError: The step is 0 or has the wrong sign, or there are too many values.
+    """
+    if step == 0:
+        raise ScenarioError(f"a step of 0 does not lead from {first:f} to {last:f}", path=key)
+    has_wrong_sign = (last - first) * step < 0
+    if has_wrong_sign:
+        suggestion = f"{min(first, last):f}:{max(first, last):f}:{abs(step):f}"
+        problem = f"a step of {step:f} does not lead from {first:f} to {last:f}"
+        raise ScenarioError(f"is empty: {problem}; did you mean {suggestion}?", path=key)
+    count = int((last - first) / step + _ON_GRID) + 1
+    if count > _MAX_AXIS_VALUES:
+        raise ScenarioError(f"has {Decimal(count):.3g} values: take a larger step", path=key)
+    return _Steps(first, step, count)
+
+
+def _parse_decimal(key: str, text: str) -> Decimal:
+    """Returns a number of a range as an exact decimal number.
+
+    Args:
+        key: Scenario key of the axis, for error messages.
+        text: Text of the number.
+
+    Raises:
+        ScenarioError: The text is not a number, or the number is not finite or out of range.
+    """
+    text = text.strip()
+    try:
+        number = Decimal(text)
+    except InvalidOperation:
+        problem = (
+            f"a range a:b:step must consist of numbers, and {text!r} is not a number; "
+            "list words as in KEY=first,second"
+        )
+        raise ScenarioError(problem, path=key) from None
+
+    if not number.is_finite():
+        raise ScenarioError(f"a range must consist of finite numbers, not {text!r}", path=key)
+    size = abs(number)
+    if size > Decimal("1e18") or 0 < size < Decimal("1e-18"):
+        raise ScenarioError(
+            f"the magnitudes in a range must be from 1e-18 to 1e18, not {text}", path=key
+        )
+    return number
+
+
+def _parse_list(key: str, text: str) -> tuple[str, ...]:
+    """Splits the values of a swept parameter, written as "v1,v2,v3", into separate texts.
+
+    Args:
+        key: Scenario key of the axis, for error messages.
+        text: Text of the list.
+
+    Raises:
+        ScenarioError: A value is empty, is not finite, or appears twice.
+    """
+    texts = tuple(part.strip() for part in _split_outside_brackets(text, ","))
+    if "" in texts:
+        raise ScenarioError(f"is empty: list the values, {_VALUES_EXAMPLE}", path=key)
+    values = list[Any]()
+    for value_text in texts:
+        value = _parse_value(value_text)
+        if value in values:
+            raise ScenarioError(f"has {value_text} twice", path=key)
+        if isinstance(value, float) and not math.isfinite(value):
+            raise ScenarioError(f"must be finite numbers, not {value_text}", path=key)
+        values.append(value)
+    return texts
+
+
+def _split_outside_brackets(text: str, separator: str) -> list[str]:
+    """Splits a text at the separators that stand outside of brackets and quotation marks.
+
+    A value of a list may itself be a list or a text that contains the separator.
+    """
+    parts = [""]
+    open_brackets = 0
+    open_quote = ""  # the quotation mark that is open; empty outside of quotation marks
+    for letter in text:
+        if open_quote:
+            open_quote = "" if letter == open_quote else open_quote
+        elif letter in "\"'":
+            open_quote = letter
+        if not open_quote:
+            open_brackets += (letter in "[{") - (letter in "]}")
+
+        is_separator = letter == separator and not open_brackets and not open_quote
+        if is_separator:
+            parts.append("")
+        else:
+            parts[-1] += letter
+    return parts
+
+
+def _parse_value(text: str) -> Any:
+    """Returns the value that a text represents: 0.2 for "0.2", True for "true".
+
+    A text that is not valid TOML, such as gamma without quotes, is returned unchanged.
+    """
+    try:
+        return tomllib.loads(f"value = {text}")["value"]
+    except tomllib.TOMLDecodeError:
+        return text
+
+
+_GAINS = {
+    "K": "N m/rad",
+    "d": "N m s/rad",
+    "Kp": "N m s/rad",
+    "Kd": "N m s/rad",
+    "Lambda": "1/s",
+}
+"""Units of the gains, whose keys do not end in a unit."""
+
+
+def label_axis(key: str, scenario: Scenario | None = None) -> str:
+    """Returns the label of an axis in a figure, such as "delay (ms)" for link.delay_ms.
+
+    If links draw their delays at random, the delay is called stated, because the age of the
+    samples in use is smaller: a newer sample may overtake an older one.
+
+    Args:
+        key: Scenario key of the axis.
+        scenario: Scenario in which the names of operators and walls are looked up.
+    """
+    quantity, unit = _describe_key(key, scenario)
+    if scenario is not None and key.startswith("link") and key.endswith("delay_ms"):
+        _, *names, _ = key.split(".")
+        links = [scenario.links[name] for name in names or scenario.links]
+        if any(link.random and link.moments().deviation_ms > 0.0 for link in links):
+            quantity = f"stated {quantity}"
+    return f"{quantity} ({unit})" if unit else quantity
+
+
+def label_setting(key: str, value: Any, scenario: Scenario | None = None) -> str:
+    """Returns a setting as a label with unit, such as "delay 200 ms" for link.delay_ms = 200.
+
+    Args:
+        key: Scenario key.
+        value: Value of the key.
+        scenario: Scenario in which the names of operators and walls are looked up.
+    """
+    quantity, unit = _describe_key(key, scenario)
+    if isinstance(value, bool):
+        text = str(value).lower()
+    elif is_number(value):
+        text = f"{value:g}"
+    else:
+        text = str(value).replace("_", " ")
+    return " ".join(part for part in (quantity, text, unit) if part)
+
+
+def _describe_key(key: str, scenario: Scenario | None = None) -> tuple[str, str]:
+    """Splits the name of a setting, such as delay_ms, into a name and a unit for labels.
+
+    Args:
+        key: Scenario key, such as "sites.s.control.K" or "link.delay_ms".
+        scenario: Scenario in which the names of operators and walls are looked up.
+
+    Returns:
+        The name in words, such as "K of s", and the unit, which is empty if the setting has no
+        unit.
+    """
+    *tables, name = key.split(".")
+    subscript = ""
+    if name.isdigit() and tables:  # an element of a list over joints or parameters
+        subscript = f"[{name}]"
+        name = tables.pop()
+    quantity, unit = split_unit(name)
+    is_symbol = not unit and len(name) <= 3
+    if is_symbol:
+        quantity = name  # symbols such as Kp keep their capital letters
+    owner = _describe_owner(tables, scenario)
+    return f"{quantity}{subscript}{owner}", _GAINS.get(name) or unit.replace("^2", "²")
+
+
+def _describe_owner(tables: list[str], scenario: Scenario | None) -> str:
+    """Returns the phrase of a label that names the site, link or actor of a setting.
+
+    Args:
+        tables: Names of the tables that contain the key, from the outermost table.
+        scenario: Scenario in which the kind of an operator or a wall is looked up.
+
+    Returns:
+        A string such as " of s". Empty if the key applies to all sites or links.
+    """
+    match tables:
+        case ["sites", site, ("hands" | "environment") as group, number]:
+            kind = "hand" if group == "hands" else "environment"
+            if scenario is not None and site in scenario.sites and number.isdigit():
+                actors = getattr(scenario.sites[site], group)
+                if int(number) < len(actors):
+                    tag = actors[int(number)].__struct_config__.tag
+                    kind = str(tag).replace("_", " ")
+            return f", {kind} of {site}"
+        case ["sites", site, *_]:
+            return f" of {site}"
+        case ["links", link, *_]:
+            return f" {link}"
+        case ["dominance", site]:
+            return f"'s share in {site}"
+        case _:
+            return ""
