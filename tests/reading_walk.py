@@ -392,8 +392,8 @@ def walk(*starts: Place) -> Walk:
 def walk_to_judgement() -> Walk:
     """Returns the walk from a log to the exit code of `trilat certify`."""
     return walk(
-        Place(CERTIFICATE / "stability_certificate.py", "certify_log"),
-        Place(CERTIFICATE / "certificate_result.py", "Certificate.accepts"),
+        Place(CERTIFICATE / "stability_certificate.py", "Certificate.of_log"),
+        Place(CERTIFICATE / "stability_certificate.py", "Certificate.accepts"),
     )
 
 

@@ -25,7 +25,6 @@ from tests.unit_arm import (
     read_last_rows,
 )
 from trilat_net.analysis.metrics.log_metrics import LogMetrics
-from trilat_net.analysis.theory.delay_margin import set_common_delay
 from trilat_net.analysis.theory.linear_analysis import analyse_linear_loop
 from trilat_net.errors import ScenarioError
 from trilat_net.laws.six_channel import complementary_shares, complementary_weights
@@ -191,7 +190,7 @@ def test_full_acceleration_one_tick_late_is_unstable() -> None:
 
 def test_the_linear_loop_has_the_law_without_acceleration() -> None:
     loop = analyse_linear_loop(three_sites(0.25, 5), pose=(0.0, 0.0)).loop
-    A = set_common_delay(loop, 0.0).A
+    A = loop.set_common_delay(0.0).A
     alpha = complementary_shares(0.25)
     assert np.linalg.eigvals(A).real.max() == pytest.approx(
         rightmost_root(alpha, [(0.0, 0.0), (0.0, 0.0), (500.0, 5.0)]), abs=1e-6

@@ -15,6 +15,7 @@ from tests.log.builders import add_clock_readings
 from tests.presentation.figure_content import list_curves
 from tests.scenario.builders import planar_task_text
 from trilat_net.analysis import site_signals
+from trilat_net.analysis.arm_rows import build_arm_rows
 from trilat_net.analysis.link_summary import DelayDistribution
 from trilat_net.analysis.timeline import Timeline
 from trilat_net.errors import UsageError
@@ -181,10 +182,8 @@ def test_shares_are_fractions_of_the_total():
 
 def test_arms_stand_in_panels_with_equal_axes():
     log = make_short_log("four")
-    arm = log.scenario.arms["c"]
-    base, elbow, end_effector = arm_poses.joint_positions_m(
-        arm, np.array([[np.pi / 2, -np.pi / 2]])
-    )[0]
+    arm = build_arm_rows(log.scenario, "c")
+    base, elbow, end_effector = arm.joint_positions_m(np.array([[np.pi / 2, -np.pi / 2]]))[0]
     assert [*base, *elbow, *end_effector] == pytest.approx([0.0, 0.0, 0.0, 0.6, 1.0, 0.6])
     figure = FIGURES["arms"].draw(log)
     titles = [axes.get_title() for axes in figure.axes if axes.get_title()]

@@ -12,7 +12,7 @@ from playwright.sync_api import Browser
 from tests.analysis.builders import make_busy_run, make_run, make_short_log
 from tests.live.browsers import needs_browser
 from tests.page.whole_pages import watched_page
-from trilat_net.analysis.certificate.stability_certificate import certify_log
+from trilat_net.analysis.certificate.stability_certificate import Certificate
 from trilat_net.analysis.dominance_history import DominanceHistory
 from trilat_net.log.log_reader import Log
 from trilat_net.presentation.charts import ChartBuilder
@@ -97,7 +97,7 @@ def test_the_bar_stands_below_the_slider(
     size: tuple[int, int], browser: Browser, tmp_path: Path
 ) -> None:
     log = simulate_training()
-    path, _ = write_report(log, tmp_path, certificate=certify_log(log))
+    path, _ = write_report(log, tmp_path, certificate=Certificate.of_log(log))
     options: dict[str, Any] = {
         "viewport": {"width": size[0], "height": size[1]},
         "reduced_motion": "reduce",

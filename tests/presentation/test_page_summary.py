@@ -18,14 +18,12 @@ from tests.log.builders import (
     rewrite_log,
     write_log,
 )
-from trilat_net.analysis.certificate.certificate_result import Certificate
-from trilat_net.analysis.certificate.stability_certificate import certify_log
+from trilat_net.analysis.certificate.stability_certificate import Certificate
 from trilat_net.analysis.decision_facts import LoopRoots
 from trilat_net.analysis.file_overview import summarise_run
 from trilat_net.analysis.judge import certify_run
-from trilat_net.analysis.metrics.motion_metrics import measure_undelayed_error
+from trilat_net.analysis.metrics.log_metrics import LogMetrics
 from trilat_net.analysis.run_end import EndBehaviour, Stability
-from trilat_net.analysis.run_view import RunView
 from trilat_net.analysis.site_signals import SETTLED_ERROR_RAD, JointError
 from trilat_net.log.findings import Finding
 from trilat_net.log.log_reader import Log, open_log
@@ -162,8 +160,7 @@ def test_key_numbers_have_place_and_time() -> None:
         last = max(facts["sites"][site]["max_error_end_rad"] for site in sites)
         assert f"<dt>{name}" in html
         assert f"joint {joint + 1}, at {peak.t_s:.2f} s; {last:.3g} rad in the last" in html
-    undelayed_rad = measure_undelayed_error(RunView(log), "s")["undelayed_max_rad"].value
-    assert undelayed_rad is not None
+    undelayed_rad = LogMetrics.find_undelayed_maxima(log, ["s"])["s"]
     tile = f"<dt>s from where the masters are</dt><dd>{undelayed_rad:.3g} rad</dd>"
     assert tile in html
     # the remote arm is first
@@ -176,7 +173,7 @@ def test_key_numbers_have_place_and_time() -> None:
 def test_all_texts_have_the_same_last_error(name: str) -> None:
     """The page, the table of `report` and `certify` name one number and its joint."""
     log = make_short_log(name)
-    certificate = certify_log(log)
+    certificate = Certificate.of_log(log)
     error = JointError.find_last_of_all(log)
     assert error is not None
     facts = summarise_run(log)

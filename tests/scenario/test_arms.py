@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 import trilat_net
 from tests.core.chain_references import chain_references
 from tests.scenario.builders import SIX_JOINTS, make_six_joint_scenario
-from trilat_net.analysis.arm_rows import joint_positions_m
+from trilat_net.analysis.arm_rows import build_arm_rows
 from trilat_net.core.step.site_setup import MotionLimits
 from trilat_net.errors import ScenarioError
 from trilat_net.execution.verification import verify_log
@@ -61,10 +61,11 @@ def refusal(changes: Overrides) -> ScenarioError:
 @pytest.mark.long
 def test_shipped_arms_have_their_makers_data() -> None:
     """UR5: table C.3 of its manual, less than 18 kg with the base; Panda: 0.855 m and about 18 kg."""
-    ur5, panda = (load_scenario(name).arms["s"] for name in ("six_joints", "seven_joints"))
+    scenarios = [load_scenario(name) for name in ("six_joints", "seven_joints")]
+    ur5, panda = (build_arm_rows(scenario, "s") for scenario in scenarios)
     assert ur5.theta[::10].sum() == pytest.approx(17.05, abs=0.005)
     assert panda.theta[::10].sum() == pytest.approx(16.06, abs=0.005)
-    straight = joint_positions_m(ur5, np.zeros((1, 6)))[0]
+    straight = ur5.joint_positions_m(np.zeros((1, 6)))[0]
     assert math.dist(straight[5], straight[2]) == pytest.approx(
         math.hypot(0.425 + 0.39225, 0.10915)
     )
@@ -72,7 +73,7 @@ def test_shipped_arms_have_their_makers_data() -> None:
     poses = np.zeros((40**3, 7))
     # what the reach depends on
     poses[:, 3:6] = np.stack(np.meshgrid(*limits), axis=-1).reshape(-1, 3)
-    points = joint_positions_m(panda, poses)
+    points = panda.joint_positions_m(poses)
     assert np.linalg.norm(points[:, -1] - points[:, 1], axis=1).max() == pytest.approx(
         0.855, abs=0.004
     )

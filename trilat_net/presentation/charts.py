@@ -22,7 +22,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ..analysis import DelayDistribution, Timeline, joint_positions_m, site_signals
+from ..analysis import DelayDistribution, Timeline, build_arm_rows, site_signals
 from ..core import Array
 from ..log import Ints, Log, SiteLog
 from ..scenario import Scenario
@@ -764,18 +764,19 @@ class ChartBuilder:
             Description of the chain, which refers to the table of its motion.
         """
         records = self._log[site]
-        arm = self._log.scenario.arms[site]
+        arm = build_arm_rows(self._log.scenario, site)
         last_record = len(records) - 1
         record_indices = np.linspace(0, last_record, _CHAIN_INSTANTS).astype(np.int64)
         rows = np.unique(record_indices)  # a short log has fewer records than `_CHAIN_INSTANTS`
 
         desired_q = plot_signals.reference_angles(records)
-        actual_m = joint_positions_m(arm, records.q[rows])
-        desired_m = joint_positions_m(arm, desired_q[rows])
+        axes = arm.upright_axes
+        actual_m = arm.joint_positions_m(records.q[rows])
+        desired_m = arm.joint_positions_m(desired_q[rows])
         pictures = (
-            arm_poses.project_arm_m(arm, actual_m),
-            arm_poses.project_arm_m(arm, desired_m),
-            arm_poses.project_arm_m(arm, actual_m, onto_floor=True),
+            arm_poses.project_arm_m(axes, actual_m),
+            arm_poses.project_arm_m(axes, desired_m),
+            arm_poses.project_arm_m(axes, actual_m, onto_floor=True),
         )
         # The first point is the base, which does not move.
         moving_points_m = [picture[:, 1:] for picture in pictures]
@@ -808,9 +809,9 @@ class ChartBuilder:
         sizes_m = self._log.scenario.bodies_m(site).values()
         if not sizes_m:
             return []
-        arm = self._log.scenario.arms[site]
+        arm = build_arm_rows(self._log.scenario, site)
         poses = self._log[site].bodies[rows]
-        paths_m = arm_poses.trace_bodies_m(arm, sizes_m, poses)
+        paths_m = arm_poses.trace_bodies_m(arm.upright_axes, sizes_m, poses)
         return [self.units_per_m * path.reshape(len(rows), -1) for path in paths_m]
 
 

@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 from markupsafe import Markup
 
-from ..analysis import DominanceHistory, DominancePlan, Timeline
+from ..analysis import DominanceHistory, Timeline
 from ..core import Array
 from ..errors import join_words
 from ..log import Log
@@ -94,9 +94,8 @@ class SlaveLead(NamedTuple):
         # Candidates: equal steps, and the start and the end of each ramp. A point just before
         # the start shows a jump as a vertical line.
         times_s = [np.linspace(0.0, end_s, _INSTANTS)]
-        for ramp in DominancePlan.of_log(log, slave).ramps:
-            start_s = ramp.start_ns * 1e-9
-            times_s.append(np.array([start_s - _STEP_S, start_s, ramp.end_ns * 1e-9]))
+        for start_s, end_of_ramp_s in DominanceHistory.list_ramp_spans_s(log, slave):
+            times_s.append(np.array([start_s - _STEP_S, start_s, end_of_ramp_s]))
         t_s = np.unique(np.clip(np.concatenate(times_s), 0.0, end_s))
 
         factors = DominanceHistory.of_log(log, slave, t_s).alpha

@@ -25,10 +25,8 @@ from ..analysis import (
     LogMetrics,
     Metric,
     Quantity,
-    RunView,
     Timeline,
     link_summary,
-    measure_undelayed_error,
 )
 from ..errors import count_nouns
 from ..execution import LogCheckReport, Rerun
@@ -450,18 +448,10 @@ def _compare_undelayed_errors(rerun: Rerun) -> dict[str, tuple[float, float]]:
     Returns:
         Largest undelayed error in the log and in the rerun, by site.
     """
-    logged_run = RunView(rerun.before)
-    repeated_run = RunView(rerun.after)
-    key = "undelayed_max_rad" if shared_unit(rerun.before) == "rad" else "undelayed_max_m"
-    errors = {}
-    for site, effect in rerun.sites.items():
-        if not effect.compared:
-            continue
-        logged_error = measure_undelayed_error(logged_run, site, repeated_run)[key].value
-        repeated_error = measure_undelayed_error(repeated_run, site, logged_run)[key].value
-        if logged_error is not None and repeated_error is not None:
-            errors[site] = (logged_error, repeated_error)
-    return errors
+    sites = [site for site, effect in rerun.sites.items() if effect.compared]
+    logged = LogMetrics.find_undelayed_maxima(rerun.before, sites, rerun.after)
+    repeated = LogMetrics.find_undelayed_maxima(rerun.after, sites, rerun.before)
+    return {site: (logged[site], repeated[site]) for site in logged if site in repeated}
 
 
 _USED_FIELD = "used["

@@ -50,7 +50,7 @@ from scipy.linalg import expm
 from ...core import Array, IntArray, Law, Scheme, SiteSetup
 from ...scenario import LinkBase
 from ..blas_threads import limit_blas_threads
-from ..delay_period import MAX_NEAR_PERIOD_S, find_delay_period
+from ..delay_period import MAX_NEAR_PERIOD_S, DelayPeriod
 from .characteristic_roots import (
     NAMED_SHARE,
     ZERO_SHARE,
@@ -352,7 +352,7 @@ class SamplesInUse(NamedTuple):
         links: list[LinkBase] = []
         if conditions.varying:
             links = [link for link, _ in conditions.links.values()]
-        period = find_delay_period(links, rates_hz)
+        period = DelayPeriod.of_links(links, rates_hz)
         period_s = period.span_s
         delays_ms = [sum(link.moments()) + link.playout_ms for link in links]
         reach_ms = max(delays_ms, default=0.0)

@@ -581,10 +581,9 @@ def linear_command(
     verdict.
     """
     options.check_picture(picture, force=force)
-    from ...analysis import analyse_linear_loop, read_hands
+    from ...analysis import analyse_linear_loop
 
     draws_ports = picture is not None and drawn is not LinearFigure.ROOTS
-    hands = read_hands(operators or [])
     with terminal.progress_lines(f"linearising {scenario}"):
         analysis = analyse_linear_loop(
             scenario,
@@ -593,7 +592,7 @@ def linear_command(
             roots=roots,
             over=over or [],
             ports=ports or draws_ports,
-            hands=hands,
+            operators=operators or [],
         )
     # The ports may have been analysed only for the figure; then they are not printed.
     prints_ports = ports or as_json

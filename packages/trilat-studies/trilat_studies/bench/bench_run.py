@@ -34,7 +34,7 @@ import numpy as np
 from trilat_net.analysis import (
     SETTLED_ERROR_RAD,
     THROWN_RAD,
-    DominancePlan,
+    DominanceHistory,
     EndBehaviour,
     RunEnd,
     Stability,
@@ -802,7 +802,7 @@ def _measure_error_rad(scenario: Scenario, records: dict[str, RecordBatch]) -> f
     """
     slave = records[SLAVE]
     t_s = slave.t_ns / NS_PER_S
-    alpha = DominancePlan.of_scenario(scenario, SLAVE).evaluate(t_s).alpha
+    alpha = DominanceHistory.of_scenario(scenario, SLAVE, t_s).alpha
     reference: Array = np.zeros_like(slave.q)
     for index, peer in enumerate(scenario.peers(SLAVE)):
         weight = alpha[:, index, None]

@@ -22,7 +22,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from trilat_net.analysis import find_root_crossings
+from trilat_net.analysis import GrowthColumn
 from trilat_net.errors import ScenarioError, UsageError, count_nouns
 from trilat_net.files import write_whole
 from trilat_net.presentation import TextTable
@@ -347,7 +347,7 @@ def _search_margin_task(task: _MarginItem) -> GridPointMargin:
     closed = StabilityCriterion.find_edge(
         lambda value: StabilityCriterion.evaluate(load(value)), low, high
     )
-    linear, remark = find_root_crossings(load(high), key, low, high)
+    linear, remark = GrowthColumn.find_crossings(load(high), key, low, high)
     return GridPointMargin(
         cell=task.cell,
         seed=task.seed,

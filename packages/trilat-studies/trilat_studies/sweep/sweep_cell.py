@@ -26,7 +26,6 @@ from trilat_net.analysis import (
     EndBehaviour,
     GrowthColumn,
     RunEnd,
-    RunTrace,
     Stability,
     find_run_roots,
     judge_virtual_run,
@@ -319,8 +318,7 @@ class _CellInProgress:
         A lasting motion under a user's law may be a decay that is too slow to show. The roots
         of the loop, which take longer than the measurement, are computed in this case only.
         """
-        run_trace = RunTrace(self.run.buckets, self.run.tau_x, self.run.diverged_s)
-        run_end = run_trace.classify_end(self._scenario)
+        run_end = RunEnd.of_run(self.run, self._scenario)
         self._outcome = _build_result(self.run, run_end, self._totals, self._extended)
         self._is_finished = self._outcome.is_conclusive
         has_user_law = bool(self._scenario.user_laws)

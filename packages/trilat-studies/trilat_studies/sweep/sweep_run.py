@@ -25,7 +25,7 @@ from typing import Any, NamedTuple
 
 import msgspec
 
-from trilat_net.analysis import SETTLED_ERROR_RAD, LogMetrics, RunTrace, TwinGrowth
+from trilat_net.analysis import SETTLED_ERROR_RAD, LogMetrics, RunEnd, TwinGrowth
 from trilat_net.errors import (
     CodeFailed,
     CodeWithheld,
@@ -487,7 +487,7 @@ def _measure_exponent(scenario: Scenario) -> float | None:
     """
     run = FusedRun(scenario, SETTLED_ERROR_RAD)
     run.advance_to(scenario.duration_s)
-    end = RunTrace(run.buckets, run.tau_x, run.diverged_s).classify_end(scenario)
+    end = RunEnd.of_run(run, scenario)
     twins = TwinGrowth.of_scenario(scenario, end, run.ran_s, TWINS_OF_A_CELL)
     rates_per_s = [push.rate_per_s for push in twins.pushes]
     return max(filter(math.isfinite, rates_per_s), default=None)

@@ -43,13 +43,12 @@ import numpy as np
 
 from trilat_net.analysis import (
     SETTLED_ERROR_RAD,
-    DominancePlan,
+    DominanceHistory,
     EndBehaviour,
     RunEnd,
     SourceRows,
     Stability,
     build_arm_rows,
-    find_hanging_sites,
 )
 from trilat_net.core import Array, DominanceMatrix, TorqueKind
 from trilat_net.errors import CodeFailed, ScenarioError
@@ -369,7 +368,7 @@ def check_final_posture(log: Log) -> list[str]:
     for site, site_log in site_logs.items():
         in_last_second = site_log.t_s > site_log.t_s[-1] - END_WINDOW_S
         end_poses_rad[site] = site_log.q[in_last_second].mean(axis=0)
-    hanging = find_hanging_sites(log.scenario, end_poses_rad)
+    hanging = RunEnd.find_hanging_sites(log.scenario, end_poses_rad)
     if hanging:
         verb = "hangs" if len(hanging) == 1 else "hang"
         warnings.append(
@@ -647,7 +646,7 @@ def _compute_promised_motion(
     alpha = np.zeros((len(t_s), len(laws), len(laws)))
     for site, name in enumerate(scenario.names):
         peers = [scenario.names.index(peer) for peer in scenario.peers(name)]
-        alpha[:, site, peers] = DominancePlan.of_scenario(scenario, name).evaluate(t_s).alpha
+        alpha[:, site, peers] = DominanceHistory.of_scenario(scenario, name, t_s).alpha
     run = TuningRun(laws=laws, t_s=t_s, q=q, outside_nm=-tau_x, alpha=alpha)
     return laws[0].target_motion(run)
 
