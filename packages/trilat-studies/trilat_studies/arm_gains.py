@@ -103,7 +103,7 @@ class ArmGains(Result):
     """The largest stable gains for an arm, reduced by a safety margin.
 
     The gains are computed for two or three identical arms that follow one another over delayed
-    links. All gains scale with one parameter k, in 1/s^2: the stiffness of a joint is K = k m,
+    links. One parameter k, in 1/s^2, determines all gains: the stiffness of a joint is K = k m,
     where m is the inertia of the joint. The edge of stability is the k above which small
     motions grow. `tune_arm` creates this object. Its JSON keys are the attribute names.
 

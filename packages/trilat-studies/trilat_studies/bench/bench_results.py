@@ -73,7 +73,7 @@ class BenchRun(msgspec.Struct, frozen=True):
         length_s: Duration of the judged run, in s.
         to_s: Requested duration, in s, of a run that was repeated because it was not stable. 0
             for a first run.
-        at_limit: True if the run was cut off at the safety limit on the number of ticks.
+        at_limit: True if the run would have needed more ticks than the safety limit allows.
         confirmed: True if the repeated run was not stable either, False if the repeated run was
             stable and so refuted the first one. `None` if there was no repetition, because the
             first run diverged or was not judged "not stable".
@@ -85,8 +85,7 @@ class BenchRun(msgspec.Struct, frozen=True):
             no such time within the run.
         error_rad: RMS over time and joints of the difference between the slave and the average
             of the users (weighted with the dominance factors, with no delay), in rad.
-        effort_nm: RMS of tau - G(q), the control torque excluding gravity compensation, over
-            sites and joints, in N m.
+        effort_nm: RMS of tau - G(q), the torque without gravity, over sites and joints, in N m.
         hand_nm: RMS torque of the operators over the joints of the arms that have an operator,
             in N m.
         wall_n: Mean force of the wall in the last quarter of the task, in N. `None` if there is
