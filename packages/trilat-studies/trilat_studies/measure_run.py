@@ -693,7 +693,7 @@ class SiteStats:
 
     @property
     def last_ns(self) -> int:
-        """Nominal time of the last record, in ns since the epoch, or -1 if there is none yet."""
+        """Nominal time of the last record, in ns since the epoch. -1 if there is none yet."""
         if not self._tail:
             return -1
         last_batch = self._tail[-1]
