@@ -72,7 +72,7 @@ class EdgeRefinement:
         return []
 
     def list_coarse_cells(self) -> list[int]:
-        """Returns the numbers of the cells that a refined sweep runs first (the coarse grid)."""
+        """Returns the numbers of the cells in the coarse grid, which are simulated first."""
         is_needed = np.zeros(self._shape, bool)
         for panel in self._iterate_panels():
             is_needed[panel] = self._mark_lattice()
