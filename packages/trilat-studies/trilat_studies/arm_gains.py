@@ -57,45 +57,45 @@ TUNED_LAWS = tuple(
     for name, law in BUILT_IN.items()
     if {"K", "d"} <= law.tune.keys() and not getattr(law, "sends", ())
 )
-"""Control laws with a stiffness and a damping that send only the motion of their arm."""
+"""Control laws that have a stiffness and a damping and send only the motion of their arm."""
 SHARES = (0.95, 1.1)
-"""Fractions of k at the edge with which runs confirm the edge, below and above it."""
+"""Values of k, as fractions of k at the edge, at which runs check the edge."""
 _PUSH = 1e-6
 """Largest initial displacement of the joints of the first arm, in rad or m."""
 _SMALL = 1.0
-"""Speed above which a motion does not count as small, in rad/s."""
+"""Speed above which a motion is no longer considered small, in rad/s."""
 _STILL = 1e-7
-"""Fraction of the largest speed below which a speed counts as a rounding error."""
+"""Fraction of the largest speed below which a speed is treated as rounding error."""
 _SITES = {2: ("m", "s"), 3: ("m1", "m2", "s")}
-"""Names of the sites, by their number."""
+"""Site names for each number of sites."""
 _SLACK = 0.05
-"""Fraction of the range of a joint, at either end, that the drawn poses avoid."""
+"""Fraction of a joint's range, at either end, that the drawn poses avoid."""
 _HALF_TURN = math.pi
 """Half of the range of a revolute joint without limits, in rad."""
 _HALF_SLIDE_M = 0.5
 """Half of the range of a prismatic joint without limits, in m."""
 _SETTLES = 4.0
-"""First duration of a run, in time constants of its slowest motion."""
+"""Initial duration of a run, in time constants of its slowest motion."""
 _SHORTEST_S = 2.0
-"""Smallest first duration of a run, in s."""
+"""Smallest initial duration of a run, in s."""
 _LONGEST_S = 400.0
-"""Largest first duration of a run, in s."""
+"""Largest initial duration of a run, in s."""
 _EXTENSIONS = 3
-"""Number of durations of a run that are tried, each twice as long as the previous one."""
+"""Number of durations to try for a run, each twice as long as the previous one."""
 _IS_STABLE = {EnvelopeTrend.GROWS: False, EnvelopeTrend.DECAYS: True}
-"""Stability of a run, by the trend of its speed. Other trends leave it undecided."""
+"""Stability of a run for each trend of its speed. All other trends leave it undecided."""
 _NO_GAIN = 1e-6
-"""Negligible gain of the loop before its gains are set."""
+"""Negligible gain used in the loop until its gains are set."""
 _CURVE_POINTS = 9
 """Number of delays for which the edge is computed for a figure."""
 _EDGE_TOLERANCE = 1e-4
 """Tolerance of ln k at the edge."""
 _FITTING_STEP = 0.9
-"""Least factor by which m is reduced in one step."""
+"""Smallest factor by which m is multiplied in one step."""
 _DELAY = re.compile(r"(\d+\.?\d*|\.\d+) ?(us|ms|s|)")
-"""A number with an optional unit, as in "40ms"."""
+"""A number with an optional unit, such as "40ms"."""
 _UNIT_MS = {"us": 1e-3, "ms": 1.0, "": 1.0, "s": 1e3}
-"""Units of a delay in ms. A number without a unit is in ms."""
+"""Delay units in ms. A number without a unit is in ms."""
 
 
 @dataclass(frozen=True, repr=False)
@@ -184,18 +184,17 @@ class ArmGains(Result):
         yield self.line
 
     def _describe_edge(self) -> Iterator[str]:
-        """Yields the lines about the limits of k, where the stiffness is K = k m.
+        """Yields the lines of the report on the limits of k, in 1/s^2.
 
-        m is the inertia of a joint, and k has the unit 1/s^2. The limits, see the attribute
-        `edge`, are the smallest values of k at which
+        The stiffness of a joint is K = k m, where m is its inertia. The limits (see the
+        attribute `edge`) are the smallest values of k at which
 
-        - small motions grow: in the loop as it is, with a constant delay, and in continuous
-          time ("none" if they never grow there). This is the edge of stability;
-        - the damping, which grows with sqrt(k), reverses a velocity in every tick (control
-          period).
+        - small motions grow, which is the edge of stability: in the loop as it is, with a
+          constant delay, and in continuous time ("none" if they never grow there);
+        - the damping, which grows with sqrt(k), reverses a velocity in every tick.
 
-        The lines also state which joints move at the edge, with which frequency, in which pose
-        the edge is lowest, and which of the two limits bounds the stiffness.
+        The lines also state which joints move at the edge and at which frequency, the pose with
+        the lowest edge, and which of the two limits bounds the stiffness.
         """
         edge = self.edge
         motion = describe_moving_states(edge["moves"])
@@ -219,9 +218,9 @@ class ArmGains(Result):
 
 
 def _format_cell(value: Any) -> str:
-    """Returns the text of a table cell, in which a number has four digits.
+    """Formats a table cell, rounding a number to four digits.
 
-    A text is returned unchanged, and an empty value becomes "-".
+    A string is returned unchanged, and an empty value becomes "-".
     """
     if isinstance(value, float):
         return f"{value:.4g}"
@@ -229,9 +228,9 @@ def _format_cell(value: Any) -> str:
 
 
 def _describe_run(run: Mapping[str, Any]) -> str:
-    """Returns a sentence about a simulation that confirms the limit of stability or the gains.
+    """Returns a sentence about a simulation that checks the stability limit or the gains.
 
-    An example is "run of 20 s at 0.97 of the edge: decays -0.12 /s; by its roots -0.118 /s".
+    Example: "run of 20 s at 0.97 of the edge: decays -0.12 /s; by its roots -0.118 /s".
 
     Args:
         run: The run, as in `ArmGains.runs`.
@@ -248,11 +247,11 @@ def _describe_run(run: Mapping[str, Any]) -> str:
 
 
 def _read_delay(delay: str | float) -> tuple[dict[str, Any], str]:
-    """Reads the delay for which gains are computed.
+    """Parses the delay for which gains are computed.
 
     Args:
-        delay: A number with an optional unit, a table of delays, or a log. If it is a log, the
-            link with the longest median delay is used.
+        delay: A number with an optional unit, a table of delays, or a log. From a log, the link
+            with the longest median delay is used.
 
     Returns:
         The table [link] of a scenario with this delay, and a description for the user.
@@ -298,10 +297,10 @@ def _build_loop(
     tip: str,
     rate_hz: int,
 ) -> Scenario:
-    """Builds a scenario of equal arms without friction that follow one another.
+    """Builds a scenario of identical arms that follow one another without friction.
 
-    The gains are negligible; the search replaces them. The limits of the arms are so wide that
-    they do not act on small motions.
+    The scenario has negligible gains, which the search replaces, and limits so wide that they
+    do not affect small motions.
 
     Args:
         arm: Path of a URDF, or the name of a shipped file.
@@ -363,15 +362,15 @@ def _build_loop(
 
 
 def _draw_poses(scenario: Scenario, count: int, seed: int) -> Array:
-    """Draws random poses within the limits of the joints.
+    """Draws random poses within the joint limits.
 
-    A joint without limits, or with wide limits, stays within half a turn or half a metre of the
-    position that is closest to 0.
+    A joint with no limits, or with wide limits, stays within half a turn or half a metre of the
+    position closest to 0.
 
     Args:
         scenario: Scenario with the arm.
         count: Number of poses.
-        seed: Seed of the random numbers.
+        seed: Random seed.
 
     Returns:
         Joint angles or positions, shape (count, n), in rad or m.
@@ -398,26 +397,24 @@ def _draw_poses(scenario: Scenario, count: int, seed: int) -> Array:
 
 
 class _GainSearch:
-    """Search for the edge of stability of equal arms whose gains grow along a ray.
+    """Search for the edge of stability of identical arms whose gains depend on one parameter.
 
-    The stiffness is K = k m for each joint, where m is the inertia of the joint and k a common
-    parameter in 1/s^2. The edge is the least k at which small motions of the linearised loop
-    grow.
+    The stiffness of each joint is K = k m, where m is its inertia and k the parameter, in
+    1/s^2. The edge is the smallest k at which small motions of the linearised loop grow.
 
     Args:
         scenario: Scenario of the loop, see `_build_loop`.
         poses: Poses in which the loop is analysed, shape (count, n).
-        margin: Factor by which the stiffness lies below the edge.
+        margin: Factor by which the stiffness is kept below the edge.
         damping: Damping ratio of the gains.
-        quantile: Quantile of varying ages of samples (received states) that is used as their
-            constant age.
+        quantile: With varying sample ages, the quantile that is used as the constant age.
 
     Attributes:
         loop: The linearised loop of the arms.
-        constant_loop: The same loop with the constant sample age `age_s`. It is equal to `loop`
-            if the ages do not vary.
+        constant_loop: The same loop with the constant sample age `age_s`. Equal to `loop` if
+            the ages do not vary.
         rate_hz: Tick rate, in Hz.
-        age_s: Constant age of samples, in s.
+        age_s: Constant sample age, in s.
         inertia: Inertia m of each joint, shape (n,).
     """
 
@@ -459,23 +456,24 @@ class _GainSearch:
         self._fit_inertia()
 
     def _fit_inertia(self) -> None:
-        """Reduces the inertias m of the joints, so that the damping suits the tick rate.
+        """Reduces the inertias m of the joints until the damping suits the tick rate.
 
-        The gains are proportional to the inertia m of a joint, about its own axis: the damping
+        The gains are proportional to the inertia m of a joint about its own axis: the damping
         is 2 zeta sqrt(k) m, in N m s/rad. A motion of several joints together can have a
         smaller inertia than m. Relative to this inertia, the damping is larger by a ratio r,
         the largest eigenvalue of m M^-1, where M is the inertia matrix:
 
             damping per inertia = 2 zeta sqrt(k) r, in 1/s
 
-        Above the sampled-data limit (one or two times the tick rate), the motion would swing
-        from tick to tick. The method reduces m until r is so small that the damping keeps its
-        margin to this limit, at the least k that the search considers.
+        Above the sampled-data limit (one or two times the tick rate), the motion would
+        oscillate from tick to tick. This method reduces m until the damping keeps its margin to
+        this limit at the smallest k that the search considers.
 
-        Only those joints matter that take part in the lightest motion, the one with the ratio
-        r. The m of the joint with the largest participation is multiplied by a factor below 1,
-        and that of another joint by the factor to the power of its relative participation.
-        Since another motion may then be the lightest, this is repeated in small steps.
+        Only joints that take part in the lightest motion (the one with the ratio r) need to be
+        changed. The m of the joint with the largest participation is multiplied by a factor
+        below 1, and that of any other joint by this factor to the power of its relative
+        participation. Afterwards another motion may be the lightest, so this is repeated in
+        small steps.
         """
         damping_per_inertia_per_s = 2.0 * self._damping * math.sqrt(self._least_k)
         damping_with_margin_per_s = damping_per_inertia_per_s * self._margin
@@ -493,7 +491,7 @@ class _GainSearch:
 
         Returns:
             The largest eigenvalue of m M^-1 over the poses, where M is the inertia matrix; and
-            the participation of each joint in that motion, shape (n,), with the sum 1.
+            the participation of each joint in that motion, shape (n,), which adds up to 1.
         """
         # m M^-1 has the eigenvalues of the symmetric matrix m^(1/2) M^-1 m^(1/2).
         root = np.sqrt(self.inertia)
@@ -748,7 +746,7 @@ class _GainSearch:
 
 
 def _write_control_line(law: str, gains: Mapping[str, Sequence[float]]) -> str:
-    """Returns the line of a scenario that selects a law with these gains.
+    """Returns the scenario line that selects a law with these gains.
 
     Args:
         law: Name of the law.
@@ -875,15 +873,15 @@ def tune_arm(
 def _tabulate_joints(
     scenario: Scenario, inertia: Array, gains: Mapping[str, list[float]]
 ) -> list[dict[str, Any]]:
-    """Returns the inertia and the control gains of each joint of an arm, with units.
+    """Returns the inertia and the gains of each joint of an arm, with units.
 
-    A row also has the position error at which the spring reaches the torque limit of the joint.
-    This error is `None` for a joint without a limit. See `ArmGains.joints`.
+    Each row also contains the position error at which the spring reaches the torque limit of
+    the joint, or `None` if the joint has no limit. See `ArmGains.joints`.
 
     Args:
         scenario: Scenario with the arm.
         inertia: Inertia m of each joint, shape (n,).
-        gains: Values of each gain, one per joint, by the name of the gain.
+        gains: Mapping from gain name to values, one per joint.
     """
     first_site = scenario.names[0]
     arm_model = scenario.arms[first_site]

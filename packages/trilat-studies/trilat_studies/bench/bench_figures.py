@@ -35,38 +35,39 @@ FIGURES_OF_BENCH = {
     "effort": ("effort, N m", "effort_nm"),
     "stiffness": ("stiffness at the hand, N/m", "stiffness_n_m"),
 }
-"""Label and quantity of each figure. The figure of the judgements has no quantity."""
+"""Label and quantity of each figure. The figure of verdicts has no quantity."""
 JUDGEMENTS = {
     Stability.NOT_STABLE: "#a23b53",
     Stability.OPEN: "#e2c044",
     Stability.SETTLED: "#8fb8de",
     Stability.STABLE: "#1f5a99",
 }
-"""Colour of each judgement, from the worst to the best. The best judgements are blue."""
+"""Colour of each verdict, from worst to best. The best verdicts are blue."""
 _WIDTH_IN = 7.0
 """Width of a figure in inches, equal to two columns of a paper."""
 _ROW_IN = 0.14
 """Height of a row, in inches."""
 _HEAD_IN = 0.65
-"""Height of the labels below all panels, in inches. The title of a panel takes half of it."""
+"""Height of the labels below all panels, in inches. The title of a panel takes up half of it.
+"""
 _TEXT_PT = 5.5
 _PALETTE = "cividis"
 _NONE = "#a23b53"
-"""Colour of cells without a number.
+"""Colour of cells with no value.
 
-A number is missing if the slave touched no wall, the arms did not come to rest, or a run
+A value is missing if the slave touched no wall, the arms did not come to rest, or a run
 diverged.
 """
 
 
 def _list_figures_with_values(results: BenchResults) -> list[str]:
-    """Lists the figures of a benchmark for which the results contain at least one number.
+    """Lists the figures for which the results contain at least one value.
 
     Args:
-        results: The results of the benchmark, which compares control laws.
+        results: The results of the benchmark.
 
     Returns:
-        Names of figures that `_draw_bench` can draw. Empty if there are no numbers at all.
+        Names of figures that `_draw_bench` can draw. May be empty.
     """
     names = []
     for name in FIGURES_OF_BENCH:
@@ -77,14 +78,14 @@ def _list_figures_with_values(results: BenchResults) -> list[str]:
 
 
 def _collect_fields(results: BenchResults, name: str) -> dict[str, Array]:
-    """Collects the numbers of a figure, as one array of laws and links for each panel.
+    """Collects the values shown in a figure, as one array of laws and links per panel.
 
     Args:
         results: The results of the suite.
         name: Name of the figure, a key of `FIGURES_OF_BENCH`.
 
     Returns:
-        For each task an array of shape (laws, links). A missing number is NaN.
+        For each task, an array of shape (laws, links). A missing value is NaN.
     """
     _, quantity = FIGURES_OF_BENCH[name]
     tasks = list(results.plan.tasks)
@@ -95,7 +96,7 @@ def _collect_fields(results: BenchResults, name: str) -> dict[str, Array]:
 
 
 def _draw_bench(results: BenchResults, name: str) -> Figure:
-    """Draws one of the figures that compare the control laws of the benchmark.
+    """Draws one of the figures that compare the control laws.
 
     Args:
         results: The results of the suite.
@@ -150,12 +151,12 @@ def _draw_bench(results: BenchResults, name: str) -> Figure:
 
 
 def _choose_scale(fields: list[Array]) -> Normalize:
-    """Returns a logarithmic colour scale from the smallest to the largest number of a figure.
+    """Returns a logarithmic colour scale that spans all values of a figure.
 
-    All panels have the same scale. If there are no numbers, the scale goes from 0.1 to 1.
+    All panels share this scale. If there are no values, the scale extends from 0.1 to 1.
 
     Args:
-        fields: The numbers of the panels. NaN is ignored.
+        fields: The values in each panel. NaN is ignored.
     """
     numbers_of_fields = []
     for field in fields:
@@ -171,10 +172,10 @@ def _choose_scale(fields: list[Array]) -> Normalize:
 
 
 def _list_laws(results: BenchResults, task: str) -> list[tuple[str, str]]:
-    """Lists the control laws that have results in a task, one per row of the figure's panel.
+    """Lists the laws that have results in a task, which are the rows of the figure's panel.
 
     Returns:
-        Pairs of the name of a law and the form of the suite in which it runs.
+        Pairs of the name of a law and the kind of scenario in which it runs.
     """
     rows = []
     for law, form in results.plan.laws:
@@ -185,17 +186,15 @@ def _list_laws(results: BenchResults, task: str) -> list[tuple[str, str]]:
 
 
 def _collect(results: BenchResults, task: str, quantity: str) -> Array:
-    """Collects the mean values by which the fields of one panel of a figure are coloured.
-
-    A field belongs to a control law (row) and a network link (column).
+    """Collects the values that determine the colours in one panel of a figure.
 
     Args:
         results: The results of the benchmark.
         task: The task of the panel.
-        quantity: The quantity. If empty, the judgement is used.
+        quantity: The quantity. If empty, the verdict is used.
 
     Returns:
-        The numbers, shape (laws, links). A missing number is NaN.
+        The values, shape (laws, links). A missing value is NaN.
     """
     laws = _list_laws(results, task)
     links = results.plan.links
@@ -212,15 +211,15 @@ def _collect(results: BenchResults, task: str, quantity: str) -> Array:
 
 
 def _compute_number(result: BenchCellResult, quantity: str) -> float | None:
-    """Returns the number by which a field of a figure is coloured: a mean or a judgement.
+    """Returns the value that determines the colour of a cell: a mean or a verdict.
 
     Args:
         result: Result of one law in one task over one link.
-        quantity: Quantity whose mean is returned. If empty, the index of the judgement in
+        quantity: Quantity whose mean is returned. If empty, the index of the verdict in
             `JUDGEMENTS` is returned.
 
     Returns:
-        The number. `None` if the runs lack the quantity.
+        The value, or `None` if the runs lack the quantity.
     """
     if not quantity:
         return list(JUDGEMENTS).index(result.judgement)
@@ -229,7 +228,7 @@ def _compute_number(result: BenchCellResult, quantity: str) -> float | None:
 
 
 def _label_laws(axes: Axes, results: BenchResults, task: str) -> None:
-    """Writes the names of control laws beside the rows of a panel of the figure.
+    """Labels the rows of a panel with the names of the control laws.
 
     Args:
         axes: The panel.
@@ -245,9 +244,10 @@ def _label_laws(axes: Axes, results: BenchResults, task: str) -> None:
 
 
 def _mark_cells(axes: Axes, results: BenchResults, task: str) -> None:
-    """Marks fields of a figure whose mean value hides runs that are not stable, or are open.
+    """Marks cells of a figure whose mean includes runs that are not stable or are open.
 
-    A cross marks a run that is not stable, and a dot a run whose stability is open.
+    A cross marks a cell with a run that is not stable, and a dot one with a run whose stability
+    is open.
 
     Args:
         axes: The panel.

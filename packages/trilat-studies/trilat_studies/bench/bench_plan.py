@@ -39,13 +39,13 @@ from ..tuning.search_space import SEARCH_SPACES, ModelInformation, SearchSpace
 from ..tuning.tuning_plan import CandidateSearch, plan_tuning
 
 Settings = Mapping[str, Any]
-"""Overrides of a scenario by key."""
+"""Scenario overrides, by key."""
 
 BASES = {"three": "_bench_three", "two": "_bench_two", "level": "_bench_two"}
-"""Name of the scenario of each form of the suite.
+"""Maps each kind of scenario in the suite to the name of the shipped scenario.
 
-The form "three" has two masters and a slave, "two" has a master and a slave. The form "level"
-has the same two sites, but the arms lie in a level plane, so gravity does not act on them.
+"three" has two masters and a slave; "two" has a master and a slave. "level" has the same two
+sites, but with the arms in a horizontal plane, so gravity does not act on them.
 """
 _OUT = (-0.4557864690179811, 1.3957985827210313)
 """Joint angles in rad at which the end effector is 0.30 m further out than at the start.
@@ -72,11 +72,11 @@ _WALL = {
 _CUT_S = (2.0, 5.0)
 """Start and end of the outage in the task `outage`, in s."""
 _BURST_SAMPLES = 100.0
-"""Mean number of samples that are lost in succession."""
+"""Mean number of consecutive samples that are lost."""
 _FIRST = 0.75
-"""Parameter a of `_build_dominance` with which the first user leads, as before a handover."""
+"""Parameter a of `_build_dominance` while the first user dominates, as before a handover."""
 _SECOND = 0.25
-"""Parameter a of `_build_dominance` with which the second user leads, as after a handover."""
+"""Parameter a of `_build_dominance` while the second user dominates, as after a handover."""
 
 
 def _build_hand(
@@ -87,7 +87,7 @@ def _build_hand(
     Args:
         to_rad: Joint angles of the pose, in rad.
         move_start_s: Time at which the motion starts, in s.
-        keys: Further keys of the table.
+        keys: Additional keys for the table.
     """
     return {
         **_HAND,
@@ -101,14 +101,11 @@ def _build_hand(
 def _build_dominance(a: float) -> dict[str, dict[str, float]]:
     """Returns the scenario table of the dominance factors of two users and a slave.
 
-    A dominance factor is the weight with which an arm follows another arm.
-
     Args:
         a: Dominance factor of the first user over the slave. The second user has 1 - a.
 
     Returns:
-        The factors other than 0, by the name of the arm and by the name of the arm that it
-        follows.
+        The nonzero factors, by the name of the arm and by the name of the arm that it follows.
     """
     factors_by_arm = {
         "m1": {"m2": 1.0 - a, "s": a},
@@ -126,12 +123,12 @@ class _BenchTask(NamedTuple):
 
     Attributes:
         about: Description of the task for the user.
-        settings: Overrides of a shipped scenario. With them, the scenario describes the task.
-        users: Number of users that the task needs.
-        cut_s: Time interval, in s, during which the slave arm has no connection to any other
-            arm. `None` if no connection fails.
+        settings: Overrides that turn a shipped scenario into the task.
+        users: Number of users that the task requires.
+        cut_s: Time interval, in s, during which the slave arm is disconnected from all other
+            arms. `None` if no connection fails.
         duration_s: Time from the start over which errors and efforts are measured, in s. A run
-            lasts at least as long.
+            lasts at least this long.
         gravity: Ratio of the gravity parameters that the laws get to the true gravity
             parameters.
     """
@@ -193,8 +190,8 @@ def _build_constant_links() -> dict[str, Settings]:
     """Returns the links of the benchmark with a constant delay, with and without losses.
 
     Returns:
-        The scenario keys of each link, by a name such as "rtt68-loss50": a round trip of 68 ms,
-        in which half of the samples are lost.
+        The scenario keys of each link, by name. For example, "rtt68-loss50" has a round trip of
+        68 ms and loses half of the samples.
     """
     links: dict[str, Settings] = {}
     for percent in GRID_LOSSES_PERCENT:
@@ -211,63 +208,63 @@ def _build_constant_links() -> dict[str, Settings]:
 
 
 LINKS: dict[str, Settings] = _build_constant_links()
-"""Keys of all links, by name. Losses come in bursts of 0.1 s."""
+"""Scenario overrides of each link, by name. Losses come in bursts of 0.1 s."""
 LINKS |= {name: {"preset": name} for name in ("4g", "5g", "geo")}
 LINKS["trace"] = {"model": "trace", "file": "busy_machine.csv", "at_end": "loop"}
 
 _MEAN_MS = {"geo": 300.0}
-"""Mean one-way delays, in ms, of presets with long delays.
+"""Mean one-way delays of presets with long delays, in ms.
 
-Over these links `ROUND_TRIPS` round trips take longer than the tasks, so the runs are longer.
+Over these links, `ROUND_TRIPS` round trips take longer than the tasks, so the runs are longer.
 """
 
 SHORTER_REACH: Settings = {"sites.m1.hands": [_build_hand(_LESS_OUT)]}
-"""Overrides that give the task `contact` a shorter reach.
+"""Overrides that shorten the reach in the task `contact`.
 
-The stiffness at the hand is computed from the difference between both reaches.
+The stiffness at the hand is computed from the difference between the two reaches.
 """
 
 EQUAL_LAWS = {"six_channel": "four_channel"}
-"""Laws that the suite leaves out, each with the law of the suite that computes the same torque.
+"""Laws that the suite omits, each mapped to the law of the suite that computes the same torque.
 
 `six_channel` is `four_channel` with a check that all dominance factors are functions of one
-parameter. All tasks have such factors, because a task has the same factors for all laws. With
-other factors, `six_channel` would be compared in a different task.
+parameter. This is true of every task, since a task has the same factors for all laws. Using
+`six_channel` with other factors would amount to comparing it in a different task.
 """
 _ROLES = ("master", "master", "slave")
 _TUNED_LAWS = {
     name: law for name, law in BUILT_IN.items() if law.tune and name not in EQUAL_LAWS
 }
 LAWS_OF_ANY = tuple(name for name, law in _TUNED_LAWS.items() if not law.explain_misfit(_ROLES))
-"""Names of the tuned laws that fit two users and a slave."""
+"""Names of the tuned laws that can be used with two users and a slave."""
 LAWS_OF_TWO = tuple(name for name in _TUNED_LAWS if name not in LAWS_OF_ANY)
-"""Names of the tuned laws that fit two sites only."""
+"""Names of the tuned laws that can be used with two sites only."""
 TUNED_ROUND_TRIPS_MS = (68, 272, 1088)
-"""Round trips at which every law is tuned, in ms."""
+"""Network round trips for which every law is tuned, in ms."""
 TUNING_TASK = "contact"
 """The task in which laws are tuned.
 
 The tuning also runs it without the wall, as free motion.
 """
 _OTHER_TUNING_TASKS = {("three", "sync"): "free"}
-"""Laws that are tuned in another task, by the form of the suite and the name of the law.
+"""Laws that are tuned in another task, by kind of scenario and name of the law.
 
 Under gravity, the arms can rest only at q = 0 with the law `sync`. The wall keeps the slave
-away from this pose, so the arms do not come to rest in `contact` with any gains.
+away from this pose, so no gains bring the arms to rest in `contact`.
 """
 
 
 class _BenchStudy(NamedTuple):
     """A named part of the benchmark: a selection of tasks, control laws and links.
 
-    The study runs every law in every task over every link, except where a law does not fit a
-    task.
+    The study runs every law in every task over every link, except where a law is not suitable
+    for a task.
 
     Attributes:
         about: Purpose of the study.
         tasks: Names of the tasks.
-        laws: Names of the control laws. The keys name the kind of scenario in which the laws
-            run, such as "two" for two arms, and are keys of `BASES`.
+        laws: Names of the control laws, by the kind of scenario in which they run (a key of
+            `BASES`, such as "two" for two arms).
         links: Names of the links, keys of `LINKS`.
         seeds: Number of runs of a law in a task over a link with random delays or losses. Over
             a link without randomness, the law runs once.
@@ -285,7 +282,9 @@ _GRID = tuple(name for name in LINKS if name.startswith("rtt"))
 _LOSSY = ("rtt68-loss50", "rtt136-loss50", "rtt544-loss50")
 _COARSE = tuple(name for name in LINKS if "-loss" not in name or name in _LOSSY)
 FULL_SEEDS = 1
-"""Number of runs over a random link in the large studies. Two cores then take about an hour."""
+"""Number of runs over a random link in the large studies, which take about an hour on two
+cores.
+"""
 STUDIES = {
     "full": _BenchStudy(
         about="all laws in all tasks",
@@ -314,7 +313,7 @@ STUDIES = {
 
 
 ROUND_TRIPS = 40
-"""Least duration of a run, in round trips of its link."""
+"""Minimum duration of a run, in round trips of its link."""
 
 
 def build_settings(form: str, task: str, link: str, seed: int | None = None) -> dict[str, Any]:
@@ -355,17 +354,17 @@ def build_settings(form: str, task: str, link: str, seed: int | None = None) -> 
 
 
 GAINS_FILE = Path(str(resources.files("trilat_studies.bench") / "bench_gains.json"))
-"""File of the tuned gains, which is part of the program."""
+"""File of the tuned gains, which ships with the program."""
 KNOWLEDGE = ModelInformation()
-"""Knowledge of the laws about the arms during the tuning: all laws know gravity exactly."""
+"""Model information available to the laws in the tuning: all laws know gravity exactly."""
 TUNING_BUDGET = 16
 """Number of candidates per gain of a law, at each round trip."""
 TUNING_MARGIN = 1.5
 """Factor by which delays may grow without making the selected gains unstable."""
 MARGIN_LENGTHS = 3.0
-"""Factor by which the run with longer delays is longer than the tuning run.
+"""Ratio of the duration of the run with longer delays to that of the tuning run.
 
-With an equally long run, a law whose arms come to rest slowly would appear to be unstable.
+With equal durations, a law whose arms come to rest slowly would appear to be unstable.
 """
 
 
@@ -442,23 +441,23 @@ def load_tuning_task(form: str, law: str, round_trip_ms: int) -> TuningScenario:
 
 
 TUNING_VERSION = 2
-"""Number of the procedure. Gains that an earlier procedure has tuned are out of date.
+"""Version of the tuning procedure. Gains tuned with an earlier version are out of date.
 
-Since the second procedure, a law may define its own objective.
+Since the second version, a law may define its own objective.
 """
 
 
 def _probe_law(task: TuningScenario, space: SearchSpace) -> str:
-    """Runs a law in a tuning task with fixed gains, and returns its error and effort as a text.
+    """Runs a law in its tuning task with fixed gains, and formats its error and effort.
 
-    The text shows whether the law still moves the arms as it did when its gains were tuned. A
-    digest of the source code is no substitute, because it also changes with a comment, a name
-    or an import.
+    The string reveals whether the law still moves the arms as it did when its gains were tuned.
+    A digest of the source code would not do, because it also changes with a comment, a name or
+    an import.
 
     Args:
         task: The task in which the law was tuned.
-        space: The law and the ranges of its gains. Each gain has the middle of its range, on a
-            logarithmic scale if the range does not begin at zero.
+        space: The law and the ranges of its gains. Each gain is set to the middle of its range,
+            on a logarithmic scale unless the range begins at zero.
     """
     gains = {}
     for gain in space.knobs:
@@ -524,13 +523,13 @@ def choose_round_trip(mean_ms: float) -> int:
 
 
 def _has_margin(form: str, round_trip_ms: int, search: CandidateSearch, candidate: int) -> bool:
-    """Returns True if a candidate comes to rest at the pose even if delays are longer.
+    """Returns True if a candidate still comes to rest at the pose with longer delays.
 
     Delays are multiplied by `TUNING_MARGIN`, and the run lasts `MARGIN_LENGTHS` times as long.
 
     Args:
         form: Kind of scenario in which the law runs, a key of `BASES`.
-        round_trip_ms: Round trip of the tuning, in ms.
+        round_trip_ms: Round trip for which the law is tuned, in ms.
         search: The search that tried the candidate.
         candidate: Index of the candidate in the search. Its gains are used unchanged.
     """
@@ -594,15 +593,15 @@ def tune_laws(
 def _tune_law(
     form: str, law: str, round_trip_ms: int, jobs: int | None, on: Workers, budget: int
 ) -> TunedGains:
-    """Tunes the gains of one control law for one round trip of the network.
+    """Tunes the gains of one control law for one network round trip.
 
     Args:
         form: Kind of scenario in which the law runs, a key of `BASES`.
         law: Name of the law.
         round_trip_ms: Round trip of the links, in ms.
         jobs: Number of processes.
-        on: Cluster that tries the gains.
-        budget: Number of choices of gains to try, per gain of the law.
+        on: Cluster that evaluates the gains.
+        budget: Number of gain vectors to try, per gain of the law.
     """
     base = load_tuning_task(form, law, round_trip_ms)
     gain_count = len(SEARCH_SPACES[law].knobs)
@@ -617,11 +616,11 @@ def _tune_law(
 
 
 def _select_gains(form: str, round_trip_ms: int, search: CandidateSearch) -> TunedGains:
-    """Selects the candidate with the smallest error that stays stable if delays grow.
+    """Selects the candidate with the smallest error that stays stable with longer delays.
 
     Args:
         form: Kind of scenario in which the law runs, a key of `BASES`.
-        round_trip_ms: Round trip of the tuning, in ms.
+        round_trip_ms: Round trip for which the law is tuned, in ms.
         search: The finished search of one law.
     """
     law = search.space.law
@@ -788,8 +787,8 @@ class BenchPlan(NamedTuple):
 def _load_base_text(form: str) -> str:
     """Returns the TOML text of a shipped scenario of the benchmark, with all defaults.
 
-    The text enters the fingerprint of tuned gains, because gains that were tuned with other
-    defaults are out of date.
+    The text is part of the fingerprint of tuned gains, because gains become out of date when a
+    default changes.
 
     Args:
         form: Kind of scenario, a key of `BASES`.
@@ -854,13 +853,13 @@ def plan_bench(
 
 
 def _explain_no_cells(tasks: Sequence[str], laws: Sequence[str], without: list[str]) -> str:
-    """Returns the error text if the user has selected laws that run in no selected task.
+    """Returns the error message for a selection of laws that run in none of the selected tasks.
 
     Args:
         tasks: Names of the selected tasks.
         laws: Names of the selected laws.
         without: Tunings of these laws that found no gains. Empty if the reason is that the laws
-            do not fit the tasks.
+            are not suitable for the tasks.
     """
     law_names = ", ".join(laws)
     if without:
@@ -875,7 +874,7 @@ def _explain_no_cells(tasks: Sequence[str], laws: Sequence[str], without: list[s
 
 
 NO_GAINS = "no gains"
-"""Reason for a missing cell: the tuning of the law found no gains."""
+"""Reason for a missing cell: the tuning found no gains for the law."""
 
 
 def explain_no_cell(law: str, form: str, task: str) -> str:
@@ -907,7 +906,7 @@ def explain_no_cell(law: str, form: str, task: str) -> str:
 
 @cache
 def _gets_gravity(form: str, law: str) -> bool:
-    """Returns True if a law uses the gravity parameters that the benchmark gives to it.
+    """Returns True if a law uses the gravity parameters that the benchmark passes to it.
 
     A law that takes the exact model of the arm cannot run in a task with wrong parameters.
 
@@ -930,9 +929,10 @@ def _list_cells(
     links: Sequence[str],
     seeds: int,
 ) -> Iterator[BenchCell]:
-    """Yields a cell, one law in one task over one link, for all selected names.
+    """Yields the cells for all combinations of the selected tasks, laws and links.
 
-    Tasks that a law does not fit are left out. Cells whose tuning found no gains are included.
+    Tasks for which a law is not suitable are skipped. Cells whose tuning found no gains are
+    included.
 
     Args:
         study: The study.
@@ -969,7 +969,7 @@ def _list_cells(
 def _find_gains(
     gains: Mapping[tuple[str, str, int], TunedGains], form: str, law: str, delay_ms: float
 ) -> TunedGains:
-    """Returns the tuned gains with which a law runs over a link.
+    """Looks up the tuned gains that a law uses over a link.
 
     Args:
         gains: All tuned gains, by form, law and round trip in ms.
@@ -978,7 +978,7 @@ def _find_gains(
         delay_ms: Mean one-way delay of the link, in ms.
 
     Raises:
-        UsageError: The law has not been tuned at that delay.
+        UsageError: The law has not been tuned for that delay.
     """
     round_trip_ms = choose_round_trip(2.0 * delay_ms)
     tuned = gains.get((form, law, round_trip_ms))
@@ -991,14 +991,13 @@ def _find_gains(
 
 
 def _analyse_link(link: str) -> tuple[bool, float]:
-    """Determines whether a link of the benchmark is random, and how long its delay is.
+    """Determines the mean delay of a link of the benchmark, and whether the link is random.
 
     Args:
         link: A key of `LINKS`.
 
     Returns:
-        True if the delays or losses of the link are random.
-        The mean one-way delay of the link, in ms.
+        True if the delays or losses of the link are random; and its mean one-way delay, in ms.
     """
     settings = format_settings({"link": dict(LINKS[link])})
     scenario = TuningScenario.load(BASES["two"], settings).scenario
@@ -1013,13 +1012,13 @@ def _select_names(
     default: Sequence[str],
     known: Sequence[str] | None = None,
 ) -> list[str]:
-    """Returns the checked names of an option, or the default if the user gave no names.
+    """Returns the names given for an option, or the default if the user gave none.
 
     Args:
         option: The option, without its dashes.
         names: Names from the user.
-        default: Names that replace an empty selection.
-        known: Names that exist. If `None`, these are the names in `default`.
+        default: Names to use if the user gave none.
+        known: Valid names. If `None`, those in `default`.
 
     Raises:
         UsageError: A name is unknown.
@@ -1030,7 +1029,7 @@ def _select_names(
 
 
 def _check_name(option: str, name: str, known: Sequence[str]) -> str:
-    """Returns a name that the user gave to an option, after a check that it is known.
+    """Returns the name given for an option, or raises UsageError if it is unknown.
 
     Raises:
         UsageError: The name is unknown. The message suggests a similar name.

@@ -28,19 +28,19 @@ from ..side_by_side import describe_runs_alone
 from .bench_plan import STUDIES, TASKS, BenchCell, BenchPlan, TunedGains, explain_no_cell
 
 LEAST_CONTACT_N = 1.0
-"""Smallest mean force of the wall, in N, at which the slave counts as touching the wall.
+"""Smallest mean wall force, in N, at which the slave is considered to touch the wall.
 
 The mean is taken over the last quarter of the task.
 """
 PASSIVE_J = -1e-3
-"""Limit of `BenchRun.energy_j`, in J, at or above which a run counts as passive.
+"""Value of `BenchRun.energy_j`, in J, at or above which a run counts as passive.
 
-It is not 0, because the energy is a numerical integral.
+It is slightly below 0, because the energy is a numerical integral.
 """
 CONFIRMATION_LENGTHS = 2.0
-"""Factor by which the repetition of a run that is not stable is longer than the run."""
+"""Ratio of the duration of a confirming repetition to that of the original run."""
 LEAST_SEEDS = 20
-"""Smallest number of runs for which an interval is computed."""
+"""Smallest number of runs for which a confidence interval is computed."""
 
 
 def name_run(key: str, to_s: float) -> str:
@@ -426,7 +426,7 @@ class BenchResults(Result):
 
 
 def _list_used_gains(results: BenchResults) -> list[TunedGains]:
-    """Returns the tuned gains with which the control laws were simulated, without repetitions.
+    """Returns the tuned gains used in the simulations, without duplicates.
 
     Several tasks and network links may share the same gains.
     """
@@ -435,14 +435,14 @@ def _list_used_gains(results: BenchResults) -> list[TunedGains]:
 
 
 def _confirm_run(runs: dict[tuple[str, int], BenchRun], cell: BenchCell, seed: int) -> BenchRun:
-    """Returns a run, or its repetition over twice the duration if there is a repetition.
+    """Returns a run, or its repetition over twice the duration if there is one.
 
-    A run that is not stable is repeated. The longer run decides, and its values are used.
+    A run that is not stable is repeated. The longer run is decisive, and its values are used.
 
     Args:
         runs: All finished runs, by the name of the cell in the journal and by seed.
         cell: The law, task, link and gains of the runs.
-        seed: Seed of the run.
+        seed: Random seed of the run.
     """
     run = runs[cell.key, seed]
     if not run.needs_confirmation:
@@ -468,22 +468,22 @@ _PRINTED_LINKS = (
     "geo",
     "trace",
 )
-"""Links that tables show if there are too many links for the width of a page."""
+"""Links shown in tables when there are too many for the width of a page."""
 OPEN_MARK = "?"
-"""Mark of a cell in tables: the stability of at least one run is open."""
+"""Mark in a table cell if the stability of at least one run is open."""
 UNSTABLE_MARK = "!"
-"""Mark of a cell in tables: at least one run is not stable."""
+"""Mark in a table cell if at least one run is not stable."""
 
 
 def _list_quantities(results: BenchResults) -> list[tuple[str, str]]:
-    """Lists the measured quantities that are printed for each task.
+    """Lists the tables of measured quantities that are printed for the tasks.
 
     Args:
-        results: Results of the benchmark or of a part of it.
+        results: Results of the benchmark or of part of it.
 
     Returns:
-        Pairs of the name of a task that ran and the name of a quantity, a key of `QUANTITIES`.
-        Each pair is printed as a table.
+        One pair per table: the name of a task that ran and the name of a quantity, a key of
+            `QUANTITIES`.
     """
     tasks = results.plan.tasks
     pairs = [(task, quantity) for quantity in _QUANTITIES_OF_ALL for task in tasks]
@@ -506,13 +506,13 @@ def name_law(law: str, form: str) -> str:
 
 
 def _tabulate_verdicts(results: BenchResults) -> TextTable:
-    """Returns a table of the number of links over which each law is stable, for each task.
+    """Returns a table with the number of links over which each law is stable, for each task.
 
-    The table has a row per law and a column per task. An entry has four counts: the links over
-    which the law is stable, only settles, is undecided (open), and is not stable.
+    The table has one row per law and one column per task. An entry contains four counts: the
+    links over which the law is stable, only settled, open (undecided) and not stable.
 
     Args:
-        results: Results of the suite or of a part of it.
+        results: Results of the suite or of part of it.
     """
     tasks = results.plan.tasks
     rows = []
@@ -527,14 +527,13 @@ def _count_verdicts(results: BenchResults, law: str, form: str, task: str) -> st
     """Counts the links over which a law is stable, settled, open and not stable, for a table.
 
     Args:
-        results: Results of the benchmark or of a part of it.
+        results: Results of the benchmark or of part of it.
         law: Name of the control law.
         form: Kind of scenario in which the law runs, a key of `BASES`.
         task: Name of the task.
 
     Returns:
-        A text such as "12 / 0 / 1 / 3". If the law did not run in the task, the text is the
-        reason.
+        A string such as "12 / 0 / 1 / 3", or the reason why the law did not run in the task.
     """
     judgements = [result.judgement for result in results.select(task, law)]
     if not judgements:
@@ -543,14 +542,14 @@ def _count_verdicts(results: BenchResults, law: str, form: str, task: str) -> st
 
 
 def _tabulate_properties(results: BenchResults, task: str) -> TextTable:
-    """Returns a table of the properties of a task's runs: a row per law.
+    """Returns a table of the properties of a task's runs, with one row per law.
 
-    There is a column per property, such as passivity. An entry such as 3/12 means that all runs
-    over 3 of the 12 links have the property. Two more columns show the smallest energy, and the
-    number of links over which the slave did not touch the wall.
+    There is one column per property, such as passivity. An entry such as 3/12 means that all
+    runs over 3 of the 12 links have the property. Two more columns show the smallest energy,
+    and the number of links over which the slave did not touch the wall.
 
     Args:
-        results: Results of the suite or of a part of it.
+        results: Results of the suite or of part of it.
         task: A task that ran.
     """
     headers = (
@@ -575,7 +574,7 @@ def _tabulate_properties(results: BenchResults, task: str) -> TextTable:
 
 
 def _describe_properties(law_results: Sequence[BenchCellResult]) -> list[str]:
-    """Returns the properties of a control law in a task, as entries of a row of a table.
+    """Returns the properties of a control law in a task, as entries of a table row.
 
     Args:
         law_results: The results of the law in the task, one per link.
@@ -605,10 +604,10 @@ def _describe_properties(law_results: Sequence[BenchCellResult]) -> list[str]:
 
 
 def _format_least_energy(law_results: Sequence[BenchCellResult]) -> str:
-    """Returns the smallest energy of some results in J, as an entry of a table.
+    """Formats the smallest energy of some results, in J, as a table entry.
 
     Returns:
-        The energy as text. A dash if all cells have a run that diverged.
+        The energy, or a dash if all cells contain a run that diverged.
     """
     energies_j = [result.energy_j for result in law_results if result.energy_j is not None]
     if not energies_j:
@@ -621,14 +620,14 @@ def _format_least_energy(law_results: Sequence[BenchCellResult]) -> str:
 
 
 def _tabulate_quantity(results: BenchResults, task: str, quantity: str) -> TextTable:
-    """Returns a table of the mean of a quantity: a row per control law, a column per link.
+    """Returns a table of the mean of a quantity, with one row per law and one column per link.
 
-    The mean is over the runs of the law with different random seeds. An entry has a mark if not
-    all of its runs are stable. A law that cannot run in the task has no row. If there are many
+    The mean is taken over the runs with different random seeds. An entry is marked if not all
+    of its runs are stable. A law that cannot run in the task has no row. If there are many
     links, only some of them have a column.
 
     Args:
-        results: Results of the benchmark or of a part of it.
+        results: Results of the benchmark or of part of it.
         task: Name of a task that ran.
         quantity: Name of the quantity, a key of `QUANTITIES`.
     """
@@ -649,7 +648,7 @@ def _tabulate_quantity(results: BenchResults, task: str, quantity: str) -> TextT
 
 
 def _describe_result(result: BenchCellResult, quantity: str) -> str:
-    """Returns the mean of a quantity as an entry of a table, or the reason why it has no mean.
+    """Returns the table entry for the mean of a quantity, or the reason why there is no mean.
 
     Args:
         result: The result of a cell.
@@ -675,13 +674,13 @@ def _describe_result(result: BenchCellResult, quantity: str) -> str:
 def _tabulate_round_trips(results: BenchResults) -> TextTable:
     """Returns a table that shows how the error of each law grows with delay and with losses.
 
-    A row is a task and a control law. Its columns are the error at the shortest round trip,
-    the error at the longest round trip divided by the error at the shortest, and the error
-    with losses divided by the error without losses. The published study that the study
-    "round-trips" repeats reports the same effects.
+    Each row is a task and a control law. The columns are the error at the shortest round trip,
+    the ratio of the error at the longest round trip to that at the shortest, and the ratio of
+    the error with losses to that without. The study "round-trips" repeats a published study
+    that reports the same effects.
 
     Args:
-        results: Results of the benchmark or of a part of it.
+        results: Results of the benchmark or of part of it.
     """
     rows = []
     for task in results.plan.tasks:
@@ -712,8 +711,8 @@ def _tabulate_round_trips(results: BenchResults) -> TextTable:
 def _find_error(results: BenchResults, task: str, law: str, link: str) -> float | None:
     """Returns the mean position error of a law in a task over a link, in rad.
 
-    The result is `None` if the law did not run over this link, or if an arm left its limits or
-    did not touch the wall.
+    `None` if the law did not run over this link, or if an arm left its limits or did not touch
+    the wall.
     """
     result = results.find(task, law, link)
     mean = None if result is None else result.compute_mean("error_rad")
@@ -721,9 +720,9 @@ def _find_error(results: BenchResults, task: str, law: str, link: str) -> float 
 
 
 def _format_ratio(numerator: float | None, denominator: float | None) -> str:
-    """Returns a ratio of two means as a table cell with three digits.
+    """Formats the ratio of two means as a table entry with three digits.
 
-    The cell is "-" if a mean is missing, or if the denominator is 0.
+    The entry is "-" if a mean is missing or the denominator is 0.
     """
     if numerator is None or not denominator:
         return "-"
@@ -733,10 +732,10 @@ def _format_ratio(numerator: float | None, denominator: float | None) -> str:
 def _describe_bench(results: BenchResults) -> Iterator[str]:
     """Yields lines that introduce the results.
 
-    The lines name the study, its runs, its tasks, and the laws that did not run.
+    They state the study, the number of runs, the tasks, and the laws that did not run.
 
     Args:
-        results: Results of the suite or of a part of it.
+        results: Results of the suite or of part of it.
     """
     plan = results.plan
     cells = count_nouns(len(plan.cells), "cell")
@@ -771,11 +770,11 @@ def _tabulate_gains(results: BenchResults) -> TextTable:
     """Returns a table of the gains of each law at each round trip, and how they were selected.
 
     The column "stable" shows the number of stable candidates and of all candidates. The column
-    "without margin" shows the number of candidates with smaller errors that were rejected
-    because they are not stable when delays grow.
+    "without margin" counts the candidates that had smaller errors but were rejected because
+    they are not stable when delays grow.
 
     Args:
-        results: Results of the suite or of a part of it.
+        results: Results of the suite or of part of it.
     """
     tunings = {str(gains): gains for gains in _list_used_gains(results)}
     tunings |= {str(gains): gains for gains in results.plan.without}
@@ -798,14 +797,14 @@ def _tabulate_gains(results: BenchResults) -> TextTable:
 _FORMER_KEYS = ("reflected", "reflected_half", "observed", "least_j")
 """Keys of quantities that are no longer measured.
 
-They stay in the JSON with the value null, because keys are never removed
+They remain in the JSON with the value null, because keys are never removed
 (docs/reference/json.md).
 """
 _CELL_COLUMNS = ("task", "law", "link", "form")
 
 
 def _build_cell_columns(cell: BenchCell) -> dict[str, Any]:
-    """Returns the columns that identify a result in a table: task, law, link and form.
+    """Returns the columns that identify a cell in a table: task, law, link and form.
 
     The form is the kind of scenario: how many arms, and whether gravity acts on them.
     """
@@ -813,10 +812,10 @@ def _build_cell_columns(cell: BenchCell) -> dict[str, Any]:
 
 
 def _build_row(result: BenchCellResult) -> dict[str, Any]:
-    """Returns the results of one law in one task over one link, as a row of a table.
+    """Returns the results of one cell as a table row for JSON and CSV.
 
-    The row has judgements, and means with intervals, for JSON and CSV. Unknown values are
-    `None`, for example the force of the wall in a task without a wall.
+    The row contains verdicts, and means with intervals. Values that do not exist are `None`,
+    for example the force of the wall in a task without a wall.
 
     Args:
         result: Results of the cell.
