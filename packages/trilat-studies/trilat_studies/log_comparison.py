@@ -27,11 +27,11 @@ from trilat_net.work import MeanInterval
 from .tuning.candidate import check_final_posture
 
 _MOST_REASONS = 6
-"""Largest number of reasons for missing metrics that the text lists."""
+"""Largest number of reasons for missing metrics that the report lists."""
 MOST_METRICS = 10
-"""Largest number of metrics in the short text."""
+"""Largest number of metrics in the short report."""
 _ROUNDING_KEYS = ("unaccounted_j",)
-"""Keys of metrics that consist of rounding errors."""
+"""Keys of metrics that consist only of rounding errors."""
 _NEGLIGIBLE = {
     "": 0.01,
     "s": 0.1,
@@ -45,18 +45,18 @@ _NEGLIGIBLE = {
     "N²m²s": 1.0,
     "J": 0.1,
 }
-"""Magnitude below which a value is negligible for a person who moves an arm, by unit.
+"""For each unit, the magnitude below which a value is negligible for a person moving an arm.
 
-A force of 0.1 N and a distance of 1 mm can hardly be felt or seen. Without such a scale,
-a change from 0 to 0.06 N m would count as much as a change from 0 to 10 N m.
+A force of 0.1 N and a distance of 1 mm can hardly be felt or seen. Without such a scale, a
+change from 0 to 0.06 N m would count as much as a change from 0 to 10 N m.
 """
 _UNDELAYED_KEYS = ("undelayed_max_rad", "undelayed_max_m")
-"""Keys of the metrics of the largest distance from the peers' positions at the same time."""
+"""Keys of the metrics for the largest distance from the peers' positions at the same time."""
 _SUBJECTS = {
     "max": "largest of {}s",
     "sum": "sum of {}s",
 }
-"""How a run's value is computed from those of its sites, links or walls, by `reduction`."""
+"""Describes how the value of a run is computed from those of its parts, by `reduction`."""
 
 
 class _ComparisonRow(NamedTuple):
@@ -228,7 +228,7 @@ class LogComparison(Result):
             yield f"to see the runs together: trilat figure {first} {files}"
 
     def _compose_differences(self) -> Iterator[Block]:
-        """Yields a table of the differences between the experiments, with a row per difference.
+        """Yields a table with one row per difference between the scenarios.
 
         If the names of the scenarios differ, a sentence states this. If nothing differs, a
         sentence replaces the table.
@@ -250,7 +250,7 @@ class LogComparison(Result):
         """Returns a phrase with each arm's largest distance from its peers' true positions.
 
         The ordinary errors compare an arm with the delayed states that it has received from its
-        peers (the other arms). A longer delay therefore hardly changes these errors.
+        peers, and therefore hardly change with a longer delay.
         """
         texts = []
         for row in self.metrics.rows:
@@ -267,7 +267,7 @@ class LogComparison(Result):
         )
 
     def _sum_up(self, rows: Sequence[_ComparisonRow]) -> str:
-        """Returns a sentence with the judgement of each run and the quantity that differs most.
+        """Returns a sentence with the verdict on each run and the quantity that differs most.
 
         Args:
             rows: The metrics that differ most.
@@ -293,7 +293,7 @@ class LogComparison(Result):
         return text
 
     def _explain_missing_values(self) -> Iterator[str]:
-        """Yields a sentence for each metric that applies to a log but has no value there.
+        """Yields one sentence per metric that applies to a log but has no value there.
 
         Example: "b: no settling time: the arms were still moving". Metrics that do not apply,
         such as those of a wall in a run without one, need no explanation.
@@ -395,8 +395,7 @@ def _measure_difference(row: _ComparisonRow) -> float:
         row: The metric in each run.
 
     Returns:
-        The relative difference. It is 0 if fewer than two values are known, or if all values
-        are negligible.
+        The relative difference, or 0 if fewer than two values are known or all are negligible.
     """
     known_values = [value for value in row.values if value is not None]
     largest = max(map(abs, known_values), default=0.0)
@@ -409,10 +408,10 @@ def _measure_difference(row: _ComparisonRow) -> float:
 def _select_most_different(
     rows: Sequence[_ComparisonRow], shown_keys: Sequence[str]
 ) -> list[_ComparisonRow]:
-    """Returns the metrics that differ most between runs, in their order.
+    """Selects the metrics that differ most between runs, and returns them in table order.
 
-    Metrics that consist of rounding errors are left out, because these errors differ in every
-    run. Metrics whose values are all negligible come last.
+    Metrics that consist of rounding errors are excluded, because they differ in every run.
+    Metrics whose values are all negligible come last.
 
     Args:
         rows: The metrics of the runs.
@@ -434,9 +433,9 @@ def _select_most_different(
 
 
 def _name_columns(files: Sequence[Path]) -> list[str]:
-    """Returns a short and distinct name for the column of each log.
+    """Returns a short and distinct column name for each log.
 
-    The name is the file's name without its suffix, preceded by as many of its folders as are
+    Each name is the file name without its suffix, preceded by as many of its folders as are
     needed to distinguish all files.
 
     Args:
@@ -465,8 +464,8 @@ def _average_repeats(
         metrics: Their metrics.
 
     Returns:
-        The mean of each row, or `None` if it cannot be computed. The list is empty if the logs
-        differ in more than their seeds.
+        The mean of each row, or `None` where it cannot be computed. Empty if the logs differ in
+        more than their seeds.
     """
     first = logs[0].scenario
     seeds = {log.scenario.seed for log in logs}
@@ -487,7 +486,7 @@ def _tabulate_quantities(
     Args:
         metrics: The metrics.
         columns: Names of the logs.
-        means: Mean of each row, for an additional column. Empty if there is no such column.
+        means: Mean of each row, for an additional column. May be empty.
     """
     rows: list[list[str]] = []
     mean_by_row = dict(zip(metrics, means, strict=True)) if means else {}

@@ -51,10 +51,9 @@ from trilat_net.scenario import (
 )
 
 BATCH_RECORDS = 1000
-"""Number of records of a site in a batch."""
+"""Number of records per batch of a site."""
 _VECTORS = ("q", "qd", "q_des", "tau", "tau_x", "x")
-"""Vectors of a record from which `_build_batch` builds a batch, in the order of its arguments.
-"""
+"""Vectors of a record that `_build_batch` takes, in the order of its arguments."""
 
 
 class RecordBatch(NamedTuple):
@@ -151,17 +150,17 @@ class RecordBatch(NamedTuple):
 
 
 def _build_batch(axes: Sequence[float], t_ns: Ints, used: Ints, *vectors: Array) -> RecordBatch:
-    """Builds a batch, and computes the error e against the reference of the site.
+    """Builds a batch and computes the error e against the reference of the site.
 
     In task space, the error is the difference between the pose of the end effector and its
     reference. Otherwise it is the difference between the joint angles and their reference.
 
     Args:
-        axes: For each task coordinate, 1 if the site follows its peers along it, otherwise 0.
+        axes: For each task coordinate, 1 if the site follows its peers along it, 0 otherwise.
         t_ns: Nominal times, shape (K,), in ns.
         used: Samples in use, shape (K, P), as in `RecordBatch`.
-        vectors: The arrays q, qd, q_des, tau, tau_x and x, shape (K, ...) each. The pose x of
-            the end effector is empty if the sites agree on joint angles.
+        vectors: The arrays q, qd, q_des, tau, tau_x and x, each of shape (K, ...). The pose x
+            of the end effector is empty if the sites agree on joint angles.
     """
     q, qd, q_des, tau, tau_x, x = vectors
     in_task_space = x.size > 0
@@ -264,7 +263,7 @@ def run_compiled_in_batches(
 
 
 class _CompiledRun:
-    """A simulation by compiled code that passes the results on in batches of records.
+    """A run in the compiled loop that passes on its records in batches.
 
     Args:
         scenario: Scenario to run.
@@ -372,18 +371,18 @@ class WholeRun(NamedTuple):
 
 
 _RECORD_ROWS = 1 << BATCH_RECORDS.bit_length()
-"""Number of records that runs side by side keep, a power of two above `BATCH_RECORDS`."""
+"""Number of records kept by runs side by side, a power of two above `BATCH_RECORDS`."""
 
 
 def _finish_together(compiled: Sequence[_CompiledRun]) -> Iterator[tuple[int, str]]:
-    """Simulates several runs to their ends, as many as possible at once.
+    """Simulates several runs to their ends, as many at once as possible.
 
     Args:
         compiled: The runs.
 
     Yields:
-        The index of a finished run; and the property because of which it was computed alone, or
-        an empty text.
+        The index of a finished run, and the reason why it was computed alone (an empty string
+        if it was not).
     """
     # A single run must not load the code of lanes.
     from trilat_net.core import RunGroup
@@ -402,12 +401,12 @@ def _finish_together(compiled: Sequence[_CompiledRun]) -> Iterator[tuple[int, st
 def _join_run(
     scenario: Scenario, run: FusedRun, batches: Mapping[str, Sequence[RecordBatch]]
 ) -> WholeRun:
-    """Joins the batches of records of a finished run, and judges how the run ends.
+    """Joins the batches of records of a finished run and judges how the run ends.
 
     Args:
         scenario: Its scenario.
         run: The run.
-        batches: Batches of the records of each site.
+        batches: Batches of records of each site.
     """
     records = {}
     buckets = []
@@ -510,7 +509,7 @@ class WindowStats:
         self._peaks[key] = max(previous, largest)
 
     def _add_wall_force(self, force: Array) -> None:
-        """Updates the statistics of the force that walls exert on an arm, within the interval.
+        """Updates the statistics of the wall force on the arm within the window.
 
         A hit is a record with contact that follows a record without contact.
 
@@ -673,10 +672,10 @@ class SiteStats:
             del self._tail[0]
 
     def _add_ages(self, rows: RecordBatch) -> None:
-        """Updates the statistics of the ages of the samples (received states) in use.
+        """Updates the statistics of the ages of the samples in use.
 
-        The age of a sample is the time since its peer sent it. Records from before the first
-        sample of a peer do not count.
+        The age of a sample is the time since its peer sent it. Records from before a peer's
+        first sample are not counted.
 
         Args:
             rows: The next records of the arm.
@@ -957,14 +956,14 @@ def _compute_run_metrics(
     late_samples: int,
     missing: int,
 ) -> RunMetrics:
-    """Computes quantities about a whole run from the statistics of its arms.
+    """Computes the metrics of a complete run from the statistics of its sites.
 
     Args:
-        scenario: Scenario to run: arms, control laws, links and duration.
+        scenario: Scenario of the run.
         site_stats: Statistics of each site, in the order of the scenario.
         diverged_at_s: Time at which the first site left the limits of its arm, in s. `None` if
             no site did.
-        late_samples: Number of samples (states that a site sent) that arrived too late.
+        late_samples: Number of samples that arrived too late.
         missing: Number of ticks without a record.
 
     Returns:
@@ -1032,7 +1031,7 @@ def _compute_run_metrics(
 
 
 def _list_end_poses(site_stats: Mapping[str, SiteStats]) -> dict[str, tuple[float, ...]]:
-    """Returns the last joint angles of each arm, in rad, by the name of its site.
+    """Returns the last joint angles of each arm, in rad, by site name.
 
     Args:
         site_stats: Statistics of the sites, each of which has records.
@@ -1048,7 +1047,7 @@ def _list_end_poses(site_stats: Mapping[str, SiteStats]) -> dict[str, tuple[floa
 def _list_link_ages(
     scenario: Scenario, site_stats: Mapping[str, SiteStats]
 ) -> dict[str, LinkAge]:
-    """Returns the ages of the samples in use on each link, by the name of the link.
+    """Returns the ages of the samples in use on each link, by link name.
 
     Args:
         scenario: Scenario of the run.
@@ -1065,13 +1064,13 @@ def _list_link_ages(
 def _find_synchronisation_s(site_stats: Sequence[SiteStats]) -> float | None:
     """Returns the time from which all sites stay synchronised until the end, in s.
 
-    A site is synchronised while its error |e| is below the limit of [expect].
+    A site is synchronised while its error |e| is below the limit in [expect].
 
     Args:
         site_stats: Statistics of all sites, each of which has records.
 
     Returns:
-        The time. `None` if a site is not synchronised in its last record.
+        The time, or `None` if a site is not synchronised in its last record.
     """
     if any(stats.unsynchronised_ns == stats.last_ns for stats in site_stats):
         return None
@@ -1082,15 +1081,15 @@ def _find_synchronisation_s(site_stats: Sequence[SiteStats]) -> float | None:
 def _merge_windows(windows: Sequence[WindowStats | None]) -> dict[str, Range]:
     """Combines the statistics of a window over all sites to which the window applies.
 
-    If the window applies to a single site, the ranges are those of this site. Otherwise only
-    quantities that can be compared between sites are kept, each with its largest value.
+    If this is a single site, its ranges are returned. Otherwise only quantities that can be
+    compared between sites are kept, each with its largest value.
 
     Args:
         windows: Statistics of each site within the window. `None` for a site to which the
             window does not apply.
 
     Returns:
-        Ranges by the keys of a window of [expect].
+        Ranges, by the keys of a window of [expect].
     """
     site_ranges = []
     for window in windows:
@@ -1110,17 +1109,17 @@ def _merge_windows(windows: Sequence[WindowStats | None]) -> dict[str, Range]:
 
 
 def _compute_end_spread_rad(ends: Sequence[RecordBatch]) -> float | None:
-    """Returns the largest difference between sites in the angle of a joint in the last second.
+    """Returns the largest difference of a joint angle between sites in the last second, in rad.
 
-    Sites may have different tick rates. Therefore each record of the first site is compared
-    with the latest record of every other site at that time.
+    Since tick rates may differ between sites, each record of the first site is compared with
+    the latest record of every other site at that time.
 
     Args:
         ends: Records of the last second, one batch per site.
 
     Returns:
-        The difference in rad. `None` if a site has no records in the last second, or if the
-        arms have different numbers of joints.
+        The difference, or `None` if a site has no records in the last second or the arms have
+        different numbers of joints.
     """
     if not all(len(end.t_ns) for end in ends):
         return None
@@ -1145,17 +1144,17 @@ def _compute_end_spread_rad(ends: Sequence[RecordBatch]) -> float | None:
 
 
 NEEDS_LOG = "metrics that need a log"
-"""Reason why a run cannot be computed together with others: its metrics need its whole log."""
+"""Reason why a run cannot be computed together with others: its metrics need a complete log."""
 
 
 class _EvenBatches:
-    """Passes records on in batches of `BATCH_RECORDS`, from batches of any size.
+    """Regroups records from batches of any size into batches of `BATCH_RECORDS`.
 
-    Equal batches are needed because the last bits of a mean depend on them, and sites with
-    different tick rates produce batches of different lengths.
+    The last bits of a mean depend on the batch size, and sites with different tick rates
+    produce batches of different lengths.
 
     Args:
-        receive: Function that receives the batches.
+        receive: Called with each batch.
     """
 
     def __init__(self, receive: Callable[[RecordBatch], None]) -> None:
@@ -1195,7 +1194,7 @@ class _MeasuredRun:
 
     Attributes:
         compiled: The run in the compiled loop. `None` if the loop cannot simulate it.
-        obstacle: Reason why the compiled loop cannot simulate the run. Otherwise empty.
+        obstacle: Reason why the compiled loop cannot simulate the run. Empty if it can.
     """
 
     def __init__(self, scenario: Scenario) -> None:
@@ -1275,11 +1274,10 @@ class ExpectationResult(msgspec.Struct, frozen=True):
 
 
 def _evaluate_stability(expect: Expect, metrics: RunMetrics) -> Iterator[ExpectationResult]:
-    """Yields whether the run is as stable as the key `stable` of the scenario expects.
+    """Yields whether the run is as stable as the scenario's key `stable` requires.
 
-    A run that diverged is also evaluated if the scenario does not state the key. A single run
-    cannot prove stability. "settled" is therefore the best possible judgement, and counts as
-    stable.
+    A run that diverged is also reported if the scenario does not state the key. Since a single
+    run cannot prove stability, "settled" is the best possible verdict and counts as stable.
 
     Args:
         expect: Table [expect] of the scenario.
@@ -1304,11 +1302,11 @@ def _read_metric(key: str, metrics: RunMetrics) -> float | None:
     """Returns the metric that a key of [expect] limits.
 
     The key contains the name of the metric: "peak_error_max_rad" limits `peak_error_rad`, and
-    "synchronised_by_s" limits `synchronised_at_s`. Keys in ms limit the ages of samples
-    (received states), and the worst link counts.
+    "synchronised_by_s" limits `synchronised_at_s`. Keys in ms limit the sample ages on the
+    worst link.
 
     Returns:
-        The metric. `None` if the run does not have it, or if a link never delivered a sample.
+        The metric, or `None` if the run does not have it or a link never delivered a sample.
     """
     is_age = key.endswith("_ms")
     if not is_age:
@@ -1359,7 +1357,7 @@ def _evaluate_poses(expect: Expect, metrics: RunMetrics) -> Iterator[Expectation
     """Compares the final pose of each arm with the pose that the scenario expects.
 
     Yields:
-        An outcome for each site with an expected pose. The joint with the largest error counts.
+        One result per site with an expected pose, for the joint with the largest error.
     """
     tolerance_rad = expect.end_pose_within_rad
     for site, expected in expect.end_pose_rad.items():
@@ -1388,7 +1386,7 @@ def _evaluate_poses(expect: Expect, metrics: RunMetrics) -> Iterator[Expectation
 
 
 def _evaluate_windows(expect: Expect, metrics: RunMetrics) -> Iterator[ExpectationResult]:
-    """Yields the outcome of each quantity that a window of the table [expect] limits.
+    """Yields the result for each quantity limited by a window of the table [expect].
 
     A window is a period of the run, such as 9 s to 15 s, with limits of its own.
 
@@ -1407,9 +1405,10 @@ def _evaluate_windows(expect: Expect, metrics: RunMetrics) -> Iterator[Expectati
 
 
 def _evaluate_metrics(expect: Expect, metrics: RunMetrics) -> Iterator[ExpectationResult]:
-    """Yields the outcome of each metric that the table [expect] limits, such as "path_m".
+    """Yields the result for each metric limited by the table [expect], such as "path_m".
 
-    A metric that cannot be computed fails its limit, with the reason in place of a value.
+    A metric that cannot be computed fails its limit, and the reason is reported in place of a
+    value.
 
     Args:
         expect: Table [expect] of the scenario.
@@ -1443,10 +1442,10 @@ def _compare_with_range(
             it, which fails the expectation.
         limits: Lower and upper limit.
         unit: Unit of the quantity.
-        missing_text: Text in place of a missing value.
+        missing_text: Text to show in place of a missing value.
 
     Returns:
-        The outcome. Its margin is relative to half the width of the permitted range.
+        The result. Its margin is relative to half the width of the permitted range.
     """
     least, most = limits
     limit_text = f"{least:g} to {most:g} {unit}".rstrip()

@@ -18,17 +18,17 @@ from trilat_net.core import Array
 from trilat_net.scenario import ArmModel
 
 PLANAR_MARGIN = 0.01
-"""Fraction of a planar arm's length by which a position must lie inside its reach, so that no
-goal requires a straight arm.
+"""Minimum distance of a position from the limit of a planar arm's reach, as a fraction of the
+arm's length, so that no goal requires a straight arm.
 """
 FOUND_WITHIN_M = 1e-3
-"""Distance from the position at which the search succeeds, in m."""
+"""Distance from the position at which the search is successful, in m."""
 _STEPS = 40
-"""Largest number of steps of the search."""
+"""Maximum number of search steps."""
 _PROBE_RAD = 1e-6
-"""Step of the numerical derivative, in rad or m."""
+"""Step size of the numerical derivative, in rad or m."""
 _DAMPING = 1e-3
-"""Damping of the least squares, in m^2."""
+"""Damping of the least-squares step, in m^2."""
 _LARGEST_STEP_RAD = 0.5
 """Largest change of a joint in one step, in rad or m."""
 
@@ -57,11 +57,11 @@ def can_reach(arm: ArmModel, start_rad: Sequence[float] | Array, position_m: Arr
 
 
 def _find_pose(arm: ArmModel, q: Array, position_m: Array) -> bool:
-    """Searches for a pose within the joint limits with the end effector at a given position.
+    """Searches for a pose within the joint limits that places the end effector at a position.
 
     Each step moves the joints by damped least squares (Wampler 1986): with the Jacobian J and
-    the distance e from the position, the step is J' (J J' + d I)^-1 e. The damping d keeps the
-    step finite near singular poses. Then the joints are clipped to their limits.
+    the remaining displacement e, the step is J' (J J' + d I)^-1 e. The damping d keeps the step
+    finite near singular poses. The joints are then clipped to their limits.
 
     Args:
         arm: A chain.

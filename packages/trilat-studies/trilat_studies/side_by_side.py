@@ -16,10 +16,10 @@ from trilat_net.scenario import Scenario
 K = TypeVar("K", bound=Hashable)
 
 LANE_SITE_TICKS = 100_000_000
-"""Least number of site ticks for which a study compiles code that computes runs side by side.
+"""Smallest number of site ticks for which a study compiles the code for side-by-side runs.
 
-The compilation takes about ten seconds per kind of site. The code then saves about 0.4 us per
-site tick.
+The compilation takes about ten seconds per kind of site, after which the code saves about 0.4
+us per site tick.
 """
 
 

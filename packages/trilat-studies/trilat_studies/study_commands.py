@@ -142,10 +142,10 @@ def _list_trials(
     """Lists the trials of a test: each scenario with each seed.
 
     Args:
-        sources: Names or paths of the scenarios. If empty, all shipped scenarios that have
-            expectations are selected.
+        sources: Names or paths of the scenarios. If empty, all shipped scenarios with
+            expectations.
         seeds: The seeds. If empty, each scenario's own seed is used.
-        overrides: Overrides of all scenarios.
+        overrides: Overrides that apply to all scenarios.
         live: True if the trials run live over a network.
     """
     from trilat_net.scenario import list_shipped, load_scenario
@@ -163,14 +163,14 @@ def _list_trials(
 
 
 def _run_virtual(trials: "list[Trial]", jobs: int | None, on: str | None) -> "TrialReport":
-    """Runs trials in virtual time, and shows their progress.
+    """Runs trials in virtual time and shows their progress.
 
-    In a terminal, the progress is a bar. Otherwise it is a line for each scenario whose trials
-    have all ended.
+    In a terminal, progress is shown as a bar. Otherwise one line is printed per scenario when
+    all of its trials have ended.
 
     Args:
         trials: The trials.
-        jobs: Number of processes. If `None`, there is one per core.
+        jobs: Number of processes. If `None`, one per core.
         on: Address of a Dask scheduler that executes the trials instead.
     """
     from .trials import run_trials
@@ -201,7 +201,7 @@ def _run_virtual(trials: "list[Trial]", jobs: int | None, on: str | None) -> "Tr
 def _run_live(trials: "list[Trial]") -> "TrialReport":
     """Runs trials live, one after the other, and evaluates their logs.
 
-    Live sessions share the processors and ports of the machine, so they do not run side by
+    Live sessions share the processors and ports of the machine, so they cannot run side by
     side.
 
     Args:
@@ -224,14 +224,14 @@ def _run_live(trials: "list[Trial]") -> "TrialReport":
 
 
 def _run_in_own_folder(scenario: "Scenario", label: str, folder_name: str) -> "SessionResult":
-    """Runs a scenario live, and stores its results in a new folder.
+    """Runs a scenario live and stores its results in a new folder.
 
-    Results of several scenarios do not replace each other.
+    A separate folder per scenario keeps results from overwriting each other.
 
     Args:
         scenario: The scenario.
         label: Name of the run in the printed line.
-        folder_name: Name of the folder, to which a number is added.
+        folder_name: Name of the folder, to which a number is appended.
 
     Raises:
         typer.Exit: The session was interrupted.
@@ -261,8 +261,8 @@ def _run_tuning(
 
     Args:
         plan: The laws and the procedure.
-        folder: Folder of the results. If `None`, the next free folder is used.
-        jobs: Number of processes. If `None`, there is one per core.
+        folder: Folder for the results. If `None`, the next free folder is used.
+        jobs: Number of processes. If `None`, one per core.
         on: Address of a Dask scheduler that executes the runs instead.
         force: True to replace existing files.
         as_json: True to print the result as JSON.
@@ -462,14 +462,14 @@ def tune_command(
 
 
 def _measure_delay(text: str, reach: options.Reach) -> str:
-    """Returns a delay as `tune_arm` accepts it, and measures it if it names a running session.
+    """Converts a delay to the form that `tune_arm` accepts, measuring that of a live session.
 
-    The delay of a session is the delay of its slowest link. If the session measures no link, it
-    is half of the longest round trip from this machine. Both are 99th percentiles.
+    The delay of a session is that of its slowest link. If the session measures no link, half of
+    the longest round trip from this machine is used. Both are 99th percentiles.
 
     Args:
         text: A delay such as "40ms", a file, or "measured:SESSION".
-        reach: The options by which the command reaches the session.
+        reach: Options that specify how to connect to the session.
     """
     name = text.removeprefix("measured:")
     names_session = name != text and not name.endswith(".mcap")
@@ -500,16 +500,16 @@ def _measure_delay(text: str, reach: options.Reach) -> str:
 
 
 def _tune_bench(laws: list[str], study: str, jobs: int | None, on: str | None) -> None:
-    """Tunes the control laws of a study of the benchmark, and stores their gains.
+    """Tunes the control laws of a benchmark study and stores their gains.
 
-    The file of the gains is part of the program. The gains of each law are stored as soon as
-    they are tuned. Gains that are up to date are kept, so that the same command continues an
-    interrupted tuning.
+    The gains of each law are stored as soon as they are tuned, in the gains file of the
+    program. Gains that are up to date are kept, so the same command continues an interrupted
+    tuning.
 
     Args:
-        laws: Names of the laws. If empty, all laws of the study are selected.
+        laws: Names of the laws. If empty, all laws of the study.
         study: Name of the study.
-        jobs: Number of processes. If `None`, there is one per core.
+        jobs: Number of processes. If `None`, one per core.
         on: Address of a Dask scheduler that executes the runs instead.
 
     Raises:
@@ -550,11 +550,11 @@ def _tune_bench(laws: list[str], study: str, jobs: int | None, on: str | None) -
 def _run_bench(
     folder: "BenchFolder", jobs: int | None, on: str | None, *, confirm: bool
 ) -> "BenchResults":
-    """Runs the benchmark in its folder. On Ctrl-C it prints how to continue.
+    """Runs the benchmark in its folder. On Ctrl-C, prints how to continue.
 
     Args:
         folder: Folder of the benchmark.
-        jobs: Number of processes. If `None`, there is one per core.
+        jobs: Number of processes. If `None`, one per core.
         on: Address of a Dask scheduler that executes the runs instead.
         confirm: Accepted for older commands, see `run_bench`.
     """

@@ -28,10 +28,10 @@ Axes = str | Sequence[str] | Mapping[str, Any]
 
 
 def _list_override_texts(overrides: Overrides, duration_s: float | None) -> list[str]:
-    """Returns overrides as texts KEY=VALUE, as on the command line.
+    """Converts overrides to strings KEY=VALUE, as on the command line.
 
     Args:
-        overrides: Overrides by key, or a text or texts KEY=VALUE.
+        overrides: Mapping from key to value, or one or more strings KEY=VALUE.
         duration_s: Duration of the run in s, which becomes the last override. If `None`, no
             such override is added.
     """

@@ -79,23 +79,24 @@ BOUND_RAD_S = 5.0
 In addition, no joint of such a run moves more than `THROWN_RAD` away from its start.
 """
 REST_S = 2.0
-"""Shortest time, in s, for which the arms of a converged run stay at their final poses.
+"""Shortest time for which the arms of a converged run stay at their final poses, in s.
 
 All joints stay within `SETTLED_ERROR_RAD` of their final angles.
 """
 TIME_CONSTANTS = 6.0
-"""Duration of a run whose judgement needs more time, in units of its slowest time constant."""
+"""Duration of a run that needs more time for a verdict, in units of its slowest time constant.
+"""
 MAX_RUN_TICKS = 3_000_000
 """Largest number of ticks, over all sites, to which a run is extended.
 
-It is a safety limit for the memory: three sites at 1 kHz reach it after 1000 s, when their
-records take a quarter of a gigabyte. A repetition over twice the length may take twice as many.
+This limits the memory use: three sites at 1 kHz reach it after 1000 s, when their records take
+up a quarter of a gigabyte. A repetition over twice the length may take twice as many ticks.
 """
 STIFFNESS_S = 2.0
 """Time after the first contact at which the stiffness is measured, in s.
 
-Laws that integrate an error in contact become stiffer with time, so the result of a later
-measurement would depend on its time.
+Laws that integrate an error in contact become stiffer with time, so the time of the measurement
+must be fixed.
 """
 STIFFNESS_WINDOW_S = 0.2
 """Duration over which positions and forces are averaged for the stiffness, in s."""
@@ -104,9 +105,10 @@ IMPEDANCE_HZ = 1.0
 IMPEDANCE_PERIODS = 4
 """Number of periods over which the impedance is measured."""
 SHAKING_N = 0.5
-"""Amplitude of the force with which the user's arm is shaken for the impedance, in N.
+"""Amplitude of the force that shakes the user's arm to measure the impedance, in N.
 
-It is half of the least force of the wall that counts as contact, so the slave keeps contact.
+At half of the smallest wall force that counts as contact, it does not make the slave lose
+contact.
 """
 
 
@@ -222,11 +224,11 @@ class JudgedRun(NamedTuple):
 
 
 LANE_RUNS = 16
-"""Number of runs that a worker computes side by side. All their records are in memory."""
+"""Number of runs that a worker computes side by side, with all of their records in memory."""
 
 
 def _run_bench_tasks(items: Sequence[BenchRunItem]) -> Iterator[BenchRun]:
-    """Executes several runs of the benchmark, side by side where that is possible.
+    """Executes several benchmark runs, side by side where possible.
 
     Args:
         items: The runs to execute.
@@ -251,7 +253,7 @@ def _run_bench_tasks(items: Sequence[BenchRunItem]) -> Iterator[BenchRun]:
 
 
 def _build_scenario(item: BenchRunItem) -> Scenario:
-    """Returns the scenario of a run of the benchmark, with the duration of the run.
+    """Returns the scenario of a benchmark run, with the duration of the run.
 
     Args:
         item: The run to execute.
@@ -263,12 +265,12 @@ def _build_scenario(item: BenchRunItem) -> Scenario:
 
 
 def _measure_item(item: BenchRunItem, scenario: Scenario, whole: WholeRun) -> BenchRun:
-    """Judges a run of the benchmark and measures its performance, see `BenchRunItem.run`.
+    """Judges a benchmark run and measures its performance, see `BenchRunItem.run`.
 
     Args:
         item: The run.
         scenario: Its scenario, with the duration of the run.
-        whole: Its records.
+        whole: The simulated run, with its records.
     """
     cell = item.cell
     judged = _judge_records(scenario, whole)
@@ -304,7 +306,7 @@ def _measure_item(item: BenchRunItem, scenario: Scenario, whole: WholeRun) -> Be
 
 
 def _judge_records(scenario: Scenario, whole: WholeRun) -> JudgedRun:
-    """Decides whether a simulated run is stable, see `JudgedRun.simulate`.
+    """Judges the stability of a simulated run, see `JudgedRun.simulate`.
 
     Args:
         scenario: Its scenario, with the duration of the run.
@@ -326,13 +328,12 @@ def _judge_records(scenario: Scenario, whole: WholeRun) -> JudgedRun:
 
 
 def _compute_longest_s(scenario: Scenario) -> float:
-    """Returns the longest duration for which a run may be extended to judge it, in s.
+    """Returns the longest duration to which a run may be extended for its verdict, in s.
 
-    After this time all sites together have computed `MAX_RUN_TICKS` ticks, periods of their
-    control loops.
+    After this time, all sites together have computed `MAX_RUN_TICKS` ticks.
 
     Args:
-        scenario: The scenario, whose sites have tick rates.
+        scenario: The scenario, which defines the tick rates of its sites.
     """
     ticks_per_s = sum(site.rate_hz for site in scenario.sites.values())
     return MAX_RUN_TICKS / ticks_per_s
@@ -341,8 +342,8 @@ def _compute_longest_s(scenario: Scenario) -> float:
 def _find_slowest_s(judged: JudgedRun) -> float:
     """Returns the slowest time constant of a run, in s, or 0 if nothing decays.
 
-    It is the time constant of the slowest root of the loop. If the loop has no roots, it is the
-    time constant of the slowest decay of an envelope of the motion, or of a push in a twin.
+    This is the time constant of the slowest root of the loop. If the loop has no roots, it is
+    that of the slowest decay of an envelope of the motion, or of a push in a twin.
     """
     root_per_s = judged.roots.rate_per_s
     if root_per_s is not None:
@@ -360,12 +361,12 @@ def _measure(run: BenchRun, judged: JudgedRun, duration_s: float) -> BenchRun:
     """Measures the errors, efforts, forces and energies of a run.
 
     Args:
-        run: The run without these numbers.
+        run: The run before these quantities are filled in.
         judged: The same run with its records.
         duration_s: Time over which errors, efforts and forces are measured, in s.
 
     Returns:
-        The run with the numbers, see `BenchRun`.
+        The run with the measured quantities, see `BenchRun`.
     """
     scenario = judged.scenario
     all_records = judged.records
@@ -416,10 +417,10 @@ def _measure(run: BenchRun, judged: JudgedRun, duration_s: float) -> BenchRun:
 def _is_bounded(scenario: Scenario, records: dict[str, RecordBatch]) -> bool:
     """Returns True if no joint was thrown far away or became too fast in a run.
 
-    A run can be judged as settled and still be unusable, because an arm has swung round.
+    Even a run judged as settled can be unusable, because an arm has swung round.
 
     Args:
-        scenario: The scenario, which has the start angles.
+        scenario: The scenario, which defines the start angles.
         records: All records of the run, by site.
     """
     for name, record in records.items():
@@ -434,11 +435,11 @@ def _is_bounded(scenario: Scenario, records: dict[str, RecordBatch]) -> bool:
 
 
 def _compute_hand_torque(scenario: Scenario, name: str, record: RecordBatch) -> Array:
-    """Computes the torque of the operators on the joints of an arm.
+    """Computes the joint torque that the operators exert on an arm, in N m.
 
-    The records contain -tau_x, the sum of all external torques. This sum includes the viscous
-    friction -D qd of the joints, which is removed by adding D qd. Forces of walls are not
-    removed: the function is meant for arms that touch no wall.
+    The records contain -tau_x, the sum of all external torques. It includes the viscous
+    friction -D qd of the joints, which this function removes by adding D qd. Wall forces are
+    not removed, so the arm must not touch a wall.
 
     Args:
         scenario: The scenario.
@@ -446,7 +447,7 @@ def _compute_hand_torque(scenario: Scenario, name: str, record: RecordBatch) -> 
         record: The records of the site.
 
     Returns:
-        The torque in N m, shape (records, joints).
+        The torque, shape (records, joints).
     """
     operator_torque: Array = -record.tau_x
     for part in scenario.sites[name].environment:
@@ -488,13 +489,13 @@ def find_least_energy(records: dict[str, RecordBatch]) -> float:
 
 
 def _find_settled_s(records: dict[str, RecordBatch]) -> float | None:
-    """Finds the time from which every joint stays at its final angle.
+    """Finds the time from which every joint stays at its final angle, in s.
 
     Args:
         records: All records of the run, by site.
 
     Returns:
-        The time in s. `None` if it is less than `REST_S` before the end of the run, because the
+        The time, or `None` if it is less than `REST_S` before the end of the run, because the
         arms may then still be moving.
     """
     settled_s = 0.0
@@ -514,12 +515,12 @@ def _measure_contact(run: BenchRun, item: BenchRunItem, judged: JudgedRun) -> Be
     """Measures the stiffness and the impedance that the user feels at the wall.
 
     Args:
-        run: The run without these numbers.
+        run: The run before these quantities are filled in.
         item: The run of the task `contact`, as it was executed.
         judged: The same run with its records.
 
     Returns:
-        The run with the numbers that could be measured.
+        The run with those quantities that could be measured.
     """
     contact_s = _find_contact_s(judged.scenario, judged.records)
     if contact_s is None:
@@ -540,10 +541,10 @@ def _measure_contact(run: BenchRun, item: BenchRunItem, judged: JudgedRun) -> Be
 def _find_contact_s(scenario: Scenario, records: dict[str, RecordBatch]) -> float | None:
     """Returns the time at which the slave first touches a wall, in s, or `None` if it does not.
 
-    The rendered stiffness is measured a fixed time after this contact.
+    The rendered stiffness is measured at a fixed time after this contact.
 
     Args:
-        scenario: Scenario of the run, with the walls.
+        scenario: Scenario of the run, which defines the walls.
         records: Records of each site.
     """
     record = records[SLAVE]
@@ -560,7 +561,7 @@ def _find_contact_s(scenario: Scenario, records: dict[str, RecordBatch]) -> floa
 def _run_variant(
     item: BenchRunItem, settings: Settings, duration_s: float
 ) -> tuple[Scenario, dict[str, RecordBatch]] | None:
-    """Executes a benchmark run with other settings, without a judgement.
+    """Executes a benchmark run with other settings, without judging it.
 
     The difference between two variants, for example with and without a sine, shows a response.
 
@@ -570,7 +571,7 @@ def _run_variant(
         duration_s: Duration, in s.
 
     Returns:
-        The scenario and its records. `None` if the run diverged.
+        The scenario and its records, or `None` if the run diverged.
     """
     built = item.cell.build(item.seed)
     overrides = (*built.overrides, *format_settings(settings))
@@ -583,20 +584,20 @@ def _run_variant(
 def _estimate_stiffness(
     item: BenchRunItem, judged: JudgedRun, contact_s: float
 ) -> float | None:
-    """Estimates the stiffness that the user feels along the normal of the wall.
+    """Estimates the stiffness that the user feels along the normal of the wall, in N/m.
 
-    The same run is executed with a shorter reach of the user. The stiffness is the difference
-    between the forces, divided by the difference between the positions of the user's arm. In
-    each run, force and position are measured `STIFFNESS_S` after the first contact.
+    The run is repeated with a shorter reach of the user. The stiffness is the difference
+    between the two forces divided by the difference between the two positions of the user's
+    arm. In each run, force and position are measured `STIFFNESS_S` after the first contact.
 
     Args:
         item: The run with the longer reach.
         judged: The same run with its records.
-        contact_s: Time of the first contact of the longer reach, in s.
+        contact_s: Time of the first contact in this run, in s.
 
     Returns:
-        The stiffness in N/m. `None` if one of the runs ends earlier than `STIFFNESS_S` after
-        its first contact, or has no contact.
+        The stiffness, or `None` if one of the runs has no contact or ends earlier than
+        `STIFFNESS_S` after it.
     """
     shorter_run = _run_variant(item, SHORTER_REACH, TASKS[item.cell.task].duration_s)
     if shorter_run is None:
@@ -635,10 +636,10 @@ def _measure_push(
         scenario: The scenario.
         records: All records of the run, by site.
         time_s: The time, in s. Position and force are averaged over `STIFFNESS_WINDOW_S` around
-            this time.
+            it.
 
     Returns:
-        The position and the force. `None` if the run ends earlier.
+        The position and the force, or `None` if the run ends earlier.
     """
     window_s = (time_s - 0.5 * STIFFNESS_WINDOW_S, time_s + 0.5 * STIFFNESS_WINDOW_S)
     tip_motion = _measure_tip(scenario, records, window_s)
@@ -668,8 +669,8 @@ def _measure_tip(
 ) -> _TipMotion | None:
     """Computes the motion of the user's end effector, and the force on it, within a window.
 
-    The force F of the operator on the end effector is computed from the operator's torque tau
-    on the joints by solving J' F = tau, where J is the Jacobian of the end effector.
+    The force F of the operator on the end effector is obtained from the operator's joint torque
+    tau by solving J' F = tau, where J is the Jacobian of the end effector.
 
     Args:
         scenario: The scenario.
@@ -677,7 +678,7 @@ def _measure_tip(
         window_s: Start and end of the window, in s.
 
     Returns:
-        The motion along x. `None` if the run ends within the window.
+        The motion along x, or `None` if the run ends within the window.
     """
     start_ns, end_ns = (round(time_s * NS_PER_S) for time_s in window_s)
     if records[USER].t_ns[-1] < end_ns - NS_PER_S // scenario.sites[USER].rate_hz:
@@ -705,11 +706,10 @@ def _estimate_impedance(
     """Estimates the impedance |Z| at `IMPEDANCE_HZ` that the user feels, with and without wall.
 
     The user's arm is excited by a small sinusoidal force along the normal of the wall. Z is the
-    ratio of the phasors of the user's force and of the velocity, both along the normal. Each
-    phasor is computed from the difference between the excited run and the same run without the
-    sine, so that slow changes of the motion do not count. In the run in free motion there is no
-    wall, and the user moves to the pose that the user has in contact, so that the inertia of
-    the arm is the same.
+    ratio of the phasors of the user's force and velocity along the normal. To exclude slow
+    changes of the motion, each phasor is computed from the difference between the run with the
+    sine and the same run without it. In the run in free motion there is no wall, and the user
+    moves to the pose reached in contact, so the inertia of the arm is the same.
 
     Args:
         item: The run of the task `contact`.
@@ -717,7 +717,8 @@ def _estimate_impedance(
         contact_s: Time of the first contact, in s.
 
     Returns:
-        |Z| in contact and in free motion, in N s/m. `None` if a run is too short or diverges.
+        Both values of |Z|, in contact and in free motion, in N s/m. `None` if a run is too
+        short or diverges.
     """
     start_s = contact_s + STIFFNESS_S
     end_s = start_s + IMPEDANCE_PERIODS / IMPEDANCE_HZ
@@ -754,15 +755,15 @@ def _estimate_impedance(
 def _run_window(
     item: BenchRunItem, settings: Settings, window_s: tuple[float, float]
 ) -> _TipMotion | None:
-    """Repeats a simulation with other settings, and returns the motion of the user's arm.
-
-    Only the motion within a given time window is returned. The result is `None` if an arm left
-    its limits.
+    """Repeats a run with other settings, and returns the motion of the user's arm in a window.
 
     Args:
         item: The run.
         settings: Overrides of its scenario.
         window_s: Start and end of the window, in s. The run ends just after the window.
+
+    Returns:
+        The motion, or `None` if an arm left its limits.
     """
     variant = _run_variant(item, settings, window_s[1] + STIFFNESS_WINDOW_S)
     return None if variant is None else _measure_tip(*variant, window_s)
@@ -771,8 +772,8 @@ def _run_window(
 def _compute_impedance(shaken: _TipMotion, still: _TipMotion) -> float:
     """Computes the impedance |Z| that the user feels at one frequency, in N s/m.
 
-    The user's arm is excited by a sine in one of two otherwise equal runs. The difference
-    between the two runs is the response to the sine. Z is the ratio of its force and its
+    In one of two otherwise identical runs, the user's arm is excited by a sine. The difference
+    between the runs is the response to the sine, and Z is the ratio of its force to its
     velocity.
 
     Args:
@@ -855,9 +856,10 @@ def prepare_bench_folder(plan: BenchPlan, path: Path | None = None) -> BenchFold
 
 
 def _check_origin(path: Path, folder_origin: str, origin: str) -> None:
-    """Rejects a folder whose runs come from another version or arithmetic than this program's.
+    """Raises UsageError if a folder's runs come from another program version or arithmetic.
 
-    Runs of both would not be comparable, because equal scenarios might give different results.
+    Results of both would not be comparable, because the same scenario might give different
+    results.
 
     Args:
         path: The folder.
@@ -865,7 +867,7 @@ def _check_origin(path: Path, folder_origin: str, origin: str) -> None:
         origin: JSON text that describes this program.
 
     Raises:
-        UsageError: The texts differ.
+        UsageError: The two texts differ.
     """
     if folder_origin == origin:
         return
@@ -928,19 +930,19 @@ def run_bench(
 
 
 def _find_kind(item: BenchRunItem) -> tuple[str, str, str]:
-    """Returns a key that is equal for runs that differ only in numbers, such as the delay."""
+    """Returns a key that is equal for runs that differ only in numerical parameters."""
     return item.cell.form, item.cell.law, item.cell.task
 
 
 RUNS_OF_A_JUDGEMENT = 8
-"""Approximate number of simulations with which a run is judged: the run and its twins."""
+"""Approximate number of simulations needed to judge a run: the run itself and its twins."""
 
 
 def _choose_lanes(items: Sequence[BenchRunItem]) -> dict[tuple[str, str, str], str]:
-    """Chooses the runs that are computed side by side with other runs or with their own twins.
+    """Chooses the runs to compute side by side with other runs or with their own twins.
 
     Args:
-        items: The runs that are to be executed.
+        items: The runs to execute.
 
     Returns:
         The kinds of these runs, see `prepare_kinds`.
@@ -962,9 +964,9 @@ def _run_pending(
     on: Workers,
     progress: Progress,
 ) -> None:
-    """Executes the runs that are not yet in the journal, and stores each run when it ends.
+    """Executes the runs that are not yet in the journal, and stores each one when it ends.
 
-    An interrupted benchmark therefore continues where it was. Nothing happens if the journal
+    An interrupted benchmark therefore continues where it stopped. Does nothing if the journal
     contains all runs.
 
     Args:
@@ -972,7 +974,7 @@ def _run_pending(
         items: All runs that are needed.
         jobs: Number of processes.
         on: Cluster that executes the runs.
-        progress: Function that is called with the number of finished runs and of all runs.
+        progress: Called with the number of finished runs and the total number of runs.
     """
     pending = []
     for item in items:

@@ -22,7 +22,7 @@ from . import sweep_cell
 from .sweep_plan import SweepPlan
 
 LAW_KEY = "law"
-"""Name of the dimension of the control laws."""
+"""Name of the grid dimension that holds the control laws."""
 
 
 class CellGroups(NamedTuple):
@@ -112,13 +112,13 @@ def _find_structure(plan: SweepPlan, dimension: int, index: int) -> Hashable:
     """Returns the structure of the first scenario that has a given value on one axis.
 
     Args:
-        plan: The sweep: its scenario, axes, control laws and seeds.
+        plan: The sweep.
         dimension: Dimension of the axis in the grid.
         index: Index of its value.
 
     Returns:
-        The structure. If the run cannot be computed together with others, the reason is
-        returned instead. `None` if the cell is not a valid scenario.
+        The structure; the reason why the run cannot be computed together with others, if there
+        is one; or `None` if the cell is not a valid scenario.
     """
     # A sweep of single runs must not load the code of lanes.
     from trilat_net.core import RunGroup

@@ -109,7 +109,7 @@ class EdgeRefinement:
         return STABLE if 2 * stable > decided else UNSTABLE
 
     def _iterate_panels(self) -> Iterator[tuple[int | slice, ...]]:
-        """Yields an index of the grid for each panel, which has all values of the refined axes.
+        """Yields one grid index per panel, which selects all values of the refined axes.
 
         A panel is one setting of the control law and of the axes that are not refined.
         """
@@ -120,7 +120,7 @@ class EdgeRefinement:
         yield from itertools.product(*indices)
 
     def _find_lines(self, dimension: int, level: int) -> NDArray[np.int64]:
-        """Returns the indices along one axis at which the grid of a given level has lines.
+        """Returns the indices along one axis of the grid lines at a given level.
 
         Level 0 is the coarse grid. Each further level halves the distance between the lines.
         """
@@ -129,16 +129,16 @@ class EdgeRefinement:
         return np.unique([*range(0, last, stride), last])
 
     def _mark_lattice(self) -> NDArray[np.bool_]:
-        """Marks the corners of the boxes of the coarse grid in an empty panel."""
+        """Marks the corners of the coarse grid's boxes in an empty panel."""
         is_needed = np.zeros([self._shape[dimension] for dimension in self._dimensions], bool)
         lines = [self._find_lines(dimension, 0) for dimension in self._dimensions]
         is_needed[np.ix_(*lines)] = True
         return is_needed
 
     def _mark_panel(self, panel: tuple[int | slice, ...]) -> NDArray[np.bool_]:
-        """Marks the parameter combinations of a panel that must be simulated in this round.
+        """Marks the cells of a panel that must be simulated in this round.
 
-        These points halve those boxes of the grid that the edge of stability crosses.
+        These cells halve the boxes that the edge of stability crosses.
 
         Args:
             panel: Index of the panel.

@@ -18,7 +18,7 @@ from trilat_net.scenario import Scenario, describe_value
 from .sweep_plan import SweepPlan
 
 FAIR_COMPARISON = "to compare laws at their best gains, use: trilat compare --tune"
-"""Advice that is printed below a comparison of control laws by a sweep."""
+"""Advice that is printed below a sweep that compares control laws."""
 
 
 def describe_fixed_gains(plan: SweepPlan) -> list[str]:
@@ -39,10 +39,10 @@ def describe_fixed_gains(plan: SweepPlan) -> list[str]:
 
 
 def _describe_laws(plan: SweepPlan, scenario: Scenario) -> Iterator[str]:
-    """Yields one text for each control law of a sweep, with the gains that are not swept.
+    """Yields one string per control law of the sweep, with the gains that are not swept.
 
     Args:
-        plan: The sweep: its scenario, axes, control laws and seeds.
+        plan: The sweep.
         scenario: Scenario of the sweep with one of its laws.
     """
     sites_of_law: dict[tuple[str, str], list[str]] = {}
@@ -62,10 +62,10 @@ def _describe_laws(plan: SweepPlan, scenario: Scenario) -> Iterator[str]:
 
 
 def _format_gains(plan: SweepPlan, scenario: Scenario, site: str) -> Iterator[str]:
-    """Yields the control gains that a parameter sweep leaves unchanged, with their values.
+    """Yields the gains of a site that the sweep does not vary, with their values.
 
     Args:
-        plan: The sweep: its scenario, axes, control laws and seeds.
+        plan: The sweep.
         scenario: Scenario of the sweep with one of its laws.
         site: Name of the site.
     """

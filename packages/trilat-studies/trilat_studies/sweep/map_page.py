@@ -61,7 +61,7 @@ CLASS_COLOURS = {
     CellClass.DIVERGED: "#a23b53",
     CellClass.UNDECIDED: "#ffffff",
 }
-"""Colours of the classes: light, medium and dark; undecided cells are white and hatched."""
+"""Colours of the classes: light, medium and dark. Undecided cells are white and hatched."""
 _EMPTY_COLOUR = "#f4f4f4"
 """Colour of cells without runs."""
 # Look of the hatching of undecided cells.
@@ -91,9 +91,9 @@ _SHARES = LinearSegmentedColormap.from_list(
         CLASS_COLOURS[CellClass.CONVERGED],
     ],
 )
-"""Colours of stable shares: dark if nothing is stable, lighter with a larger share."""
+"""Colours of stable fractions: dark if nothing is stable, lighter for larger fractions."""
 _VERDICTS_EDGE = "edge of the verdicts"
-"""Name of the measured edges of the classes, in the legend and in the table."""
+"""Name of the measured edges between classes, in the legend and in the table."""
 _SIMULATED_EDGE = "edge of the simulation"
 """Name of the measured edges of another sweep."""
 _HALO_PT = 2.6
@@ -103,24 +103,25 @@ _COUNT_PT = 5.0
 _DIGIT_WIDTH = 0.62
 """Width of a digit, relative to the font size."""
 _TITLE_LETTERS_PER_IN = 13
-"""Letters per inch of a panel title; a longer title is broken, to keep clear of its neighbour.
+"""Letters per inch of a panel title. Longer titles are wrapped, to keep clear of the next
+panel.
 """
 _FULL_HEIGHT_IN = 2.3
-"""Height of a panel that has a row to itself."""
+"""Height of a panel that has a row to itself, in inches."""
 _SHARED_HEIGHT_IN = 1.75
-"""Height of a panel that shares its row."""
+"""Height of a panel that shares its row, in inches."""
 _STRIP_HEIGHT_IN = 0.7
-"""Height of a panel of a map with a single axis."""
+"""Height of a panel in a map with a single axis, in inches."""
 _CAPTION_PT = 5.5
 """Font size of the caption."""
 _CAPTION_LINE_IN = 0.1
-"""Height of a line of the caption."""
+"""Height of a line of the caption, in inches."""
 _CAPTION_LETTERS_PER_IN = 25
-"""Letters of the caption per inch."""
+"""Letters per inch of the caption."""
 _SHARED_LABEL_IN = 0.14
-"""Height of the label that all panels share."""
+"""Height of the label that all panels share, in inches."""
 _COLOUR_BAR_IN = 0.6
-"""Width of the colour bar with its labels."""
+"""Width of the colour bar with its labels, in inches."""
 
 
 class MapReport:
@@ -261,11 +262,12 @@ class MapReport:
 def _count_columns(panels: int, form: FigureSize) -> int:
     """Returns the number of columns in which the panels of a figure are arranged.
 
-    Narrow figures have two columns, others as many as leave few gaps in the last row.
+    Narrow figures have two columns. In others, the number is chosen to leave few gaps in the
+    last row.
 
     Args:
         panels: Number of panels.
-        form: Width, type sizes and resolution of the figure.
+        form: Width, font sizes and resolution of the figure.
     """
     if panels == 1:
         return 1
@@ -277,7 +279,7 @@ def _count_columns(panels: int, form: FigureSize) -> int:
 
 
 def _choose_panel_height_in(plane: MapPlane, columns: int) -> float:
-    """Returns the height of a panel of the stability map, in inches.
+    """Returns the height of a panel, in inches.
 
     Args:
         plane: The map. If only one axis is drawn, its panels are low strips.
@@ -289,10 +291,10 @@ def _choose_panel_height_in(plane: MapPlane, columns: int) -> float:
 
 
 def _wrap_caption(fixed: Sequence[str], form: FigureSize) -> list[str]:
-    """Returns the lines of a figure's caption, which names the gains that were not swept.
+    """Returns the lines of the figure caption, which lists the gains that were not swept.
 
     Args:
-        fixed: Gains that were not swept, one text per control law.
+        fixed: Gains that were not swept, one string per control law.
         form: Size of the figure, which determines the length of a line.
     """
     if not fixed:
@@ -341,12 +343,12 @@ def _write_caption(
 
 
 def _draw_panel(axes: Axes, plane: MapPlane, panel: MapPanel, lines: Sequence[MapLine]) -> None:
-    """Draws one panel of a stability map: its coloured cells, and lines of theory on top.
+    """Draws one panel of the map: its coloured cells, with theoretical lines on top.
 
     Cells whose result is undecided are hatched.
 
     Args:
-        axes: Where to draw.
+        axes: The axes to draw on.
         plane: The measured part of the map.
         panel: Panel of the map, a grid of runs over x and y.
         lines: Lines of the panel.
@@ -366,8 +368,9 @@ def _draw_panel(axes: Axes, plane: MapPlane, panel: MapPanel, lines: Sequence[Ma
 def _draw_cells(axes: Axes, plane: MapPlane, panel: MapPanel) -> None:
     """Draws the coloured cells of a panel, one for each combination of two parameters.
 
-    The colour shows the growth exponent if the sweep measured it, else the share of stable runs
-    if there are several seeds, else the class of the single run. Cells without runs stay empty.
+    The colour shows the growth exponent if the sweep measured it, otherwise the fraction of
+    stable runs if there are several seeds, and otherwise the class of the single run. Cells
+    without runs stay empty.
 
     Args:
         axes: The panel of the figure.
@@ -399,9 +402,10 @@ def _draw_cells(axes: Axes, plane: MapPlane, panel: MapPanel) -> None:
 
 
 def _hatch_undecided(axes: Axes, plane: MapPlane, panel: MapPanel) -> None:
-    """Hatches the cells of a map in which half or more of the simulations are undecided.
+    """Hatches the cells in which half or more of the runs are undecided.
 
-    Neighbouring cells of a row form one rectangle, because the hatching would show seams.
+    Neighbouring cells of a row are hatched as one rectangle, because separate ones would show
+    seams.
 
     Args:
         axes: The panel of the figure.
@@ -422,16 +426,15 @@ def _hatch_undecided(axes: Axes, plane: MapPlane, panel: MapPanel) -> None:
 def _draw_edges(
     axes: Axes, plane: MapPlane, edges: Sequence[tuple[float, StabilityEdge]]
 ) -> None:
-    """Draws the edges between stable and not stable runs in each column.
+    """Draws the edges between stable runs and runs that are not stable, in each column.
 
-    The edge of a column lies between two grid points, and is drawn as a vertical line between
-    them. On a map of growth exponents, the lines show whether the exponents agree with the
-    verdicts.
+    An edge is drawn as a vertical line between the two grid points that enclose it. On a map of
+    growth exponents, these lines show whether the exponents agree with the verdicts.
 
     Args:
         axes: The panel of the figure.
         plane: Axes of the map.
-        edges: The edges, with the value of x of their columns.
+        edges: The edges, each with the x value of its column.
     """
     for x_value, edge in edges:
         x = _find_position(plane.x, x_value)
@@ -443,7 +446,7 @@ def _draw_edges(
 def _find_position(axis: PlaneAxis, value: float) -> float:
     """Returns the position at which a value is drawn on an axis.
 
-    It is interpolated between the values of the axis, whose positions need not be equally
+    The position is interpolated between the values of the axis, which need not be equally
     spaced.
     """
     position = np.interp(value, axis.values, axis.positions)
@@ -451,12 +454,12 @@ def _find_position(axis: PlaneAxis, value: float) -> float:
 
 
 def _list_stretches(flags: Array) -> list[tuple[int, int]]:
-    """Returns the ranges of consecutive True values, as pairs (first, last + 1).
+    """Returns the ranges of consecutive True entries, as pairs (first, last + 1).
 
     Example: [True, True, False, True] has the ranges (0, 2) and (3, 4).
 
     Args:
-        flags: Truth values, shape (K,).
+        flags: Boolean array, shape (K,).
     """
     padded = np.concatenate([[False], flags, [False]])
     is_change = padded[1:] != padded[:-1]
@@ -467,13 +470,13 @@ def _list_stretches(flags: Array) -> list[tuple[int, int]]:
 
 
 def _draw_line(axes: Axes, plane: MapPlane, line: MapLine) -> None:
-    """Draws a line of a map as the zero contour of its quantity.
+    """Draws a line of the map as the zero contour of its quantity.
 
-    The quantity is known at the grid points, the centres of the cells. It is extrapolated
-    linearly, so that the line reaches the borders of the panel.
+    The quantity is known at the grid points, which are the centres of the cells. It is
+    extrapolated linearly, so that the line extends to the borders of the panel.
 
     Args:
-        axes: Where to draw.
+        axes: The axes to draw on.
         plane: The measured part of the map.
         line: The line.
     """
@@ -503,7 +506,7 @@ def _draw_line(axes: Axes, plane: MapPlane, line: MapLine) -> None:
 
 
 def _find_line_style(line: MapLine) -> dict[str, Any]:
-    """Returns the plot options, such as colour and dashes, of a line in a stability map.
+    """Returns the plot options of a line, such as colour and dashes.
 
     Lines of the same kind have the same style in all panels.
     """
@@ -512,9 +515,9 @@ def _find_line_style(line: MapLine) -> dict[str, Any]:
 
 
 def _extend_positions(axis: PlaneAxis) -> Array:
-    """Returns the positions of an axis's values, extended by the borders of the panel.
+    """Returns the positions of an axis's values, with the borders of the panel at both ends.
 
-    A line that is known at the first and the last value is thus drawn up to the border.
+    This allows a line to be extended to the border of the panel.
     """
     borders = axis.compute_borders()
     first_border = borders[:1]
@@ -525,7 +528,7 @@ def _extend_positions(axis: PlaneAxis) -> Array:
 def _extrapolate_rows(rows: Array, positions: Array) -> Array:
     """Returns a field with an extrapolated row before the first and after the last row.
 
-    The lines of a map are thus drawn up to its border, half a cell beyond the grid points.
+    The lines of a map are thereby extended to its border, half a cell beyond the grid points.
 
     Args:
         rows: The field, shape (n, m).
@@ -541,7 +544,7 @@ def _extrapolate_rows(rows: Array, positions: Array) -> Array:
 
 
 def _extrapolate_row(rows: Array, positions: Array) -> Array:
-    """Extends a field of numbers by a row, by linear extrapolation from the two nearest rows.
+    """Computes an additional row of a field by linear extrapolation from the two nearest rows.
 
     Args:
         rows: The nearest row and the one behind it, shape (2, m).
@@ -557,12 +560,13 @@ def _extrapolate_row(rows: Array, positions: Array) -> Array:
 
 
 def _find_undecided(plane: MapPlane, panel: MapPanel) -> Any:
-    """Returns which cells of a map are hatched, because their simulations have no clear result.
+    """Determines which cells of a map are hatched, because their runs have no clear result.
 
-    Such a cell has half or more undecided runs or, on a map of growth exponents, no exponent.
+    In such a cell, half or more of the runs are undecided. On a map of growth exponents, it is
+    a cell without an exponent.
 
     Returns:
-        Flags, shape (y, x).
+        Boolean array, shape (y, x).
     """
     has_runs = panel.runs > 0
     if plane.has_exponents:
@@ -574,12 +578,12 @@ def _find_undecided(plane: MapPlane, panel: MapPanel) -> Any:
 
 
 def _set_scale(axes: Axes, plane: MapPlane) -> None:
-    """Sets the limits and the ticks of both axes of a panel of the stability map.
+    """Sets the limits and ticks of both axes of a panel.
 
     The limits are the outer borders of the first and the last cells.
 
     Args:
-        axes: The panel in the figure.
+        axes: The panel of the figure.
         plane: The measured part of the map. With a single axis, the vertical one has no ticks.
     """
     x = plane.x.compute_borders()
@@ -595,9 +599,9 @@ def _set_scale(axes: Axes, plane: MapPlane) -> None:
 
 
 def _set_ticks(axis: Axis, plane_axis: PlaneAxis) -> None:
-    """Sets the ticks of one axis of a panel of the stability map.
+    """Sets the ticks of one axis of a panel.
 
-    If the values are equally spaced, the ticks are round numbers. Otherwise they are the values
+    For equally spaced values, the ticks are round numbers. Otherwise they are the values
     themselves.
     """
     if plane_axis.is_evenly_spaced:
@@ -613,8 +617,8 @@ def _set_ticks(axis: Axis, plane_axis: PlaneAxis) -> None:
 def _find_exponent_limit(plane: MapPlane) -> float:
     """Returns the growth exponent at which the colour scale of a map ends, in 1/s.
 
-    The limit is 1, 2 or 5 times a power of ten. Four fifths of the exponents do not exceed this
-    limit, so that a few large exponents do not make all others pale.
+    The limit is 1, 2 or 5 times a power of ten. It is at least as large as four fifths of the
+    exponents, so that a few large exponents do not make all others look pale.
     """
     # The cells that ran in a refined sweep lie along the edge, where exponents are small.
     panels = plane.panels
@@ -634,13 +638,13 @@ def _find_exponent_limit(plane: MapPlane) -> float:
 
 
 def _draw_colour_bar(figure: Figure, grid: Sequence[Axes], plane: MapPlane) -> None:
-    """Draws the colour bar of growth exponents or of stable shares.
+    """Draws the colour bar for growth exponents or for the fraction of stable runs.
 
-    The pointed ends of the bar of exponents represent all exponents beyond its limits.
+    On a bar of exponents, the pointed ends represent all exponents beyond its limits.
 
     Args:
         figure: The Matplotlib figure.
-        grid: All panels, beside which the bar stands.
+        grid: All panels, next to which the bar is drawn.
         plane: The measured part of the map.
     """
     if plane.has_exponents:
@@ -673,10 +677,10 @@ def _draw_colour_bar(figure: Figure, grid: Sequence[Axes], plane: MapPlane) -> N
 
 
 def _draw_counts(axes: Axes, plane: MapPlane, panel: MapPanel) -> None:
-    """Writes the numbers of stable and of decided runs into cells whose runs disagree.
+    """Writes the number of stable and of decided runs into cells whose runs disagree.
 
-    The runs of a cell differ in their random seeds. Nothing is written if the numbers do not
-    fit into a cell.
+    The runs of a cell differ in their random seeds. Nothing is written if the text does not fit
+    into a cell.
     """
     extent = axes.get_window_extent()
     dpi = axes.figure.dpi
@@ -708,7 +712,7 @@ def _draw_counts(axes: Axes, plane: MapPlane, panel: MapPanel) -> None:
 
 
 def _draw_legend(figure: Figure, plane: MapPlane, lines: Sequence[Sequence[MapLine]]) -> None:
-    """Draws the legend of a stability map: its colours, its hatching and its lines.
+    """Draws the legend of the map, which explains its colours, its hatching and its lines.
 
     Args:
         figure: The Matplotlib figure.
@@ -753,9 +757,9 @@ def _draw_legend(figure: Figure, plane: MapPlane, lines: Sequence[Sequence[MapLi
 
 
 def _list_class_handles(plane: MapPlane) -> list[Patch]:
-    """Returns the legend entries of the classes that occur in a map, with their colours.
+    """Returns the legend entries for the classes that occur in a map, with their colours.
 
-    The class "undecided" has no colour of its own: its cells are hatched.
+    The class "undecided" has no colour of its own, because its cells are hatched.
     """
     counts_of_panels = [panel.counts.sum(axis=(0, 1)) for panel in plane.panels]
     counts = sum(counts_of_panels)
@@ -778,7 +782,8 @@ _DPI = 300
 
 
 def _list_notes(chart: StabilityMap) -> list[str]:
-    """Returns the notes below a map: the origin of its lines, and gains that were not swept.
+    """Returns the notes below a map: the origin of its lines, and the gains that were not
+    swept.
 
     A line that several panels share is explained once.
     """
@@ -808,7 +813,7 @@ def _list_notes(chart: StabilityMap) -> list[str]:
 
 
 def _describe_refined_cells(plane: MapPlane) -> str:
-    """Returns how many parameter combinations ran, as in "1243 of 40401 cells ran".
+    """Returns a phrase on how many cells were run, such as "1243 of 40401 cells ran".
 
     A refined sweep simulates only the cells near an edge of stability.
     """
@@ -818,10 +823,10 @@ def _describe_refined_cells(plane: MapPlane) -> str:
 
 
 def _tabulate_classes(plane: MapPlane) -> TextTable:
-    """Returns a table of how many runs of a stability map ended stable, diverged, and so on.
+    """Returns a table of the number of runs in each class, with one row per panel.
 
     Args:
-        plane: Axes of the map, and the results of the runs in each panel. Each panel has a row.
+        plane: Axes of the map, and the results of the runs in each panel.
     """
     rows = []
     for panel in plane.panels:
@@ -835,12 +840,12 @@ def _tabulate_classes(plane: MapPlane) -> TextTable:
 def _tabulate_edges(plane: MapPlane, panel: MapPanel, lines: Sequence[MapLine]) -> TextTable:
     """Returns a table that compares the measured edges of stability with theory.
 
-    The table has one row per measured edge of the panel. For each line from theory it has the
-    crossing that is nearest to the edge, and the difference of this crossing from the middle of
-    the edge, or "within" if the crossing lies within the edge.
+    The table has one row per measured edge of the panel. For each theoretical line, it shows
+    the crossing nearest to the edge, and the difference of this crossing from the middle of the
+    edge, or "within" if the crossing lies within the edge.
 
     On a map of growth exponents, the measured edges are the zeros of the exponent, and another
-    column has the nearest edge between stable and not stable runs. If only one axis is drawn,
+    column shows the nearest edge between stable and not stable runs. If only one axis is drawn,
     the table is empty.
 
     Args:
@@ -890,16 +895,16 @@ def _tabulate_edges(plane: MapPlane, panel: MapPanel, lines: Sequence[MapLine]) 
 
 
 def _list_crossings(line: MapLine, plane: MapPlane) -> Iterator[tuple[float, StabilityEdge]]:
-    """Yields the crossings of a line of theory with the columns of a map.
+    """Yields the crossings of a theoretical line with the columns of a map.
 
-    The table of edges, the measured limits of stability, compares them with these crossings.
+    They are compared with the measured edges in the table of edges.
 
     Args:
         line: The line.
         plane: Axes of the map.
 
     Yields:
-        The value of x of a column, and the crossing as an edge of zero width.
+        The x value of a column, and the crossing as an edge of zero width.
     """
     for column, x in enumerate(plane.x.values):
         crossings = line.crossings(column, plane.y)
@@ -912,9 +917,9 @@ def _list_crossings(line: MapLine, plane: MapPlane) -> Iterator[tuple[float, Sta
 
 
 def _format_edge(edge: StabilityEdge) -> str:
-    """Returns an edge of stability as text, such as "40 to 60" for an edge between 40 and 60.
+    """Formats an edge of stability, such as "40 to 60" for an edge between 40 and 60.
 
-    An edge that is computed from theory has a single value, such as "52.3".
+    A theoretical edge is a single value, such as "52.3".
     """
     if edge.low == edge.high:
         return f"{edge.low:.4g}"
@@ -922,12 +927,10 @@ def _format_edge(edge: StabilityEdge) -> str:
 
 
 def _format_nearest_edge(value: float, edges: Sequence[StabilityEdge]) -> str:
-    """Returns the measured edge that is nearest to a predicted value, as text.
-
-    The text is "-" if there are no edges.
+    """Formats the measured edge that is nearest to a predicted value, or "-" if there is none.
 
     Args:
-        value: Value on the vertical axis, usually that of a line of theory.
+        value: Value on the vertical axis, usually that of a theoretical line.
         edges: Edges of the column.
     """
     if not edges:
@@ -937,18 +940,16 @@ def _format_nearest_edge(value: float, edges: Sequence[StabilityEdge]) -> str:
 
 
 def _compare_with_line(edge: StabilityEdge, values: Sequence[float]) -> list[str]:
-    """Compares a measured edge of stability with a line that theory predicts.
-
-    Returns the table cells with the crossing of the line nearest to the edge, and the
-    difference.
+    """Compares a measured edge of stability with a theoretical line.
 
     Args:
         edge: The measured edge.
         values: Values at which the line crosses the column of the edge.
 
     Returns:
-        The value of the crossing, and its relative difference from the middle of the edge, or
-        "within" if the crossing lies within the edge. Both are "-" if there is no crossing.
+        Two table cells: the crossing nearest to the edge, and its relative difference from the
+            middle of the edge, or "within" if the crossing lies within the edge. Both are "-"
+            if there is no crossing.
     """
     if not values:
         return ["-", "-"]

@@ -37,17 +37,17 @@ from .sweep_axis import label_axis
 from .sweep_plan import SweepCell, SweepPlan
 
 SCAN_POINTS = 9
-"""Number of values of the scan. It detects islands of stability that are wider than an eighth
-of the range.
+"""Number of values of the scan. It detects islands of stability wider than an eighth of the
+range.
 """
 MARGIN_TOLERANCE = 0.005
-"""Default largest width of an edge, as a fraction of its value."""
+"""Default for the largest width of an edge, as a fraction of its value."""
 _MAX_HALVINGS = 60
-"""Largest number of steps of a bisection."""
+"""Maximum number of bisection steps."""
 
 StabilityTest = Callable[[float], bool | None]
-"""Function that runs the scenario at a value of the key. It returns True if the run is stable,
-False if it is not stable, and `None` if it is undecided.
+"""Runs the scenario at a value of the key. Returns True if the run is stable, False if it is
+not, and `None` if it is undecided.
 """
 
 
@@ -129,16 +129,16 @@ class KeyMargin(NamedTuple):
 def _narrow_edge(
     classify: StabilityTest, low: float, high: float, *, tolerance: float, whole: bool
 ) -> StabilityEdge:
-    """Narrows the interval between a stable value and one that is not stable by bisection.
+    """Narrows the interval between a stable value and one that is not stable, by bisection.
 
     If undecided values lie between the two sides, both ends of this zone are located.
 
     Args:
-        classify: Function that returns whether a value is stable.
+        classify: Returns whether a value is stable.
         low: Decided value below the edge.
         high: Decided value above the edge, with the opposite result.
         tolerance: Largest width of the edge, as a fraction of its value.
-        whole: True if only whole numbers can be run.
+        whole: True if only integers can be run.
     """
     low_stable = classify(low)
     high_stable = classify(high)
@@ -165,14 +165,14 @@ def _bisect(
     """Narrows the interval between a value where a condition holds and one where it fails.
 
     Args:
-        holds: The condition. It holds at `low` and does not hold at `high`.
+        holds: The condition. It holds at `low` and fails at `high`.
         low: Lower end of the interval.
         high: Upper end of the interval.
         tolerance: Largest width of the result, as a fraction of its larger end.
-        whole: True to use only whole numbers, down to a width of 1.
+        whole: True to use only integers, down to a width of 1.
 
     Returns:
-        A value at which the condition holds, and a larger value at which it does not.
+        A value at which the condition holds, and a larger value at which it fails.
     """
     for _ in range(_MAX_HALVINGS):
         largest_width = 1.0 if whole else tolerance * max(abs(low), abs(high))
@@ -245,15 +245,15 @@ class SearchRange(NamedTuple):
 
 
 class _MarginItem(NamedTuple):
-    """Task for a worker process: find the limits of stability at one grid point of a sweep.
+    """Task for a worker process: find the stability edges at one grid point of a sweep.
 
     The object can be pickled and sent to the process.
 
     Attributes:
-        plan: The sweep: its scenario, axes, control laws and seeds.
+        plan: The sweep.
         cell: The grid point, a combination of the values of the other swept parameters.
-        seed: Seed of the runs.
-        range: Scenario key along which the limits are searched, and its range.
+        seed: Random seed of the runs.
+        range: Scenario key along which edges are searched for, and its range.
     """
 
     plan: SweepPlan
@@ -291,16 +291,15 @@ class GridPointMargin(NamedTuple):
 
 
 def _search_margin_task(task: _MarginItem) -> GridPointMargin:
-    """Finds the limits of stability at one grid point of a sweep, by runs and by theory.
+    """Finds the stability edges at one grid point of a sweep, from runs and from theory.
 
-    The function depends only on its argument, so any worker process can call it.
+    The result depends only on the argument, so any worker process can compute it.
 
     Args:
-        task: The grid point (a combination of swept parameters), the seed of the runs, and the
-            scenario key along which the limits are searched, with its range.
+        task: The grid point, the seed of the runs, and the searched key with its range.
 
     Returns:
-        The limits from runs, from the linear analysis, and from a closed-form criterion.
+        The edges from runs, from the linear analysis, and from a closed-form criterion.
 
     Raises:
         ScenarioError: The scenario is not valid at a value of the range.
@@ -350,10 +349,7 @@ def _search_margin_task(task: _MarginItem) -> GridPointMargin:
 
 
 def _find_nearest(value: float, edges: Sequence[float]) -> float | None:
-    """Returns the predicted limit of stability that is nearest to a measured limit.
-
-    The result is `None` if there are no predicted limits.
-    """
+    """Returns the predicted edge nearest to a measured edge, or `None` if there are none."""
     return min(edges, key=lambda edge: abs(edge - value), default=None)
 
 
@@ -505,9 +501,9 @@ class SweepMargins(Result):
         }
 
     def _describe_point(self, point: GridPointMargin) -> dict[str, Any]:
-        """Returns the result of one combination of swept parameters as plain values for JSON.
+        """Converts the result at one grid point to plain values for JSON.
 
-        The values are its position in the grid, its random seed and its edges of stability.
+        They contain its position in the grid, its random seed and its stability edges.
 
         Args:
             point: Margin of the grid point.
@@ -584,11 +580,11 @@ class SweepMargins(Result):
 
 
 def _format_edge(margin: KeyMargin, span: StabilityEdge | None) -> list[str]:
-    """Returns two table cells: a limit of stability as in "40 to 41", and its stable side.
+    """Returns two table cells: a stability edge, such as "40 to 41", and its stable side.
 
     Args:
         margin: The edges of the grid point.
-        span: The edge. `None` if the grid point has no edges. The cell then states whether all
+        span: The edge. If `None`, the grid point has no edges, and the cell states whether all
             values or no values were stable.
     """
     if span is None:
@@ -606,13 +602,11 @@ def _format_edge(margin: KeyMargin, span: StabilityEdge | None) -> list[str]:
 
 
 def _format_theory(span: StabilityEdge | None, value: float | None) -> list[str]:
-    """Returns two table cells: a limit of stability from theory, and its deviation.
-
-    The deviation is the difference from the measured limit.
+    """Returns two table cells: a theoretical edge, and its difference from the measured edge.
 
     Args:
-        span: The measured edge. `None` if there is no edge, and thus no difference.
-        value: The edge from theory. `None` if there is no edge. Both cells are then "-".
+        span: The measured edge. If `None`, there is no difference to show.
+        value: The theoretical edge. If `None`, both cells are "-".
     """
     if value is None:
         return ["-", "-"]
