@@ -614,8 +614,8 @@ class _GainSearch:
         time are then computed for that pose only.
 
         Returns:
-            The edge values described for `ArmGains.edge`, plus the entry `used_per_s2`: the k
-                of the tuned gains before the stiffness is divided by the margin.
+            The edge values described for `ArmGains.edge`. The additional entry `used_per_s2` is
+            the k of the tuned gains before the stiffness is divided by the margin.
         """
         constant, pose = self.find_least_edge(self.constant_loop, self._poses, self._least_k)
 

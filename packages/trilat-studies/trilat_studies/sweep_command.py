@@ -34,14 +34,13 @@ _option = partial(typer.Option, rich_help_panel="Maps and stability limits")
 
 
 def _check_modes(used_options: Sequence[str]) -> None:
-    """Rejects options that exclude each other.
+    """Raises UsageError if the options on the command line cannot be combined.
 
     Args:
-        used_options: The options that the user wrote on the command line.
+        used_options: The options that appear on the command line.
 
     Raises:
-        UsageError: Two options exclude each other, or an option lacks the option to which it
-            belongs.
+        UsageError: Two options exclude each other, or an option is missing the one it requires.
     """
     modes = [name for name in ("--map", "--margin", "--cell") if name in used_options]
     if len(modes) > 1:
@@ -69,16 +68,16 @@ def _draw_map(
     on: str | None,
     beside: Path | None,
 ) -> None:
-    """Draws the stability map of a sweep, together with the edges that theory predicts.
+    """Draws the stability map of a sweep, together with the edges predicted by theory.
 
     Args:
         results: The finished sweep.
-        folder: Folder of the files.
-        width: Width of the map, in inches. If `None`, it is one column of a paper.
-        jobs: Number of processes. If `None`, there is one per core.
+        folder: Folder for the files.
+        width: Width of the map, in inches. If `None`, one column of a paper.
+        jobs: Number of processes. If `None`, one per core.
         on: Address of a Dask scheduler that computes the map instead.
-        beside: Folder of another sweep, whose edge is drawn as well. If `None`, no other edge
-            is drawn.
+        beside: Folder of another sweep whose edge is drawn as well. If `None`, no other edge is
+            drawn.
     """
     from trilat_net.presentation import COLUMN_IN, FigureSize
 
@@ -117,15 +116,15 @@ def _search_margins(
     on: str | None,
     as_json: bool,
 ) -> None:
-    """Searches for edges along one key, prints them, and writes the result files.
+    """Searches for stability edges along one key, prints them, and writes the result files.
 
-    The edges that theory predicts are printed next to the measured edges.
+    The edges predicted by theory are printed next to the measured edges.
 
     Args:
-        plan: The sweep. Its last axis has the two ends of the range.
+        plan: The sweep. Its last axis consists of the two ends of the range.
         search_range: The key, and the range in which to search for edges.
-        folder: Folder of margin.json and margin.md. If `None`, the next free folder is used.
-        jobs: Number of processes. If `None`, there is one per core.
+        folder: Folder for margin.json and margin.md. If `None`, the next free folder is used.
+        jobs: Number of processes. If `None`, one per core.
         on: Address of a Dask scheduler that executes the runs instead.
         as_json: True to print the result as JSON.
     """
@@ -157,7 +156,7 @@ def _run_sweep(
     *,
     yes: bool,
 ) -> "FinishedSweep":
-    """Runs a sweep, or the remaining runs of a sweep, and prints its summary.
+    """Runs a sweep, or the remaining runs of one, and prints its summary.
 
     A sweep that is too large is rejected before its folder is created.
 
@@ -165,7 +164,7 @@ def _run_sweep(
         new_plan: The sweep. If `None`, the sweep in the folder is continued.
         path: Folder of a sweep to continue, or of a new sweep. If `None`, the next free folder
             is used.
-        jobs: Number of processes. If `None`, there is one per core.
+        jobs: Number of processes. If `None`, one per core.
         on: Address of a Dask scheduler that executes the runs instead.
         yes: True to run a sweep even if it is too large.
 
@@ -217,13 +216,13 @@ def _run_sweep(
 def _run_in_folder(
     folder: "SweepFolder", jobs: int | None, on: str | None, estimate: "DurationEstimate"
 ) -> "FinishedSweep":
-    """Runs a sweep in its folder. On Ctrl-C it prints the command that resumes the sweep.
+    """Runs a sweep in its folder. On Ctrl-C, prints the command that resumes it.
 
     Args:
         folder: Folder of the sweep.
-        jobs: Number of processes. If `None`, there is one per core.
+        jobs: Number of processes. If `None`, one per core.
         on: Address of a Dask scheduler that executes the runs instead.
-        estimate: Estimate of the duration. The runs that were made for the estimate are not
+        estimate: Estimate of the duration. Runs that were made for the estimate are not
             repeated.
     """
     from .sweep import run_sweep
@@ -264,10 +263,10 @@ def _print_results(results: "SweepResults", remarks: list[str], path: Path) -> N
 
 
 def _print_cell_commands(path: Path, number: int, *, as_json: bool) -> None:
-    """Prints the shell commands that record logs of one combination of a finished sweep.
+    """Prints the shell commands that record logs of one cell of a finished sweep.
 
     Args:
-        path: Folder of the sweep, or its table of results.
+        path: Folder of the sweep, or its results table.
         number: Number of the cell.
         as_json: True to print the rows of the cell as JSON instead.
     """
@@ -439,8 +438,8 @@ def _show_results(
     """Draws the map of a finished sweep, or prints its summary.
 
     Args:
-        path: Folder of the sweep, or its table of results.
-        draw: Function that draws the map. If `None`, no map is drawn.
+        path: Folder of the sweep, or its results table.
+        draw: Draws the map. If `None`, no map is drawn.
         as_json: True to print the results as JSON in addition.
     """
     from .sweep.sweep_results import read_results
@@ -468,14 +467,14 @@ _PLAN_OPTIONS = (
     "--set",
     "--duration",
 )
-"""Options that define a sweep. For a finished or interrupted sweep they are fixed."""
+"""Options that define a sweep. They cannot be changed for a finished or interrupted sweep."""
 
 
 def _refuse_plan_options(used_options: Sequence[str]) -> None:
-    """Rejects options that would change a sweep that exists already.
+    """Raises UsageError if an option would change a sweep that already exists.
 
     Args:
-        used_options: The options that the user wrote on the command line.
+        used_options: The options that appear on the command line.
 
     Raises:
         UsageError: One of the options defines a sweep.
@@ -508,13 +507,13 @@ def parse_seed_count(text: str | None) -> int | list[int]:
 
 
 def _is_results(source: str) -> bool:
-    """Returns True if an argument of the command is the folder or table of a sweep.
+    """Returns True if an argument of the command is the folder or results table of a sweep.
 
-    The name of a shipped scenario is never taken for a folder, even if a folder of this name
-    exists.
+    The name of a shipped scenario is never interpreted as a folder, even if a folder of this
+    name exists.
 
     Args:
-        source: The argument: a scenario, the folder of a sweep, or its table of results.
+        source: The argument: a scenario, the folder of a sweep, or its results table.
     """
     from trilat_net.scenario import list_shipped
 

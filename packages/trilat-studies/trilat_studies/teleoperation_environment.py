@@ -62,16 +62,16 @@ except ImportError:
 ENV_ID = "trilat_net/Teleoperation-v0"
 """Name of the environment in the registry of Gymnasium."""
 FAR = 1e6
-"""Bound on observed numbers that have no tighter bound, in rad, rad/s, m, N m or s."""
+"""Bound on observed quantities that have no tighter bound, in rad, rad/s, m, N m or s."""
 NEVER_NEGATIVE = ("alpha", "grip", "age_s")
-"""Parts of an observation whose numbers are at least 0."""
+"""Parts of an observation whose entries are never negative."""
 WITH_ROUNDING = 1.000001
-"""Factor by which the space exceeds a bound that a number can reach exactly."""
+"""Factor by which the space is larger than a bound that an entry can reach exactly."""
 MOST_DRAWS = {False: 1000, True: 100}
 """Largest number of random positions that a task tries until one is within reach.
 
-It is smaller for arms with a chain of joints (True), because the pose for a position must be
-found by a numerical search.
+It is smaller for arms with a chain of joints (True), because finding the pose for a position
+requires a numerical search.
 """
 
 
@@ -130,9 +130,9 @@ class EpisodeTask(Protocol):
     """
 
     goal: Array
-    """Goal that the user observes. Its shape must never change."""
+    """Goal as observed by the user. Its shape must never change."""
     bound: float
-    """Bound on the numbers of the goal. It must never change."""
+    """Bound on the entries of the goal. It must never change."""
 
     def begin(self, random: np.random.Generator, scene: Scene) -> None:
         """Draws the goal of a new episode. Called once per episode.
@@ -250,7 +250,7 @@ class ReachTask:
 
 
 class _ActedHand(HandPlayer):
-    """Simulated operator that moves the user's arm with the actions of a policy.
+    """Simulated operator that moves the user's arm according to a policy's actions.
 
     Args:
         hand_site: The arm that the operator holds, and the settings of the operator.
@@ -371,10 +371,11 @@ class TeleoperationEnv(gymnasium.Env[dict[str, Array], Array]):
         self._flat = flat
 
     def _build_dict_space(self, scene: Scene) -> spaces.Dict:
-        """Returns the space of observations as a dictionary of arrays.
+        """Returns the observation space in the form of a dictionary of arrays.
 
         Args:
-            scene: Any state of an episode. All observations have the shapes of its observation.
+            scene: Any state of an episode. All observations have the same shapes as that of
+                this state.
         """
         hand = self.build_hand_site(self._base).describe()
         arm = self._base.arms[self.user]
@@ -393,10 +394,10 @@ class TeleoperationEnv(gymnasium.Env[dict[str, Array], Array]):
         return spaces.Dict(boxes)
 
     def _scale_parts(self, scene: Scene) -> dict[str, Array]:
-        """Returns the typical size of each number of an observation, by the parts' names.
+        """Returns the typical magnitude of each entry of an observation, keyed by part.
 
-        An arm can exceed its speed limit in the last step of an episode, which this ends, and
-        can turn any number of times. Therefore these sizes are not bounds of the space.
+        These magnitudes are not bounds of the space: an arm can exceed its speed limit in the
+        last step of an episode, which ends it, and can turn any number of times.
 
         Args:
             scene: Any state of an episode.
@@ -436,9 +437,9 @@ class TeleoperationEnv(gymnasium.Env[dict[str, Array], Array]):
         return scales
 
     def _is_goal_position(self, scene: Scene) -> bool:
-        """Returns True if the goal of the task has as many numbers as a position.
+        """Returns True if the goal of the task has as many entries as a position.
 
-        Goals may also be numbers of another kind, such as joint angles.
+        Goals may also be of another kind, such as joint angles.
         """
         return np.shape(self.task.goal) == scene.end_effector_m[self.leads].shape
 
@@ -468,10 +469,10 @@ class TeleoperationEnv(gymnasium.Env[dict[str, Array], Array]):
         return replace(scenario, sites=sites, drawn=drawn)
 
     def _check_varied_keys(self) -> None:
-        """Rejects invalid keys or values of `vary` before the first episode.
+        """Raises an error if `vary` has invalid keys or values, before the first episode.
 
         Raises:
-            ScenarioError: There is no such key, or the value is not valid for it.
+            ScenarioError: There is no such key, or a value is not valid for it.
             UsageError: A key has no values.
         """
         for key, values in self._vary.items():
@@ -500,10 +501,10 @@ class TeleoperationEnv(gymnasium.Env[dict[str, Array], Array]):
         )
 
     def _find_reach(self) -> float:
-        """Returns the bound of an action in the modes "tip" and "joint".
+        """Returns the bound on an action in the modes "tip" (in m) and "joint" (in rad).
 
-        In the mode "tip" an action is a position of the end effector, and the bound is its
-        largest distance from the base, in m. In the mode "joint" it is an angle, in rad.
+        In the mode "tip", an action is a position of the end effector, and the bound is its
+        largest distance from the base. In the mode "joint", it is an angle.
         """
         hand_site = self.build_hand_site(self._base)
         if hand_site.spec.mode == "joint":
@@ -525,9 +526,9 @@ class TeleoperationEnv(gymnasium.Env[dict[str, Array], Array]):
         """Prepares the simulated run of a new episode, up to its first step.
 
         The run is not started. Each step of the environment appends the action of the policy to
-        `self._actions`, and lets the run execute the ticks (control periods) of the step. A
-        simulated operator, `self._player`, holds the arm of the user's site. The operator
-        shares the list, and moves the arm according to the last action.
+        `self._actions` and lets the run execute the ticks of the step. A simulated operator,
+        `self._player`, holds the arm of the user's site. It shares this list and moves the arm
+        according to the last action.
 
         Args:
             scenario: Scenario of the episode.
@@ -548,15 +549,16 @@ class TeleoperationEnv(gymnasium.Env[dict[str, Array], Array]):
         self._tick_rate_hz = scenario.sites[self.user].rate_hz
 
     def _build_scene(self) -> Scene:
-        """Describes the present state of the episode, for the task and for observations.
+        """Describes the current state of the episode, for the task and for observations.
 
         The joint angles, end effectors and bodies are the true state of the simulation. The
-        view belongs to the user's operator, the policy: it contains the states of other sites
-        with their delay.
+        view is that of the user's operator (the policy), who receives the states of other sites
+        with a delay.
 
         Returns:
-            The state. The limit `draws` of attempts to draw a position depends on the arm of
-            the site that does the task (`self.leads`), which is not always the user's arm.
+            The state. Its limit `draws` on the attempts to draw a position depends on the arm
+            of the site that performs the task (`self.leads`), which is not always the user's
+            arm.
         """
         names = self.scenario.names
         arms = self.scenario.arms
@@ -631,10 +633,9 @@ class TeleoperationEnv(gymnasium.Env[dict[str, Array], Array]):
         return numbers.astype(np.float32)
 
     def _observe(self, scene: Scene) -> dict[str, Array]:
-        """Collects an agent's observation of a state, as arrays by name.
+        """Collects the agent's observation of a state, as a mapping from name to array.
 
-        Parts that begin with "peer_", and `alpha` and `age_s`, have one row per peer (other
-        arm).
+        Parts whose names begin with "peer_", and `alpha` and `age_s`, have one row per peer.
         """
         view = scene.view
         peers = view.peers
@@ -671,13 +672,13 @@ class TeleoperationEnv(gymnasium.Env[dict[str, Array], Array]):
         """Returns the information dictionary of a step.
 
         The first two keys have the same names as in gym-hil, a library in which a human teacher
-        can take over from the policy. Among the other users, the teacher is the one with the
-        largest dominance factor at the site that does the task. The teacher intervenes while
-        this factor is larger than that of the policy.
+        can take over from the policy. The teacher is the user, other than the policy, with the
+        largest dominance factor at the site that performs the task. The teacher intervenes
+        while this factor is larger than that of the policy.
 
         Args:
             scene: State after the step.
-            succeeded: True if the task is done.
+            succeeded: True if the task is complete.
         """
         leading_site = self.scenario.names.index(self.leads)
         leading_arrays = self._run.arrays(leading_site)
@@ -829,10 +830,10 @@ class TeleoperationEnv(gymnasium.Env[dict[str, Array], Array]):
         self._runs = not ends
 
     def _check_action(self, action: Array) -> Array:
-        """Returns an action as an array, with each value clipped to its bounds.
+        """Returns an action as an array, with each entry clipped to its bounds.
 
         Raises:
-            UsageError: The number of values is wrong, or a value is not finite.
+            UsageError: The action has the wrong size, or an entry is not finite.
         """
         try:
             values = np.array(action, dtype=np.float64)
@@ -938,10 +939,10 @@ class TeleoperationEnv(gymnasium.Env[dict[str, Array], Array]):
 
 
 def _flatten_space(parts: spaces.Dict) -> spaces.Box:
-    """Returns the space of flat observations, with all numbers in one array of float32.
+    """Returns the space of flat observations, a single float32 array.
 
     Args:
-        parts: Space of observations in the form of a dictionary.
+        parts: Observation space in the form of a dictionary.
     """
     lows = []
     highs = []
@@ -959,10 +960,10 @@ def _flatten_space(parts: spaces.Dict) -> spaces.Box:
 
 
 def _name_numbers(parts: spaces.Dict) -> list[str]:
-    """Returns the name of each number of a flat observation, such as "peer_q[1][0]".
+    """Returns the name of each entry of a flat observation, such as "peer_q[1][0]".
 
     Args:
-        parts: Space of observations in the form of a dictionary.
+        parts: Observation space in the form of a dictionary.
     """
     names = []
     for part, box in parts.items():
@@ -976,7 +977,7 @@ def _name_numbers(parts: spaces.Dict) -> list[str]:
 def _check_arguments(
     *, mode: str, rate_hz: int, delay_ms: float, task: EpisodeTask | None
 ) -> None:
-    """Rejects invalid arguments of an environment before anything is simulated.
+    """Raises UsageError if an argument of an environment is not valid.
 
     Args:
         mode: Meaning of an action.
@@ -1000,11 +1001,11 @@ def _check_arguments(
 
 
 def _draw(random: np.random.Generator, values: Sequence[Any]) -> Any:
-    """Draws a value at random for a scenario key that varies from episode to episode.
+    """Draws a random value for a scenario key that varies from episode to episode.
 
     Args:
-        random: Source of random numbers.
-        values: A tuple of two numbers, which are bounds, or a sequence of possible values.
+        random: Random number generator.
+        values: A tuple of two bounds, or a sequence of possible values.
     """
     has_numbers = all(isinstance(value, int | float) for value in values)
     is_pair = isinstance(values, tuple) and len(values) == 2

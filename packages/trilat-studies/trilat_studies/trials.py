@@ -268,7 +268,7 @@ def trials(
 
 
 def _check_expectations_reachable(scenario: Scenario, source: str) -> None:
-    """Rejects expectations that no run of a scenario can meet.
+    """Raises ScenarioError if no run of a scenario can meet its expectations.
 
     Args:
         scenario: The scenario.
@@ -309,18 +309,18 @@ def _check_expectations_reachable(scenario: Scenario, source: str) -> None:
 
 
 MAX_FAILURES_SHOWN = 5
-"""Largest number of failed runs of a scenario that are printed in full. For further runs, only
-the seeds are printed.
+"""Largest number of failed runs per scenario that are printed in full. Only the seeds of
+further ones are printed.
 """
 
 TRIAL_COLUMNS = ("", "scenario", "expected", "limit", "worst", "margin", "held")
-"""Headers of the columns of the table of expectations."""
+"""Column headers of the table of expectations."""
 
 
 class _ExpectationRow(NamedTuple):
     """One expectation of a scenario, with the results of all runs of this scenario.
 
-    The runs differ in their seeds. The object is a row in the table of a `TrialReport`.
+    The runs differ in their seeds. This object is one row in the table of a `TrialReport`.
 
     Attributes:
         scenario: Name or path of the scenario, as in a command.
@@ -573,11 +573,11 @@ class TrialReport(Result):
 LANE_RUNS = 32
 """Number of trials that a worker gets at once, to compute them side by side."""
 _RUN_ERRORS = (TrilatError, ArithmeticError, ValueError, MemoryError)
-"""Errors that concern a single trial."""
+"""Errors that affect a single trial only."""
 
 
 class _TrialItem(NamedTuple):
-    """A trial for a worker.
+    """A trial to be run by a worker.
 
     Attributes:
         trial: The trial.
@@ -599,8 +599,8 @@ def _run_trial_here(item: _TrialItem) -> TrialResult:
 def _run_trial(item: _TrialItem) -> TrialResult:
     """Runs a trial in a worker process.
 
-    An error that concerns only this trial becomes its result, so that the other trials of the
-    worker still run.
+    An error that affects only this trial becomes its result, so the other trials of the worker
+    still run.
     """
     try:
         return item.trial.run()
@@ -609,23 +609,23 @@ def _run_trial(item: _TrialItem) -> TrialResult:
 
 
 def _run_trials_here(items: Sequence[_TrialItem]) -> Iterator[TrialResult]:
-    """Runs several trials in this process, side by side where that is possible."""
+    """Runs several trials in this process, side by side where possible."""
     return _run_side_by_side(items, _run_trial_here)
 
 
 def _run_trials(items: Sequence[_TrialItem]) -> Iterator[TrialResult]:
-    """Runs several trials in a worker process, side by side where that is possible."""
+    """Runs several trials in a worker process, side by side where possible."""
     return _run_side_by_side(items, _run_trial)
 
 
 def _run_side_by_side(
     items: Sequence[_TrialItem], run_alone: Callable[[_TrialItem], TrialResult]
 ) -> Iterator[TrialResult]:
-    """Runs several trials, side by side where that is possible.
+    """Runs several trials, side by side where possible.
 
     Args:
         items: The trials.
-        run_alone: Function that runs one trial.
+        run_alone: Runs one trial.
 
     Yields:
         The results in the order of the trials, equal to those of `run_alone`.
@@ -686,7 +686,7 @@ def run_trials(
 def _iterate_results(
     pool: WorkerPool, batch: Sequence[Trial]
 ) -> Iterator[tuple[int, TrialResult]]:
-    """Yields the index and the result of each trial, in the order in which the trials end.
+    """Yields the index and the result of each trial, in order of completion.
 
     Args:
         pool: Workers that run the trials.
@@ -774,12 +774,13 @@ def check(
 
 
 def _format_margin(margin: float | None) -> str:
-    """Returns a margin as a text in percent, with a sign.
+    """Formats a margin in percent, with a sign.
 
     Margins below 10 % have one decimal place.
 
     Args:
-        margin: Distance to a limit as a fraction of the limit. `None` becomes an empty text.
+        margin: Distance from a limit as a fraction of the limit. `None` becomes an empty
+            string.
     """
     if margin is None:
         return ""
@@ -790,7 +791,7 @@ def _format_margin(margin: float | None) -> str:
 def _list_repeat_commands(result: TrialResult) -> list[str]:
     """Returns two lines with the commands that repeat a failed run and show its motion.
 
-    A live run already has a log, so a report of this log shows the motion.
+    A live run already has a log, so a report on this log shows the motion.
     """
     look = f"trilat report {result.log}" if result.log else result.trial.look
     return [f"again: {result.trial.again}", f"look:  {look}"]
@@ -801,7 +802,7 @@ _NOT_XML = re.compile(r"[^\t\n\r\x20-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
 
 
 def _add_properties(suite: Xml.Element, results: Sequence[TrialResult]) -> None:
-    """Adds the common properties of all runs of a scenario to its JUnit suite.
+    """Adds the properties that all runs of a scenario share to its JUnit suite.
 
     Examples are the driver (live or virtual), the overrides and the duration.
 
@@ -839,10 +840,10 @@ def _build_count_attributes(results: Sequence[TrialResult]) -> dict[str, str]:
 
 
 def _add_case(suite: Xml.Element, result: TrialResult) -> None:
-    """Adds a run to its JUnit suite as a test case, with the run's problem if there is one.
+    """Adds a run to its JUnit suite as a test case.
 
-    A run without a result is an error. Unmet expectations together are one failure, whose text
-    has the commands that repeat the run.
+    A run without a result is an error. All unmet expectations of a run form one failure, whose
+    text contains the commands that repeat the run.
 
     Args:
         suite: Suite of the scenario.
@@ -870,7 +871,7 @@ def _add_case(suite: Xml.Element, result: TrialResult) -> None:
 
 
 def _describe_outcome(outcome: ExpectationResult) -> str:
-    """Returns a line about an expectation: the measured value, the limit and the margin.
+    """Returns a line on an expectation, with the measured value, the limit and the margin.
 
     Example: "FAIL error_rad: 0.031 rad, expected at most 0.02 rad".
     """
@@ -880,9 +881,9 @@ def _describe_outcome(outcome: ExpectationResult) -> str:
 
 
 def _replace_forbidden(text: str) -> str:
-    """Returns a text in which the characters that XML forbids are replaced by U+FFFD.
+    """Replaces characters that XML does not allow by U+FFFD.
 
-    An error message of a user's code may contain any character, and a build server would reject
-    the whole report.
+    The error message of a user's code may contain any character, and a build server would
+    reject the complete report.
     """
     return _NOT_XML.sub("\N{REPLACEMENT CHARACTER}", text)

@@ -185,7 +185,7 @@ class TeleoperationVectorEnv(SyncVectorEnv[Any, Any]):
         )
 
     def _read_actions(self, actions: Any, is_needed: Flags) -> Array:
-        """Converts the actions of all environments to an array, and checks them.
+        """Converts the actions of all environments to an array and checks them.
 
         An environment that is about to begin an episode ignores its action, which need not be
         finite.
@@ -195,10 +195,10 @@ class TeleoperationVectorEnv(SyncVectorEnv[Any, Any]):
             is_needed: True for environments that use their action.
 
         Returns:
-            The actions, shape (environments, numbers of an action).
+            The actions, shape (environments, action size).
 
         Raises:
-            UsageError: The shape is wrong, or a value is not finite.
+            UsageError: The shape is wrong, or an entry is not finite.
         """
         shape = (self.num_envs, self._members[0].action_size)
         try:
@@ -220,7 +220,7 @@ class TeleoperationVectorEnv(SyncVectorEnv[Any, Any]):
         """Inserts observations of single environments into those of all environments.
 
         Args:
-            batched: Observations of all environments, which are changed in place. If `None`,
+            batched: Observations of all environments, which are modified in place. If `None`,
                 the observations of the previous step are used.
             single: The observations to insert, by index of the environment.
 
@@ -244,13 +244,12 @@ class TeleoperationVectorEnv(SyncVectorEnv[Any, Any]):
         This is Gymnasium's reset mode "SameStep".
 
         Args:
-            batch: Observations of all environments, which are changed in place.
+            batch: Observations of all environments, which are modified in place.
             infos: Information of all environments.
 
         Returns:
-            The observations, in which the observations of new episodes replace those of ended
-            episodes.
-            The information, with "final_obs" and "final_info" of the ended episodes.
+            The observations, in which those of new episodes replace those of ended episodes;
+            and the information, with "final_obs" and "final_info" of the ended episodes.
         """
         observations = {}
         for index in np.flatnonzero(self._autoreset_envs).tolist():
@@ -280,7 +279,7 @@ class TeleoperationVectorEnv(SyncVectorEnv[Any, Any]):
         return super().render()
 
     def _write_back(self) -> None:
-        """Copies the states of episodes that were simulated together into their environments.
+        """Copies the states of jointly simulated episodes back into their environments.
 
         The environments can then draw and save their episodes.
         """
@@ -289,10 +288,10 @@ class TeleoperationVectorEnv(SyncVectorEnv[Any, Any]):
 
 
 class _Results:
-    """Results of one step of all environments, as Gymnasium's vector environments return them.
+    """Results of one step of all environments, in the format that Gymnasium expects.
 
-    At most 64 environments are simulated together. Larger numbers are divided into parts, each
-    of which writes its results into this object.
+    At most 64 environments are simulated together. Larger numbers are split into parts, each of
+    which writes its results into this object.
 
     Args:
         count: Number of environments.
@@ -362,9 +361,8 @@ class _Results:
 class _LaneEnvs:
     """Environments that are simulated together, each in one lane of the vector registers.
 
-    An episode is assigned to its lane before its first step, if its scenario has the same
-    structure as the scenarios of the other lanes. Otherwise the environment is stepped by
-    itself.
+    An episode is assigned to its lane before its first step, provided that its scenario has the
+    same structure as those of the other lanes. Otherwise the environment is stepped on its own.
 
     Args:
         envs: The environments, at most `LaneEpisodes.most_runs`.
@@ -432,10 +430,10 @@ class _LaneEnvs:
                 self._load_task(lane, env)
 
     def _load_episode(self, lane: int, env: TeleoperationEnv) -> None:
-        """Adds a new episode to those that are simulated side by side, if that is possible.
+        """Adds a new episode to those that are simulated side by side, if possible.
 
         Args:
-            lane: The lane.
+            lane: Lane of the episode.
             env: The environment.
         """
         self._runs[lane] = env.run
@@ -470,7 +468,7 @@ class _LaneEnvs:
         one.
 
         Args:
-            lane: The lane.
+            lane: Lane of the episode.
             env: The environment.
         """
         self._tasks[lane] = env.task
@@ -541,10 +539,10 @@ class _LaneEnvs:
             self._write_lane(lane, ends=True)
 
     def _advance(self, is_active: Flags) -> None:
-        """Simulates one step of all active episodes, which consists of many control periods.
+        """Simulates one step, which consists of many ticks, of all active episodes.
 
-        The operator applies an action only after its delay, which may begin within a step. The
-        step is then simulated in two parts.
+        The operator applies an action only after its delay. If this moment lies within a step,
+        the step is simulated in two parts.
 
         Args:
             is_active: True for lanes that are stepped.
@@ -573,8 +571,8 @@ class _LaneEnvs:
     def _locate(self, q: Array) -> Array:
         """Returns the pose of the user's arm in the coordinates of an action, for each lane.
 
-        The compiled operators call it to find the position from which an action starts. The
-        coordinates are joint angles, or the position of the end effector.
+        The coordinates are joint angles, or the position of the end effector. The compiled
+        operators use this pose as the position from which an action starts.
 
         Args:
             q: Joint angles in each lane, shape (lanes, 2), in rad.
@@ -608,7 +606,7 @@ class _LaneEnvs:
 
         Args:
             state: State after the step.
-            succeeded: True for lanes whose task is done.
+            succeeded: True for lanes whose task is complete.
         """
         env = self._envs[0]
         peers = env.scenario.peers(env.leads)
@@ -653,7 +651,7 @@ class _LaneEnvs:
         """Copies the state of one episode from the common arrays into its environment.
 
         Args:
-            lane: The lane.
+            lane: Lane of the episode.
             ends: True if the episode has ended.
         """
         env = self._envs[lane]
@@ -695,7 +693,7 @@ class _LaneEnvs:
 
 
 class _State:
-    """State of all jointly simulated episodes after a step, to compute observations from.
+    """State of all jointly simulated episodes after a step, used to compute observations.
 
     Args:
         envs: The environments.
@@ -721,9 +719,9 @@ class _State:
         return np.ascontiguousarray(self._lanes.read_links(name, i).transpose(1, 0, 2))
 
     def _find_view(self) -> dict[str, Array]:
-        """Returns the view of the user's operator in each lane, by the names of `HandView`.
+        """Returns the view of the user's operator in each lane, with the names of `HandView`.
 
-        The arrays have one row per lane. They are computed once per step.
+        The arrays have one row per lane and are computed once per step.
         """
         if self._view:
             return self._view
@@ -819,7 +817,7 @@ class _State:
 class _ReachTasks:
     """State of the task `ReachTask` (move to a point) in several episodes, as arrays.
 
-    The rewards of all episodes are computed together, which is faster.
+    Computing the rewards of all episodes together is faster.
 
     Args:
         count: Number of lanes.
@@ -876,7 +874,7 @@ class _ReachTasks:
 
 
 def _tick_ns(ticks: NDArray[np.int64], rate_hz: int) -> NDArray[np.int64]:
-    """Returns the nominal times of ticks, in ns, by the same equation as `tick_ns`."""
+    """Returns the nominal times of ticks, in ns, computed as in `tick_ns`."""
     # the Python function behind the compiled one, because it accepts arrays
     plain: Any = getattr(tick_ns, "py_func", tick_ns)
     times: NDArray[np.int64] = plain(ticks, rate_hz)
@@ -891,12 +889,12 @@ def _take(values: Any, where: NDArray[np.int64], is_all: bool) -> Any:
 
 
 def _return(env: TeleoperationEnv) -> TeleoperationEnv:
-    """Returns its argument. With `partial`, it becomes a factory of environments."""
+    """Returns its argument. Used with `partial` to create a factory of environments."""
     return env
 
 
 def _copy_env(env: TeleoperationEnv) -> TeleoperationEnv:
-    """Returns an environment with the same settings, but with its own copy of the task."""
+    """Returns an environment with the same settings but its own copy of the task."""
     other = copy.copy(env)
     other.task = copy.deepcopy(env.task)
     return other
@@ -909,11 +907,11 @@ def _find_hand_row(env: TeleoperationEnv) -> int:
 
 
 def _explain_steps(env: TeleoperationEnv, *, compiles: bool = True) -> str:
-    """Explains why the present episode of an environment cannot be simulated with others.
+    """Explains why the current episode of an environment cannot be simulated with others.
 
     Args:
         env: The environment.
-        compiles: True to find out whether the laws can be compiled in lanes.
+        compiles: True to find out whether the laws can be compiled for lanes.
 
     Returns:
         The reason. Empty if the episode can be simulated with others.
@@ -932,7 +930,7 @@ def _explain_steps(env: TeleoperationEnv, *, compiles: bool = True) -> str:
 
 
 def _select(infos: Mapping[str, Any], index: int) -> dict[str, Any]:
-    """Returns the information about one environment from the information of all environments.
+    """Extracts the information about one environment from that of all environments.
 
     Args:
         infos: Information of all environments.
@@ -956,14 +954,14 @@ def _select(infos: Mapping[str, Any], index: int) -> dict[str, Any]:
 
 
 def _copy_observations(batch: Any) -> Any:
-    """Returns a copy of observations, which are one array or a dictionary of arrays."""
+    """Copies observations, which are either one array or a dictionary of arrays."""
     if isinstance(batch, np.ndarray):
         return batch.copy()
     return {name: values.copy() for name, values in batch.items()}
 
 
 def _select_observation(batch: Any, i: int) -> Any:
-    """Returns the observation of one environment from the observations of all environments."""
+    """Extracts the observation of one environment from those of all environments."""
     if isinstance(batch, np.ndarray):
         return batch[i]
     return {name: values[i] for name, values in batch.items()}

@@ -482,8 +482,8 @@ def _list_quantities(results: BenchResults) -> list[tuple[str, str]]:
         results: Results of the benchmark or of part of it.
 
     Returns:
-        One pair per table: the name of a task that ran and the name of a quantity, a key of
-            `QUANTITIES`.
+        One pair per table, the name of a task that ran and the name of a quantity (a key of
+        `QUANTITIES`).
     """
     tasks = results.plan.tasks
     pairs = [(task, quantity) for quantity in _QUANTITIES_OF_ALL for task in tasks]

@@ -782,8 +782,7 @@ _DPI = 300
 
 
 def _list_notes(chart: StabilityMap) -> list[str]:
-    """Returns the notes below a map: the origin of its lines, and the gains that were not
-    swept.
+    """Returns the notes below a map: the origin of its lines and the gains that were not swept.
 
     A line that several panels share is explained once.
     """
@@ -947,9 +946,9 @@ def _compare_with_line(edge: StabilityEdge, values: Sequence[float]) -> list[str
         values: Values at which the line crosses the column of the edge.
 
     Returns:
-        Two table cells: the crossing nearest to the edge, and its relative difference from the
-            middle of the edge, or "within" if the crossing lies within the edge. Both are "-"
-            if there is no crossing.
+        Two table cells. The first is the crossing nearest to the edge, the second its relative
+        difference from the middle of the edge, or "within" if the crossing lies within the
+        edge. Both are "-" if there is no crossing.
     """
     if not values:
         return ["-", "-"]

@@ -27,21 +27,21 @@ from .sweep_cell import CellResult, CellRun, apply_diff, diff_lines
 from .sweep_plan import SweepPlan
 
 ResultRow = Mapping[str, Any]
-"""One run, as a mapping with these keys: `cell`, the value of each axis under the key of the
+"""One run, as a mapping with these keys: `cell`, the value on each axis under the key of the
 axis, `law`, `seed`, `random`, the further metrics under their keys, all fields of `CellResult`,
-`scenario_sha256`, `command` and `scenario`. The classes of the run are texts. `scenario` is the
-canonical text of the scenario that was run.
+`scenario_sha256`, `command` and `scenario`. The classes of the run are strings. `scenario` is
+the canonical text of the scenario that was run.
 """
 ROWS_IN_MEMORY = 20_000
-"""Largest number of rows of a table that are kept in memory, about 5 kB each."""
+"""Largest number of table rows that are kept in memory, at about 5 kB each."""
 _SCENARIO_COLUMN = "scenario_changes"
-"""Column of the CSV table with the scenario of the row. To save space it contains only the
+"""Column of the CSV table for the scenario of a row. To save space, it contains only the
 differences from the swept scenario, as JSON.
 """
 
 _LONGEST_CELL = 2**26
-"""Largest number of characters in a cell of the CSV table. A scenario that contains a delay
-trace exceeds the default limit of the csv module, 131 072 characters.
+"""Largest number of characters in a cell of the CSV table. A scenario with a delay trace
+exceeds the default limit of the csv module, 131 072 characters.
 """
 
 
@@ -93,7 +93,7 @@ class ResultTable:
         yield from encode_table(map(self._add_changes, rows), column_types)
 
     def _add_changes(self, row: ResultRow) -> ResultRow:
-        """Returns a row with the column that stands for its scenario in the CSV table."""
+        """Returns a row with the column that represents its scenario in the CSV table."""
         changes = diff_lines(row["scenario"], self._plan.base.text)
         return {**row, _SCENARIO_COLUMN: json.dumps(changes, ensure_ascii=False)}
 
@@ -154,9 +154,7 @@ class ResultTable:
             yield self._build_row(entry, f"cell-{entry.cell}{suffix}.mcap")
 
     def _build_row(self, entry: CellRun, log: str) -> ResultRow:
-        """Returns the table row of a finished simulation, with the command that repeats it.
-
-        The row has the parameter values (cell) and the results.
+        """Returns the table row of a finished run, including the command that repeats it.
 
         Args:
             entry: The run.
@@ -273,7 +271,7 @@ class StoredRows(Sequence[ResultRow]):
             return [self._table.parse(line) for line in lines]
 
     def _iterate_lines(self) -> Iterator[dict[str, str]]:
-        """Yields each row of the file as texts by column, without converting them to values."""
+        """Yields each row of the file as a mapping from column name to unparsed string."""
         with (
             self._explaining_errors(),
             self._file.open(encoding="utf-8", newline="") as stream,
@@ -285,7 +283,7 @@ class StoredRows(Sequence[ResultRow]):
                     yield self._name_fields(fields)
 
     def _name_fields(self, fields: Sequence[str]) -> dict[str, str]:
-        """Returns the fields of one line of the CSV table by the names of their columns.
+        """Maps the column names to the fields of one line of the CSV table.
 
         Raises:
             ValueError: The row has too few or too many fields.
@@ -294,7 +292,7 @@ class StoredRows(Sequence[ResultRow]):
 
     @contextmanager
     def _explaining_errors(self) -> Iterator[None]:
-        """Replaces errors of a damaged CSV table by an error that names the file.
+        """Converts errors from a damaged CSV table to a UsageError that names the file.
 
         Raises:
             UsageError: The table cannot be read.
@@ -308,13 +306,13 @@ class StoredRows(Sequence[ResultRow]):
 
 
 def _read_next(reader: Iterator[list[str]]) -> list[str] | None:
-    """Reads the next row of a CSV table, whose cells may hold the whole text of a scenario.
+    """Reads the next row of a CSV table, whose cells may contain the full text of a scenario.
 
-    The limit of the csv module applies to the whole process. Therefore, it is raised only
+    The field size limit of the csv module applies to the whole process, so it is raised only
     during this call.
 
     Returns:
-        The fields of the row. `None` after the last row.
+        The fields of the row, or `None` after the last row.
     """
     limit = csv.field_size_limit(_LONGEST_CELL)
     try:
@@ -324,9 +322,9 @@ def _read_next(reader: Iterator[list[str]]) -> list[str] | None:
 
 
 def _list_result_columns(plan: SweepPlan) -> dict[str, type]:
-    """Returns the columns of the CSV table in their order, each with the type of its values.
+    """Returns the column names of the CSV table, in order, mapped to the type of their values.
 
-    The column with the scenario is not listed, because it needs special treatment.
+    The scenario column is not included, because it needs special treatment.
     """
     column_types = {**plan.list_axis_columns(), "seed": int, "random": bool}
     # All fields of a result are numbers, except those whose types are corrected below.
@@ -341,7 +339,7 @@ def _format_cell(value: Any, kind: type) -> str:
     """Converts a value to a field of a CSV table, from which numbers can be read bit for bit.
 
     Args:
-        value: The value. `None` becomes an empty text.
+        value: The value. `None` becomes an empty string.
         kind: Type of the column.
     """
     if value is None:
@@ -355,12 +353,12 @@ def _parse_cell(text: str, kind: type) -> Any:
     """Converts a field of a sweep's CSV table to a value; the inverse of `_format_cell`.
 
     Args:
-        text: Text of the cell.
+        text: Text of the field.
         kind: Type of the column.
 
     Raises:
-        ValueError: The text is not a number although the column contains numbers.
-            It is neither "true" nor "false" although the column contains bools.
+        ValueError: The text is not a number in a numeric column, or is neither "true" nor
+            "false" in a column of bools.
     """
     if kind is str:
         return text

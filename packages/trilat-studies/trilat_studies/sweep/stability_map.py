@@ -58,7 +58,7 @@ PanelSettings = tuple[tuple[str, Any], ...]
 CELL_CLASSES = RUN_CLASSES
 """Classes of a run, in the order of the last dimension of `MapPanel.counts`."""
 MAX_PANELS = 12
-"""Largest number of panels of a map, so that the panels remain legible."""
+"""Largest number of panels of a map at which they remain legible."""
 
 
 class PlaneAxis(NamedTuple):
@@ -447,7 +447,7 @@ class MapPlane(NamedTuple):
 
 
 class _PanelRuns:
-    """Counts the simulations of one panel of a map by grid point and by result.
+    """Counts the runs of one panel of a map by grid point and by class.
 
     The growth exponents of each grid point are averaged.
 
@@ -499,8 +499,8 @@ _CLASS_INDEX = {verdict.value: index for index, verdict in enumerate(CELL_CLASSE
 def _format_panel_title(settings: PanelSettings, scenario: Scenario) -> str:
     """Returns the title of a panel of the stability map, such as "p d, delay 200 ms".
 
-    Numbers are given with the name and unit of their key. Other values are given alone. Their
-    underscores become spaces, except in the name of a law.
+    Numbers are shown with the name and unit of their key. Other values are shown on their own,
+    with underscores replaced by spaces except in the name of a law.
     """
     texts = []
     for key, value in settings:
@@ -537,7 +537,8 @@ class StabilityEdge(NamedTuple):
 _GRAVITY = slice(3, 5)
 """Indices of the arm parameters of Eq. (24) that appear in the gravity torque."""
 _ROUNDING = 1e-6
-"""Tolerance for rounding errors, for delays in ticks and for relative positions of edges."""
+"""Tolerance for rounding errors, both for delays in ticks and for relative positions of edges.
+"""
 
 
 class StabilityCriterion(NamedTuple):
@@ -635,8 +636,8 @@ def _evaluate_damping_criterion(scenario: Scenario) -> StabilityCriterion | None
 
         4 d1 d2 > (T1 + T2)^2 K1 K2.
 
-    For N equal sites with delay T, whose matrix of dominance factors alpha is reversible and
-    has the least eigenvalue lambda_min, the loop is stable if
+    For N identical sites with delay T and a reversible matrix alpha of dominance factors, whose
+    smallest eigenvalue is lambda_min, the loop is stable if
 
         d > max(abs(lambda_min), 0.2172) K T.
 
@@ -645,7 +646,7 @@ def _evaluate_damping_criterion(scenario: Scenario) -> StabilityCriterion | None
     (docs/theory/damping-conditions.md, 13).
 
     Returns:
-        The condition. `None` if it does not cover the scenario.
+        The condition, or `None` if it does not cover the scenario.
     """
     if scenario.scheme != "second_order":
         return None
@@ -733,24 +734,24 @@ _CIRCLE_POINTS = 400
 def _sample_unit_circle(delay_ticks: float) -> tuple[Array, Array, Array]:
     """Returns the frequencies at which the stability criteria of P+d are evaluated.
 
-    The loop is sampled with the tick period h. At its limit of stability, a root lies at
-    z = exp(i phi) on the unit circle, where phi = w h for the frequency w. For the integration
-    scheme "second_order", the equation of such a root contains two functions of t = tan(phi/2)
+    The loop is sampled with the tick period h. At its stability limit, a root lies at z = exp(i
+    phi) on the unit circle, where phi = w h for the frequency w. For the integration scheme
+    "second_order", the equation of such a root contains two functions of t = tan(phi/2)
     (docs/theory/damping-conditions.md, 13):
 
-    - the discrete frequency v = 2 t, in units of 1/h. For small phi it equals phi;
+    - the discrete frequency v = 2 t, in units of 1/h, which equals phi for small phi;
     - the lag 2 t^3 / (1 + 3 t^2), by which the scheme reduces the damping.
 
     The criteria take an extreme value over all phi, so the angles need not be sorted. The first
-    angle approximates the limit phi -> 0. A dense part of the angles covers the first turn of
-    the delay, where phi * `delay_ticks` goes from 0 to 2 pi. The other angles lie between 0 and
+    angle approximates the limit phi -> 0. A dense set of angles covers the first turn of the
+    delay, where phi * `delay_ticks` goes from 0 to 2 pi. The remaining angles lie between 0 and
     pi.
 
     Args:
         delay_ticks: Delay of the loop, in ticks.
 
     Returns:
-        The angles phi in rad, the discrete frequencies v, and the lags, of equal shape.
+        The angles phi in rad, the discrete frequencies v, and the lags, all of the same shape.
     """
     almost_zero = 1e-7 / delay_ticks
     first_turn_end = min(2.0 * np.pi / delay_ticks, 3.0)  # below pi, where t is infinite
@@ -765,26 +766,27 @@ def _sample_unit_circle(delay_ticks: float) -> tuple[Array, Array, Array]:
 
 
 def _compute_required_ratio(least_eigenvalue: float, delay_ticks: int) -> float:
-    """Returns the damping that equal sites with the law P+d need, relative to K T.
+    """Returns the damping that identical sites with the law P+d need, relative to K T.
 
     K is the stiffness, d the damping, and T = n h the delay, where h is the tick period. Let a
-    be a number between the least eigenvalue of the matrix of dominance factors (the weights
-    with which the sites follow each other) and the largest eigenvalue, 1. A root on the unit
-    circle at the angle phi, with the discrete frequency v and the lag of `_sample_unit_circle`,
-    requires (docs/theory/damping-conditions.md, 13):
+    be a number between the smallest eigenvalue of the matrix of dominance factors and its
+    largest eigenvalue, 1. A root on the unit circle at the angle phi, with the discrete
+    frequency v and the lag of `_sample_unit_circle`, requires
+    (docs/theory/damping-conditions.md, 13):
 
         d / (K T) = (lag (1 - a cos(n phi)) - a sin(n phi)) / (v n)
 
-    If d / (K T) exceeds the largest value of the right side, there is no such root, and the
-    loop is stable. The right side is linear in a, so only the two extreme values of a matter.
+    If d / (K T) exceeds the largest value of the right-hand side, there is no such root, and
+    the loop is stable. Since the right-hand side is linear in a, only the two extreme values of
+    a matter.
 
     Args:
-        least_eigenvalue: Least eigenvalue of the matrix of dominance factors, which must be
+        least_eigenvalue: Smallest eigenvalue of the matrix of dominance factors, which must be
             reversible.
         delay_ticks: Delay n, in ticks.
 
     Returns:
-        The largest value of the right side, without a unit.
+        The largest value of the right-hand side, dimensionless.
     """
     phi, discrete_frequency, lag = _sample_unit_circle(delay_ticks)
     cosine = np.cos(delay_ticks * phi)
@@ -801,20 +803,19 @@ def _compute_required_ratio(least_eigenvalue: float, delay_ticks: int) -> float:
 def _compute_pair_excess(
     K: list[float], d: list[float], mean_delay_ticks: float, rate_hz: float
 ) -> float:
-    """Returns the excess of two sites' damping under the law P+d over the required damping.
+    """Returns the margin of two P+d sites' damping over the required damping, in N m s/rad.
 
     In continuous time, the loop is stable if 2 sqrt(d1 d2) > (T1 + T2) sqrt(K1 K2), with
     stiffnesses K, dampings d and delays T. In the sampled loop, two quantities depend on the
     frequency (docs/theory/damping-conditions.md, 13). With the angle phi, the discrete
-    frequency v in 1/s, the lag of `_sample_unit_circle` and the mean delay of n ticks, they
-    are:
+    frequency v in 1/s, the lag of `_sample_unit_circle` and a mean delay of n ticks, they are:
 
         effective damping of a site = d - K lag / v, at least 0
         effective mean delay = abs(sin(n phi) + lag cos(n phi)) / v
 
     The difference between the two sides of the condition is computed with these quantities, and
-    the least value over all frequencies is returned. For phi -> 0, the effective quantities are
-    d and (T1 + T2) / 2.
+    its minimum over all frequencies is returned. For phi -> 0, the effective quantities are d
+    and (T1 + T2) / 2.
 
     Args:
         K: Stiffnesses of the two sites, in N m/rad.
@@ -823,7 +824,7 @@ def _compute_pair_excess(
         rate_hz: Tick rate of both sites.
 
     Returns:
-        The least difference, in N m s/rad. Positive if the loop is stable.
+        The minimum difference. Positive if the loop is stable.
     """
     phi, discrete_frequency, lag = _sample_unit_circle(mean_delay_ticks)
     frequency_per_s = discrete_frequency * rate_hz
@@ -852,16 +853,16 @@ def _evaluate_sampling_criterion(scenario: Scenario) -> StabilityCriterion | Non
 
     where g is the gravitational acceleration, h the period of a tick and Kp the damping gain of
     the law. This is a rule of thumb for arms of about 1 m, because a factor of length squared,
-    about 1 m^2, is left out. It holds for the integration scheme `digital`, and for delays of
-    at most one tick.
+    about 1 m^2, is omitted. It holds for the integration scheme `digital`, and for delays of at
+    most one tick.
 
     Only the gains of the parameters in the gravity torque matter, and the largest of them is
     used.
 
     Returns:
-        The condition for the site with the smallest excess. The excess is Kp - Gamma g^2 h, and
-        is positive if the condition is met. `None` if a site has another law, or if the
-        condition does not cover the scenario for another reason.
+        The condition for the site with the smallest excess, Kp - Gamma g^2 h, which is positive
+        if the condition is met. `None` if a site has another law, or if the condition does not
+        cover the scenario for another reason.
     """
     delays_s = _list_delays_s(scenario)
     if scenario.scheme != "digital" or delays_s is None:
@@ -891,10 +892,10 @@ def _evaluate_sampling_criterion(scenario: Scenario) -> StabilityCriterion | Non
 def _list_delays_s(scenario: Scenario) -> list[float] | None:
     """Returns the constant delays of all links whose samples influence an arm, in s.
 
-    Links with a dominance factor of 0 are left out: their samples have no effect.
+    Links with a dominance factor of 0 are excluded, because their samples have no effect.
 
     Returns:
-        The delays. `None` if a delay is not constant, or if a link loses messages.
+        The delays, or `None` if a delay is not constant or a link loses messages.
     """
     delays_s = []
     for site in scenario.names:
@@ -914,29 +915,29 @@ def _list_delays_s(scenario: Scenario) -> list[float] | None:
 
 
 PanelLoader = Callable[[float, float], Scenario]
-"""Function that returns the scenario of a panel at any values of x and y."""
+"""Returns the scenario of a panel at any values of x and y."""
 
 _MAX_ROOT_STEPS = 500
-"""Largest number of iterations of Brent's method."""
+"""Maximum number of iterations of Brent's method."""
 LINEAR_ANALYSIS = "linear analysis"
-"""Name of the line of the linear analysis in the legend."""
+"""Name of the line from the linear analysis, in the legend."""
 _ABOUT_ROOTS = "where the rightmost root of the linearised loop crosses the imaginary axis"
-"""Explanation of this line on the page of the map."""
+"""Explanation of the line from the linear analysis, on the page of the map."""
 
 
 _NO_COLUMNS: Array = np.zeros((0, 0))
 _FINE_COLUMNS = 24
-"""Smallest number of steps along x with which a line from theory is drawn."""
+"""Minimum number of steps along x with which a theoretical line is drawn."""
 
 
 class _FineColumns(NamedTuple):
-    """Columns at which a line from theory is computed, between and beside a map's own columns.
+    """Columns at which a theoretical line is computed, between and beside the map's columns.
 
-    A line from theory is curved. If it were computed only at the few columns of a coarse map,
-    the straight connections between them would be wrong.
+    Theoretical lines are curved, so straight connections between the few columns of a coarse
+    map would be wrong.
 
     Attributes:
-        values: Values of x, in rising order.
+        values: Values of x, in ascending order.
         positions: Positions along the axis at which they are drawn.
         on_grid: Indices of those columns that are also columns of the map.
     """
@@ -947,7 +948,7 @@ class _FineColumns(NamedTuple):
 
 
 def _keep_columns(axis: PlaneAxis) -> _FineColumns:
-    """Returns only the columns of a map, for lines of theory without points between them.
+    """Returns only the columns of the map, for theoretical lines with no points in between.
 
     Args:
         axis: Horizontal axis of the map.
@@ -1149,25 +1150,25 @@ ZERO_EXPONENT = "exponent = 0"
 _ABOUT_TWINS = (
     "where a small push neither grows nor dies away, interpolated linearly between cells"
 )
-"""Explanation of this line on the page of the map."""
+"""Explanation of the line of zero growth exponents, on the page of the map."""
 
 
 ZERO_RATE = "growth rate = 0"
-"""Name of the line of zero growth rates of a sweep that is judged linearly."""
+"""Name of the line of zero growth rates in a sweep that is judged linearly."""
 
 
 def _trace_zero_exponent(plane: MapPlane, panel: MapPanel) -> MapLine | None:
-    """Finds the measured line on a map on which small disturbances neither grow nor die away.
+    """Traces the measured line on which the growth exponent is zero.
 
-    On this line, the growth exponent is zero. The exponent is the rate, in 1/s, at which a
-    small disturbance grows.
+    The exponent is the rate, in 1/s, at which a small disturbance grows. On this line,
+    disturbances neither grow nor decay.
 
     Args:
         plane: The map.
-        panel: Part of the map with the exponent at each grid point.
+        panel: Panel of the map with the exponent at each grid point.
 
     Returns:
-        The line. `None` if it does not cross this part of the map.
+        The line, or `None` if it does not cross this panel.
     """
     name = ZERO_RATE if plane.is_linear else ZERO_EXPONENT
     line = MapLine(
@@ -1183,9 +1184,8 @@ def _trace_zero_exponent(plane: MapPlane, panel: MapPanel) -> MapLine | None:
 def _find_sign_changes(values: Sequence[float]) -> list[int]:
     """Returns the indices n at which the values n and n + 1 have different signs.
 
-    Between such values lies an edge of stability, for example where a growth rate becomes
-    positive. Zero counts as negative. Values that are not finite do not take part in any change
-    of sign.
+    Such values enclose an edge of stability, for example where a growth rate becomes positive.
+    Zero counts as negative. Values that are not finite are never part of a change of sign.
     """
     indices = list[int]()
     for n, (value, following) in enumerate(pairwise(values)):
@@ -1199,30 +1199,30 @@ def _find_sign_changes(values: Sequence[float]) -> list[int]:
 def _place_zeros(
     values: Sequence[float], excess: Sequence[float], edges: Mapping[int, float]
 ) -> Array:
-    """Changes a quantity along a column so that its linear interpolation is zero at the edges.
+    """Adjusts a quantity along a column so that its linear interpolation is zero at the edges.
 
-    The lines of a map are drawn where the linear interpolation between grid points is zero. The
-    quantity may be nonlinear between two grid points, so this zero would differ from the true
-    zero, the edge. Therefore the value above each edge is changed. Let v be the value below the
-    edge, u the value above it, and f the position of the edge in the interval, from 0 to 1. The
-    linear interpolation is zero at the edge if
+    The lines of a map are drawn where the linear interpolation between grid points is zero. If
+    the quantity is nonlinear between two grid points, this zero differs from the true zero,
+    which is the edge. The value above each edge is therefore adjusted. Let v be the value below
+    the edge, u the value above it, and f the position of the edge in the interval, from 0 to 1.
+    The linear interpolation is zero at the edge if
 
         v + f (u - v) = 0,   that is,   u = v (1 - 1/f).
 
-    u keeps its sign, which is opposite to that of v. The values are changed from the bottom to
-    the top. Therefore v is the value that may have been changed for an edge below it.
+    u keeps its sign, which is opposite to that of v. The values are adjusted from bottom to
+    top, so v may itself have been adjusted for an edge below it.
 
-    All other values stay. They determine where a line that is too steep to cross this column or
-    the next one passes between them.
+    All other values remain unchanged. They determine where a line that is too steep to cross
+    this column or the next one passes between them.
 
     Args:
-        values: Values of the axis along the column, in rising order, shape (y,).
+        values: Values of the axis along the column, in ascending order, shape (y,).
         excess: The quantity at these values, shape (y,).
         edges: Position of each edge, by the index n of the interval from value n to n + 1. An
             edge that is missing is placed at the zero of the linear interpolation.
 
     Returns:
-        The changed quantity, a column of `MapLine.excess`.
+        The adjusted quantity, a column of `MapLine.excess`.
     """
     placed: Array = np.where(np.isfinite(excess), excess, np.nan)
     placed[placed == 0.0] = -_ROUNDING  # zero counts as negative
@@ -1243,7 +1243,7 @@ def _place_zeros(
 
 
 LAW_AXIS = "law"
-"""Key of the axis of control laws."""
+"""Key of the axis for control laws."""
 
 
 class StabilityMap(NamedTuple):
@@ -1352,7 +1352,7 @@ class StabilityMap(NamedTuple):
 
 
 def _build_plane_of_sweep(results: SweepResults) -> MapPlane:
-    """Arranges the simulations of a sweep in a grid for a map, with an axis per parameter.
+    """Arranges the runs of a sweep in a grid for a map.
 
     Args:
         results: The sweep.
@@ -1369,7 +1369,7 @@ def _build_plane_of_sweep(results: SweepResults) -> MapPlane:
 
 
 def _add_simulated_edges(plane: MapPlane, simulated: MapPlane) -> MapPlane:
-    """Adds the measured limits of stability of another sweep to a map, for comparison.
+    """Adds the measured edges of another sweep to a map, for comparison.
 
     Args:
         plane: The map.
@@ -1400,7 +1400,7 @@ def _spread_line(
 ) -> MapLine | None:
     """Interpolates a line from the coarse grid of a refined sweep to all grid points of a map.
 
-    Lines of theory are smooth, and the limit in each column of the coarse grid is exact.
+    Theoretical lines are smooth, and their position in each column of the coarse grid is exact.
 
     Args:
         line: The line over the coarse grid. `None` is returned as `None`.
@@ -1431,10 +1431,10 @@ def _spread_line(
 
 
 def _choose_columns(loaders: Sequence[PanelLoader], x: PlaneAxis, y: PlaneAxis) -> _FineColumns:
-    """Returns the columns at which lines from theory are computed.
+    """Returns the columns at which theoretical lines are computed.
 
-    They are only the columns of the map if the scenario is not valid between them, for example
-    because its key accepts only whole numbers.
+    If the scenario is not valid between the columns of the map, for example because its key
+    accepts only integers, only the columns of the map are returned.
     """
     fine = x.refine_columns()
     try:
@@ -1449,7 +1449,7 @@ def _choose_columns(loaders: Sequence[PanelLoader], x: PlaneAxis, y: PlaneAxis) 
 def _analyse_column(task: tuple[PanelLoader, float, PlaneAxis]) -> GrowthColumn:
     """Computes the linear analysis of one column of a panel: growth rates along y.
 
-    Worker processes call this function, so that columns are computed at the same time.
+    Worker processes call this function, so several columns can be computed at the same time.
 
     Args:
         task: Function that loads scenarios of the panel, the column's value of x, and the
@@ -1463,13 +1463,12 @@ def _analyse_column(task: tuple[PanelLoader, float, PlaneAxis]) -> GrowthColumn:
 def _load_grid_scenario(
     plan: SweepPlan, fixed: Sequence[str], x: str, y: str, x_value: float, y_value: float
 ) -> Scenario:
-    """Returns the scenario of a sweep with given values of the two parameters on a map's axes.
+    """Loads the scenario of a sweep with given values of the two parameters on a map's axes.
 
-    The values may lie between the values that were swept, to locate a limit of stability more
-    precisely.
+    The values may lie between those that were swept, to locate a stability edge more precisely.
 
     Args:
-        plan: The sweep: its scenario, axes, control laws and seeds.
+        plan: The sweep.
         fixed: Overrides KEY=VALUE of all other parameters.
         x: Scenario key of the horizontal axis.
         y: Scenario key of the vertical axis.

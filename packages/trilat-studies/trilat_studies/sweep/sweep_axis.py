@@ -24,13 +24,14 @@ from trilat_net.scenario import Scenario, is_number
 from ..run_commands import format_toml_value
 
 _ON_GRID = Decimal("1e-9")
-"""Largest distance, in steps, at which a value counts as equal to the end of a range."""
+"""Distance from the end of a range, in steps, within which a value is treated as equal to it.
+"""
 _KEYS_WITH_OPTIONS = {
     "seed": "seeds have their own option, as in --seeds 1..20",
     "duration_s": "the duration of a cell depends on its verdict: --duration sets the first "
     "duration, --longest the limit",
 }
-"""Keys that cannot be swept, each with the option that sets the key instead."""
+"""Keys that cannot be swept, mapped to the option that sets each of them instead."""
 _MAX_AXIS_VALUES = 10**12
 """Largest number of values of an axis."""
 _VALUES_EXAMPLE = "as in KEY=0:1600:50 (from, to, step) or KEY=1,2,5"
@@ -38,10 +39,10 @@ _VALUES_EXAMPLE = "as in KEY=0:1600:50 (from, to, step) or KEY=1,2,5"
 
 
 class _Steps:
-    """Sequence of equally spaced numbers, as texts.
+    """Sequence of equally spaced numbers, as strings.
 
-    A text is created only when it is accessed, because a list of all values of a long range
-    might not fit into memory.
+    Strings are created only when they are accessed, because those of a long range might not fit
+    into memory.
 
     Args:
         first: First value.
@@ -155,11 +156,11 @@ class SweepAxis(NamedTuple):
 
 
 def _join_values(values: Any) -> str:
-    """Returns the values of a swept parameter as the text after "KEY=" in a command.
+    """Formats the values of a swept parameter as the text after "KEY=" in a command.
 
     Args:
-        values: Finished text, a list, an array or a single value. A string that is a word, such
-            as in_order, stays without quotation marks.
+        values: A finished text, a list, an array or a single value. A string that is a bare
+            word, such as in_order, is not quoted.
     """
     if isinstance(values, str):
         return values
@@ -197,7 +198,7 @@ def _build_range(key: str, first: Decimal, last: Decimal, step: Decimal) -> _Ste
 
 
 def _parse_decimal(key: str, text: str) -> Decimal:
-    """Returns a number of a range as an exact decimal number.
+    """Parses a number of a range as an exact decimal number.
 
     Args:
         key: Scenario key of the axis, for error messages.
@@ -227,7 +228,7 @@ def _parse_decimal(key: str, text: str) -> Decimal:
 
 
 def _parse_list(key: str, text: str) -> tuple[str, ...]:
-    """Splits the values of a swept parameter, written as "v1,v2,v3", into separate texts.
+    """Splits the values of a swept parameter, written as "v1,v2,v3", into separate strings.
 
     Args:
         key: Scenario key of the axis, for error messages.
@@ -251,9 +252,9 @@ def _parse_list(key: str, text: str) -> tuple[str, ...]:
 
 
 def _split_outside_brackets(text: str, separator: str) -> list[str]:
-    """Splits a text at the separators that stand outside of brackets and quotation marks.
+    """Splits a string at the separators outside of brackets and quotation marks.
 
-    A value of a list may itself be a list or a text that contains the separator.
+    A value of a list may itself be a list or a string that contains the separator.
     """
     parts = [""]
     open_brackets = 0
@@ -275,9 +276,9 @@ def _split_outside_brackets(text: str, separator: str) -> list[str]:
 
 
 def _parse_value(text: str) -> Any:
-    """Returns the value that a text represents: 0.2 for "0.2", True for "true".
+    """Parses a value: "0.2" becomes 0.2, and "true" becomes True.
 
-    A text that is not valid TOML, such as gamma without quotes, is returned unchanged.
+    Text that is not valid TOML, such as gamma without quotes, is returned unchanged.
     """
     try:
         return tomllib.loads(f"value = {text}")["value"]
@@ -333,15 +334,14 @@ def label_setting(key: str, value: Any, scenario: Scenario | None = None) -> str
 
 
 def _describe_key(key: str, scenario: Scenario | None = None) -> tuple[str, str]:
-    """Splits the name of a setting, such as delay_ms, into a name and a unit for labels.
+    """Splits a scenario key, such as delay_ms, into a name and a unit for labels.
 
     Args:
         key: Scenario key, such as "sites.s.control.K" or "link.delay_ms".
         scenario: Scenario in which the names of operators and walls are looked up.
 
     Returns:
-        The name in words, such as "K of s", and the unit, which is empty if the setting has no
-        unit.
+        The name in words, such as "K of s", and the unit, which may be empty.
     """
     *tables, name = key.split(".")
     subscript = ""
@@ -357,7 +357,7 @@ def _describe_key(key: str, scenario: Scenario | None = None) -> tuple[str, str]
 
 
 def _describe_owner(tables: list[str], scenario: Scenario | None) -> str:
-    """Returns the phrase of a label that names the site, link or actor of a setting.
+    """Returns the part of a label that names the site, link or actor of a setting.
 
     Args:
         tables: Names of the tables that contain the key, from the outermost table.

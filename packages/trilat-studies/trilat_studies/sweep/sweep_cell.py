@@ -241,14 +241,14 @@ def check_sweepable(scenario: Scenario) -> None:
 
 
 class _CellInProgress:
-    """A simulation of a parameter sweep that is in progress, and may still be extended.
+    """A run of a sweep in progress, which may still be extended.
 
     Args:
-        scenario: Scenario of the cell. Its `duration_s` is the first duration.
+        scenario: Scenario of the cell. Its `duration_s` is the initial duration.
         longest_s: Longest duration of the run, in s.
 
     Attributes:
-        duration_s: First duration of the run, in s.
+        duration_s: Initial duration of the run, in s.
         run: The run.
     """
 
@@ -308,10 +308,10 @@ class _CellInProgress:
         )
 
     def _evaluate(self) -> None:
-        """Measures the run so far, and decides whether a longer run would end in the same way.
+        """Measures the run so far and decides whether a longer run would end in the same way.
 
-        A lasting motion under a user's law may be a decay that is too slow to show. The roots
-        of the loop, which take longer than the measurement, are computed in this case only.
+        Under a user's law, a lasting motion may be a decay that is too slow to show. Only in
+        this case are the roots of the loop computed, which takes longer than the measurement.
         """
         run_end = RunEnd.of_run(self.run, self._scenario)
         self._outcome = _build_result(self.run, run_end, self._totals, self._extended)
@@ -348,12 +348,11 @@ def classify_cell(text: str, longest_s: float) -> CellResult:
 
 
 class _JudgedCell(NamedTuple):
-    """Result of a parameter combination that was simulated, if possible with others.
+    """Result of a cell, which was simulated together with others if possible.
 
     Attributes:
         result: Result of the cell.
-        obstacle: Property because of which the cell was run alone. Empty if it ran side by side
-            with others.
+        obstacle: Reason why the cell was run alone. Empty if it ran side by side with others.
     """
 
     result: CellResult
@@ -399,14 +398,14 @@ def classify_cells(scenarios: Iterable[Scenario], longest_s: float) -> Iterator[
 
 
 def _list_unfinished(cells: Sequence[_CellInProgress]) -> list[int]:
-    """Returns the positions of the cells whose runs are not conclusive and must continue."""
+    """Returns the indices of the cells whose runs are not conclusive and must continue."""
     return [position for position, cell in enumerate(cells) if cell.find_next_end() is not None]
 
 
 def _chatters(scenario: Scenario, run: FusedRun) -> bool:
     """Returns True if small motions of a run grow in contact with a sampled wall.
 
-    The force of a sampled wall is computed once per control period and held. Such a wall can
+    The force of a sampled wall is computed once per tick and then held, so the wall can
     generate energy.
 
     Args:
@@ -420,10 +419,10 @@ def _chatters(scenario: Scenario, run: FusedRun) -> bool:
 
 
 def _has_pronounced_trend(outcome: CellResult) -> bool:
-    """Returns True if the trend of a growing motion is so clear that the run can be ended.
+    """Returns True if the trend of a growing motion is clear enough to end the run.
 
-    This is the case if the largest speed doubled over the second half of the run, or if the
-    largest error and the largest speed both halved.
+    This is the case if, over the second half of the run, the largest speed doubled or both the
+    largest error and the largest speed halved.
 
     Args:
         outcome: Result of the run.
@@ -437,7 +436,7 @@ def _has_pronounced_trend(outcome: CellResult) -> bool:
 def _log_changes(outcome: CellResult) -> tuple[float, float]:
     """Returns the changes of log |e| and log |qd| over the second half of a run.
 
-    A change of 0.69 is a doubling. An amplitude without a trend counts as unchanged.
+    A change of 0.69 is a doubling. An amplitude with no trend counts as unchanged.
 
     Args:
         outcome: Result of the run, with the rates of both amplitudes.
@@ -451,12 +450,12 @@ def _log_changes(outcome: CellResult) -> tuple[float, float]:
 def _build_result(
     run: FusedRun, end: RunEnd, totals: Mapping[str, Any], extended: int
 ) -> CellResult:
-    """Returns the result of a simulation of a sweep up to its present end.
+    """Returns the result of a run of a sweep up to its current end.
 
     Args:
         run: The run.
         end: How the motion ends.
-        totals: Totals over the scenario's duration, without extensions, see `RunTotals`.
+        totals: Totals over the scenario's duration, excluding extensions, see `RunTotals`.
         extended: Number of times that the duration was doubled.
     """
     return CellResult(
@@ -477,8 +476,8 @@ def _build_result(
 
 
 LineDiff = tuple[str | tuple[int, int], ...]
-"""A text as differences from a base text. The parts are, in order, ranges (first, last) of line
-numbers of the base, and lines that the base does not contain.
+"""A text as differences from a base text: in order, ranges (first, last) of line numbers of the
+base, and lines that the base does not contain.
 """
 
 

@@ -30,17 +30,17 @@ from .sweep_axis import SweepAxis
 MAX_SEEDS = 100_000
 """Largest number of seeds of a sweep."""
 MAX_EXTENSION = 8.0
-"""Default limit of the duration of an undecided run, as a multiple of the scenario's duration.
+"""Default limit on the duration of an undecided run, as a multiple of the scenario's duration.
 """
 MAX_SCENARIO_S = 86_400.0
 """Longest duration that a scenario may have, in s."""
 JUDGES = ("verdict", "twins", "linear")
 """Ways to judge a cell. "verdict" classifies the end of its run. "twins" repeats the run with a
 small push and measures the growth exponent, the rate at which the disturbance grows. "linear"
-computes the characteristic roots of the linear loop, without a run.
+computes the characteristic roots of the linearised loop, without a run.
 """
 _CHECKED_VALUES = 32
-"""Largest number of values of an axis that are checked before the first run."""
+"""Largest number of values per axis that are checked before the first run."""
 
 
 class SweepCell(NamedTuple):
@@ -462,13 +462,13 @@ def plan_sweep(
 MOST_HALVINGS = 16
 """Largest number of times that the boxes along the stability edge are halved."""
 MOST_REFINED_CELLS = 100_000_000
-"""Largest number of cells of a grid that is refined. Each cell takes 4 bytes."""
+"""Largest number of cells of a grid that can be refined. Each cell takes up 4 bytes."""
 _REFINED_AXES = 2
-"""Largest number of axes that are refined: a map has two axes."""
+"""Largest number of axes that are refined, equal to the number of axes of a map."""
 
 
 def _check_refinement(plan: SweepPlan) -> None:
-    """Checks that a sweep can be refined as often as its plan states.
+    """Raises UsageError if a sweep cannot be refined as often as its plan states.
 
     Raises:
         UsageError: The number is out of range, no axis can be refined, or the grid is too
@@ -507,8 +507,8 @@ def _resolve_seeds(seeds: int | Sequence[int], scenario_seed: int) -> tuple[int,
     """Returns the seeds of a sweep, without duplicates.
 
     Args:
-        seeds: The seeds, or their number. A number n means n consecutive seeds that start with
-            the seed of the scenario.
+        seeds: The seeds, or their number n, which means n consecutive seeds starting from that
+            of the scenario.
         scenario_seed: Seed of the scenario. It is the only seed if `seeds` is empty.
 
     Raises:
@@ -536,7 +536,7 @@ class _Base(NamedTuple):
 
     Attributes:
         scenario: The scenario.
-        forced: True if the scenario is valid only under a swept law. In this case `scenario`
+        forced: True if the scenario is valid only under a swept law. In this case, `scenario`
             has the first of the swept laws.
     """
 
@@ -552,9 +552,9 @@ def _load_base(
 ) -> _Base:
     """Loads the scenario of a sweep before its axes and laws are applied.
 
-    The scenario may not be valid by itself. For example, a link may need the delay that an axis
-    sets, or an override may set a gain that only a swept law has. Therefore the scenario is
-    tried alone, then with the first value of each axis, then with the first law, and then with
+    The scenario may not be valid on its own. For example, a link may need the delay that an
+    axis sets, or an override may set a gain that only a swept law has. It is therefore tried on
+    its own, then with the first value on each axis, then with the first law, and then with
     both.
 
     Args:
@@ -585,7 +585,7 @@ def _load_base(
 
 
 def _check_law_name(law: str) -> None:
-    """Rejects the name of a law that does not exist.
+    """Raises UsageError if there is no law with a given name.
 
     Raises:
         UsageError: The name is neither a built-in law nor a class, as in mylaws:Law.
@@ -599,7 +599,7 @@ def _check_law_name(law: str) -> None:
 
 
 def _force_law(written: ExperimentText, overrides: Sequence[str], law: str) -> tuple[str, ...]:
-    """Returns the settings that give the same control law to every arm.
+    """Returns the overrides that set the same control law for every arm.
 
     Args:
         written: Scenario as its author wrote it.
@@ -621,7 +621,8 @@ def _list_law_overrides(
     """Returns the overrides that select a swept law.
 
     Returns:
-        The overrides. Empty if all sites already have the law, so that they keep its gains.
+        The overrides. Empty if all sites already use the law, in which case they keep its
+        gains.
     """
     sites = base.scenario.sites.values()
     if not base.forced and all(spec.law_name == law for spec in sites):
@@ -630,15 +631,14 @@ def _list_law_overrides(
 
 
 def _check_axes(plan: SweepPlan, law_index: int) -> None:
-    """Checks that the parameter combinations of a sweep can be simulated with one control law.
+    """Raises ScenarioError if the cells of a sweep cannot be simulated with a control law.
 
-    Checking all combinations (cells) of a large grid would take too long. The corners of the
-    grid are checked, and up to `_CHECKED_VALUES` evenly spread values of each axis, with the
-    other axes at their first values. A single combination may be invalid: the sweep then
-    rejects only this cell.
+    Checking every cell of a large grid would take too long. Instead, the corners of the grid
+    are checked, and up to `_CHECKED_VALUES` evenly spread values of each axis, with the other
+    axes at their first values. Single cells may be invalid: the sweep rejects only these cells.
 
     Args:
-        plan: The sweep: its scenario, axes, control laws and seeds.
+        plan: The sweep.
         law_index: Index of the law.
 
     Raises:
@@ -679,10 +679,10 @@ def _check_axes(plan: SweepPlan, law_index: int) -> None:
 
 
 def _is_valid(plan: SweepPlan, indices: Sequence[int]) -> bool:
-    """Returns True if a parameter combination (cell) of a sweep is a valid scenario.
+    """Returns True if a cell of a sweep is a valid scenario.
 
     Args:
-        plan: The sweep: its scenario, axes, control laws and seeds.
+        plan: The sweep.
         indices: Index of the law and of the value on each axis.
     """
     try:
@@ -693,15 +693,15 @@ def _is_valid(plan: SweepPlan, indices: Sequence[int]) -> bool:
 
 
 def _load_cell(plan: SweepPlan, indices: Sequence[int]) -> Scenario:
-    """Loads the scenario of one combination of swept parameters.
+    """Loads the scenario of one cell.
 
     Args:
-        plan: The sweep: its scenario, axes, control laws and seeds.
+        plan: The sweep.
         indices: Index of the law and of the value on each axis.
 
     Raises:
-        ScenarioError: The scenario is not valid or cannot run on this machine. The message
-            names the law if laws are swept.
+        ScenarioError: The scenario is not valid or cannot run on this machine. If laws are
+            swept, the message names the law.
     """
     # The number of a cell has one digit per dimension of the grid, see `SweepPlan.cell`.
     number = 0

@@ -294,7 +294,7 @@ class _GridPoint(NamedTuple):
         cell: Number of the cell, from 0.
         law: Control laws of the sites.
         values: Value of the cell on each axis.
-        counts: Number of runs of each class, such as converged or diverged, in the order of
+        counts: Number of runs in each class, such as converged or diverged, in the order of
             `RUN_CLASSES`.
         means: Mean, with its 95 % interval, of each quantity of `SweepPlan.list_totals`, over
             the runs that stayed within the limits of their arms. `None` for fewer than two such
@@ -344,11 +344,11 @@ _TOTALS = {
     "force_peak_n": ("peak force", "N"),
     "walls_j": ("work of the walls", "J"),
 }
-"""Quantities whose range over the runs is printed: the key, the name and the unit."""
+"""Quantities whose range over the runs is printed, as key, name and unit."""
 
 
 _MAX_CELLS_SHOWN = 8
-"""Largest number of doubtful or rejected cells in the summary. The CSV files have all of them.
+"""Largest number of doubtful or rejected cells in the summary. The CSV files list all of them.
 """
 
 
@@ -357,7 +357,7 @@ GROWTH_EXPONENTS = "growth exponents of small pushes"
 
 
 def _list_quantities(plan: SweepPlan) -> dict[str, tuple[str, str]]:
-    """Returns the names and units of quantities whose ranges a summary prints, by key.
+    """Maps the keys of the quantities whose ranges are printed to their names and units.
 
     Args:
         plan: The sweep, whose requested metrics come first.
@@ -398,13 +398,13 @@ class _ValueRange:
 
 
 class _RowTally:
-    """Numbers of the summary of a sweep, which are collected in one pass over its rows.
+    """Contents of a sweep's summary, collected in one pass over its rows.
 
     Args:
         quantities: Keys of the quantities whose ranges are printed.
 
     Attributes:
-        counts: Number of runs of each class.
+        counts: Number of runs in each class.
         extended: Number of runs that were extended.
         longest_s: Duration of the longest extended run, in s.
         within_limits: Number of runs whose arms stayed within their limits.
@@ -426,10 +426,10 @@ class _RowTally:
 
 
 def _tally_rows(results: SweepResults) -> _RowTally:
-    """Counts the results of a sweep for its summary, in one pass over all simulations.
+    """Collects the summary of a sweep in one pass over all of its runs.
 
     Args:
-        results: Results of the sweep: its plan and one row per run.
+        results: Results of the sweep.
     """
     tally = _RowTally(_list_quantities(results.plan))
     for row in results.rows:
@@ -451,13 +451,13 @@ def _tally_rows(results: SweepResults) -> _RowTally:
 
 
 def _summarize_seeds(results: SweepResults, not_random: int) -> Iterator[str]:
-    """Yields the lines of the summary that concern the seeds.
+    """Yields the lines of the summary that describe the effect of the seeds.
 
     The first line counts the cells in which nothing is random, which run only once. The others
     list the cells that are stable with some seeds and not stable with others.
 
     Args:
-        results: Results of the sweep: its plan and one row per run.
+        results: Results of the sweep.
         not_random: Number of runs in which nothing is random.
     """
     if not_random:

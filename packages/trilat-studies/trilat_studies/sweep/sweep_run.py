@@ -74,8 +74,8 @@ _DIFFERENCES = {
     "arithmetic": "another kind of arithmetic",
     "versions": "another version of the program",
 }
-"""Keys of a plan in which two sweeps may differ, each with a phrase for a message. The first
-key that differs is reported.
+"""Keys of a plan in which two sweeps may differ, each with a phrase for an error message. The
+first key that differs is reported.
 """
 
 
@@ -84,13 +84,13 @@ SweepFolder = StudyFolder[SweepPlan, CellRun]
 
 
 def _build_folder(path: Path, plan: SweepPlan, facts: Mapping[str, Any]) -> SweepFolder:
-    """Returns the object with which the folder of a sweep is read and continued.
+    """Returns the object that reads and continues the folder of a sweep.
 
-    Its journal is tied to the digest of the plan, so that runs of another plan are ignored.
+    Its journal is tied to the digest of the plan, so runs of another plan are ignored.
 
     Args:
         path: Path of the folder.
-        plan: The sweep: its scenario, axes, control laws and seeds.
+        plan: The sweep.
         facts: The plan as plain values, with the arithmetic and the versions of the program.
     """
     plan_digest = hashlib.sha256(_encode_plan(facts).encode()).hexdigest()
@@ -147,14 +147,14 @@ def open_sweep_folder(path: Path, expected: SweepPlan | None = None) -> SweepFol
 
 
 def _format_fact(key: str, facts: Mapping[str, Any]) -> str:
-    """Describes one property of a sweep, so that a message can state how two sweeps differ.
+    """Formats one property of a sweep for messages about how two sweeps differ.
 
     Examples: "wall (sha256 0123456789ab)" for the scenario, "1..20" for the seeds, "60 s" for
-    the longest time, "numpy 2.1, numba 0.60" for the versions.
+    the longest duration, "numpy 2.1, numba 0.60" for the versions.
 
     Args:
-        key: Key of the property in the plan, one of `_DIFFERENCES`. A plan without the key has
-            its default: the first judge, no refinement, or an empty list.
+        key: Key of the property in the plan, one of `_DIFFERENCES`. A missing key stands for
+            the default: the first judge, no refinement, or an empty list.
         facts: The plan as plain values.
     """
     defaults: dict[str, Any] = {"judge": JUDGES[0], "refine": 0}
@@ -217,7 +217,7 @@ def _list_facts(plan: SweepPlan) -> dict[str, Any]:
 
 
 def _encode_plan(facts: Mapping[str, Any]) -> str:
-    """Returns the text of the file with the plan of a sweep. Equal plans have equal bytes."""
+    """Encodes the plan of a sweep for its file. Equal plans give identical bytes."""
     return json.dumps(facts, indent=2, ensure_ascii=False, sort_keys=True) + "\n"
 
 
@@ -226,7 +226,7 @@ MAX_RUNS = 1_000_000
 MAX_SWEEP_S = 86_400.0
 """Estimated duration above which the user must confirm a sweep, in s of real time."""
 _PROBES = 7
-"""Largest number of runs that are made to estimate the duration of a sweep."""
+"""Largest number of runs used to estimate the duration of a sweep."""
 _PROBING_S = 3.0
 """Time after which no further run is started for the estimate, in s of real time."""
 _RESUME_HINT = "; finished runs are kept: continue with --resume"
@@ -396,7 +396,7 @@ class CellItem(NamedTuple):
 
 
 def _refuse_cell(task: CellItem, error: ScenarioError) -> CellRun:
-    """Returns the result of a simulation that was rejected, with the reason and without values.
+    """Creates the result of a rejected run, which has a reason but no values.
 
     Args:
         task: The run.
@@ -418,7 +418,7 @@ def _refuse_cell(task: CellItem, error: ScenarioError) -> CellRun:
 
 
 def _run_cells(tasks: Sequence[CellItem]) -> Iterator[CellRun]:
-    """Executes several simulations of a sweep, side by side where that is possible.
+    """Executes several runs of a sweep, side by side where possible.
 
     Args:
         tasks: The runs, of one sweep.
@@ -452,7 +452,7 @@ def _run_cells(tasks: Sequence[CellItem]) -> Iterator[CellRun]:
 
 
 def _build_scenario(task: CellItem) -> Scenario:
-    """Returns the scenario of one simulation of a sweep, with its parameters and seed.
+    """Returns the scenario of one run of a sweep, with its parameters and seed.
 
     Raises:
         ScenarioError: The scenario is not valid or cannot run.
@@ -471,18 +471,18 @@ estimates.
 
 
 def _measure_exponent(scenario: Scenario) -> float | None:
-    """Measures the growth exponent of a run, the rate at which small disturbances grow.
+    """Measures the growth exponent of a run, the rate at which small disturbances grow, in 1/s.
 
-    A twin is a second execution of the run with a small push. The difference between the twin
-    and the run changes as exp(exponent t), where t is the time, see `analysis.twin_growth`.
-    Several twins are run. The result is the largest of their rates over the later part of the
-    run, the part over which runs are judged.
+    A twin is a repetition of the run with a small push. The difference between the twin and the
+    run changes as exp(exponent t), where t is the time, see `analysis.twin_growth`. Several
+    twins are run. The result is the largest of their rates over the later part of the run, the
+    part over which runs are judged.
 
     Args:
         scenario: Scenario of the run.
 
     Returns:
-        The exponent in 1/s, negative if disturbances decay. `None` if no push had an effect.
+        The exponent, negative if disturbances decay. `None` if no push had an effect.
     """
     run = FusedRun(scenario, SETTLED_ERROR_RAD)
     run.advance_to(scenario.duration_s)
@@ -493,12 +493,12 @@ def _measure_exponent(scenario: Scenario) -> float | None:
 
 
 def _complete_run(task: CellItem, scenario: Scenario, outcome: CellResult) -> CellRun:
-    """Measures the further metrics of a simulation, and returns all of its results.
+    """Measures the further metrics of a run, and returns all of its results.
 
     Args:
         task: The run.
         scenario: Its scenario.
-        outcome: The class of its end.
+        outcome: How the run ended.
     """
     plan = task.plan
     if plan.judge == "twins":
@@ -530,7 +530,7 @@ LANE_RUNS = 32
 
 
 def _uses_lanes(plan: SweepPlan, runs: int) -> bool:
-    """Returns True if a sweep is so large that simulating several runs at once saves time.
+    """Returns True if a sweep is large enough to benefit from simulating several runs at once.
 
     The code for these SIMD lanes must be compiled first, which takes about ten seconds.
 
@@ -546,10 +546,10 @@ def _uses_lanes(plan: SweepPlan, runs: int) -> bool:
 
 
 def _prepare_lanes(plan: SweepPlan, runs: int) -> bool:
-    """Decides whether a sweep simulates several runs at once, and compiles their code for it.
+    """Decides whether a sweep simulates several runs at once, and compiles their code.
 
-    If the sweep is large, the code is compiled once for all workers. A small sweep, for which a
-    compilation would take too long, only uses code that exists from an earlier study.
+    For a large sweep, the code is compiled once for all workers. A small sweep, for which
+    compilation would take too long, uses only code that an earlier study has compiled.
 
     Args:
         plan: The sweep. The code for its first cell is compiled.
@@ -646,7 +646,7 @@ class _NewRuns:
 
 
 def _write_table(folder: SweepFolder, done: Mapping[tuple[int, int], CellRun]) -> Counter[str]:
-    """Writes the results of a parameter sweep into a CSV table, combination by combination.
+    """Writes the results of a sweep to a CSV table, one cell at a time.
 
     Args:
         folder: Folder of the sweep.
@@ -672,7 +672,7 @@ def _write_table(folder: SweepFolder, done: Mapping[tuple[int, int], CellRun]) -
 
 
 def _write_lines(folder: SweepFolder, name: str, lines: Iterable[str]) -> None:
-    """Writes a file of a finished sweep, from lines that need not fit into memory.
+    """Writes a file of a finished sweep from lines that need not fit into memory.
 
     Args:
         folder: Folder of the sweep.
@@ -692,10 +692,10 @@ class _SweepWork:
     """Executes the runs of a sweep that are not yet in its journal.
 
     Args:
-        plan: The sweep: its scenario, axes, control laws and seeds.
-        journal: Journal, to which the runs are added.
+        plan: The sweep.
+        journal: Journal to which the runs are added.
         pool: Workers that execute the runs.
-        progress: Function that is called with the progress, see `run_sweep`.
+        progress: Called with the progress, see `run_sweep`.
         tally: Counts the runs.
     """
 
@@ -764,8 +764,8 @@ class _SweepWork:
     ) -> None:
         """Executes all runs of some cells: one seed each, then further seeds of random cells.
 
-        The first run of a cell shows whether anything in the cell is random. If nothing is,
-        other seeds would give the same run and are not executed.
+        The first run of a cell shows whether anything in the cell is random. If not, other
+        seeds would give the same run and are skipped.
 
         Args:
             cells: Numbers of the cells, which can be iterated once.
@@ -795,14 +795,14 @@ class _SweepWork:
     def _execute_runs(
         self, runs: Iterable[tuple[int, int]], run_count: int, *, is_side_by_side: bool
     ) -> None:
-        """Executes runs of the sweep, except runs that the journal contains already.
+        """Executes runs of the sweep, skipping those that are already in the journal.
 
-        The journal sends the runs to the workers, and stores the results.
+        The journal sends the runs to the workers and stores the results.
 
         Args:
-            runs: Pairs of the number of a cell, a combination of parameters, and a seed.
-            run_count: Number of all runs of the sweep so far, with those in the journal, for
-                the progress.
+            runs: Pairs of a cell number and a seed.
+            run_count: Number of all runs of the sweep so far, including those in the journal,
+                for the progress.
             is_side_by_side: True to compute several runs side by side.
         """
         plan = self._plan
@@ -828,11 +828,10 @@ class _SweepWork:
 
 
 def _find_side(plan: SweepPlan, runs: Sequence[CellRun]) -> int:
-    """Returns whether a parameter combination lies on the stable side of an edge.
+    """Returns on which side of the stability edge a cell lies: stable, unstable or undecided.
 
-    The side is stable, unstable or undecided, by the majority of the cell's runs. It is unknown
-    if every run was rejected. If the sweep measures growth exponents, a run with an exponent of
-    at most 0 is stable.
+    The majority of the cell's runs decides. The side is unknown if every run was rejected. If
+    the sweep measures growth exponents, a run with an exponent of at most 0 is stable.
 
     Args:
         plan: The sweep. If it measures growth exponents, their sign decides.

@@ -67,9 +67,9 @@ from ..run_commands import format_command, format_toml_value, set_options
 from .search_space import GainValues, ModelInformation, SearchSpace, SiteControls
 
 CONFLICT_RAD = 0.02
-"""Distance from q*, in rad, beyond which the target of an operator keeps the arms separate."""
+"""Distance from q*, in rad, beyond which the target of an operator keeps the arms apart."""
 _POSE_SAMPLES_HZ = 100.0
-"""Rate at which the targets of operators are compared with q*."""
+"""Sampling rate at which the targets of operators are compared with q*."""
 
 
 def check_comparable(scenario: Scenario) -> None:
@@ -193,14 +193,14 @@ def compute_consensus_pose(scenario: Scenario, t_s: Array) -> Array:
 
 
 class _SpringHistory(NamedTuple):
-    """Pull of an operator towards a target pose, as by a spring, sampled at K times.
+    """An operator's spring-like pull towards a target pose, sampled at K times.
 
     The consensus pose q* is computed from the springs of all operators.
 
     Attributes:
         site: Site of the operator.
         stiffness_nm_rad: Stiffness per joint, shape (n,), in N m/rad.
-        acts: 1 while the spring acts and 0 at other times, shape (K, 1).
+        acts: 1 while the spring acts and 0 otherwise, shape (K, 1).
         target_rad: Target pose, shape (K, n), in rad.
     """
 
@@ -236,8 +236,8 @@ def _list_springs(scenario: Scenario, t_s: Array) -> Iterator[_SpringHistory]:
 
 
 STRAYED_RAD = 0.2
-"""Distance of the arms' mean pose from q*, in rad, beyond which the arms have strayed: they
-fell, hang down or were thrown.
+"""Distance of the arms' mean pose from q*, in rad, beyond which the arms have strayed because
+they fell, hang down or were thrown.
 """
 TOGETHER_RAD = 0.02
 """Largest distance of a joint from the arms' mean, in rad, at which the arms still agree."""
@@ -315,11 +315,11 @@ CLASS_MEANINGS = {
     CandidateClass.OPEN: "it hardly decays, or is undecided: a longer run may decide",
     CandidateClass.SETTLED: "it converged or decays, and no other class applies",
 }
-"""Meanings of the classes. docs/reference/stability.md defines the judgement of a run."""
+"""Meaning of each class. docs/reference/stability.md defines the verdict on a run."""
 
 
 _SHORT_S = 0.5
-"""Time before the planned end, in s. A log that ends earlier than this is reported as short."""
+"""How much earlier than planned a log may end, in s, before it is reported as short."""
 _POSE_SAMPLES = 2000
 """Number of times at which q* of a log is computed."""
 
@@ -507,12 +507,12 @@ _AVERAGED = ("error_rad", "spread_rad", "pose_rad", "effort_nm", "settled_s", "s
 
 
 def _score_candidate(run: "_RunMeasures", twin: "_RunMeasures") -> CandidateScore:
-    """Combines the measurements from the runs of a candidate into its score.
+    """Combines the measurements from a candidate's run and its twin into a score.
 
     Args:
-        run: Measurements from its run.
-        twin: Measurements from the same run without walls and pushes (twin), or from the run
-            itself if there is no twin.
+        run: Measurements from the run.
+        twin: Measurements from the twin, which is the same run without walls and pushes. If
+            there is no twin, those from the run itself.
     """
     ends = (run.end, twin.end)
     outcome = CandidateClass.classify(ends, twin.fall_rad, twin.apart_rad)
@@ -544,12 +544,12 @@ def _score_candidate(run: "_RunMeasures", twin: "_RunMeasures") -> CandidateScor
 
 
 class _RunMeasures(NamedTuple):
-    """Quantities that are measured in one run of a candidate or of its twin.
+    """Quantities measured in one run of a candidate or of its twin.
 
     `CandidateScore` is computed from them.
 
     Attributes:
-        end: Judgement of the end of the run.
+        end: Analysis of the end of the run.
         fall_rad: Predicted distance from q*, see `CandidateClass.classify`.
         apart_rad: Distance between the arms at the end, see `CandidateClass.classify`.
         spread_rad: RMS distance of the arms from their mean, or from the motion that their law
@@ -571,7 +571,7 @@ class _RunMeasures(NamedTuple):
 
 
 def _measure_run(scenario: Scenario) -> _RunMeasures:
-    """Runs a scenario in virtual time, and measures the quantities that its score combines.
+    """Runs a scenario in virtual time and measures the quantities for its score.
 
     Args:
         scenario: Scenario of the candidate, with its gains.
@@ -580,7 +580,7 @@ def _measure_run(scenario: Scenario) -> _RunMeasures:
 
 
 def _measure_records(scenario: Scenario, whole_run: WholeRun) -> _RunMeasures:
-    """Measures effort, torque limits and distances of the arms in a finished run.
+    """Measures effort, torque saturation and distances of the arms in a finished run.
 
     The arms are compared with the consensus pose q*, or with the motion that their law
     promises, at times that all sites have in common.
@@ -632,8 +632,8 @@ def _compute_promised_motion(
             external torques.
 
     Returns:
-        The promised joint angles, shape (N, K, n), in rad. `None` if the law promises that the
-        arms move together.
+        The promised joint angles, shape (N, K, n), in rad, or `None` if the law promises that
+        the arms move together.
     """
     laws = [scenario.sites[name].control for name in scenario.names]
     if not isinstance(laws[0], LawSettings):
@@ -647,11 +647,10 @@ def _compute_promised_motion(
 
 
 def _predict_fall_rad(t_s: Array, from_pose_rad: Array) -> float:
-    """Predicts the distance from the promised pose at the end of a run twice as long.
+    """Predicts the distance from the promised pose at the end of a run twice as long, in rad.
 
     The distance is averaged over the second before the middle of the run and over the last
-    second. If the distance grew between them, it is assumed to continue growing at the same
-    rate.
+    second. If it grew between the two, it is assumed to continue growing at the same rate.
 
     Args:
         t_s: Times, shape (K,), in s.
@@ -659,7 +658,7 @@ def _predict_fall_rad(t_s: Array, from_pose_rad: Array) -> float:
             motion, shape (K, n), in rad.
 
     Returns:
-        The distance, the largest over the joints, in rad.
+        The distance of the joint that is furthest away.
     """
     end_s = t_s[-1]
     half_s = 0.5 * end_s
@@ -682,8 +681,8 @@ def _find_settling_time(t_s: Array, e: Array) -> float | None:
         e: Errors, shape (N, K, n), in rad.
 
     Returns:
-        The time. It is 0 if |e| is always below 0.01 rad, and `None` if |e| is not below 0.01
-        rad at the end.
+        The time. 0 if |e| is always below 0.01 rad, `None` if it is not below 0.01 rad at the
+        end.
     """
     largest_rad = np.abs(e).max(axis=(0, 2))
     is_settled = largest_rad[-1] < SETTLED_ERROR_RAD
@@ -694,14 +693,13 @@ def _find_settling_time(t_s: Array, e: Array) -> float | None:
 
 
 def _measure_torques(scenario: Scenario, records: Sequence[RecordBatch]) -> tuple[float, float]:
-    """Returns the effort, and the fraction of the joint torques that were at their limit.
+    """Returns the effort, in N m, and the fraction of joint torques that were at their limit.
+
+    The effort is the RMS of the torque minus the gravity torque.
 
     Args:
         scenario: Scenario in which the laws are compared.
         records: Records of each site.
-
-    Returns:
-        The RMS of the torque minus the gravity torque, in N m, and the fraction.
     """
     mean_squares = []
     saturated_shares = []
@@ -725,8 +723,8 @@ def _sample_at_common_times(
 ) -> tuple[Array, Array, Array, Array]:
     """Returns the joint angles, errors and exogenous torques of all sites at common times.
 
-    Sites may have different tick rates. The times are the ticks of the slowest site. For every
-    other site, the latest record at each time is used.
+    If tick rates differ, the times are the ticks of the slowest site. For every other site, the
+    latest record at each time is used.
 
     Args:
         records: Records of each site.
@@ -752,7 +750,7 @@ def _sample_at_common_times(
 
 
 def _rms(values: Array) -> float:
-    """Returns the root mean square of all values of an array, in their unit."""
+    """Returns the root mean square over all entries of an array, in their unit."""
     return float(np.sqrt(np.mean(values**2)))
 
 
@@ -947,11 +945,11 @@ class CandidateItem(NamedTuple):
 
 
 class _MeasuredCandidate(NamedTuple):
-    """Score of a candidate, with the reasons why runs of it were computed one by one.
+    """Score of a candidate, with the reasons why some of its runs were computed one by one.
 
     Attributes:
         score: Average score over the seeds.
-        alone: For each run that could not be computed side by side with others, the reason.
+        alone: The reason for each run that could not be computed side by side with others.
     """
 
     score: CandidateScore
@@ -959,4 +957,4 @@ class _MeasuredCandidate(NamedTuple):
 
 
 LANE_RUNS = 16
-"""Number of runs that a worker computes side by side. All their records are in memory."""
+"""Number of runs that a worker computes side by side, with all of their records in memory."""

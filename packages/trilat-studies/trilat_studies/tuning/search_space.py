@@ -30,13 +30,13 @@ from trilat_net.own_code import import_named_class
 from trilat_net.scenario import BUILT_IN, Scenario, is_number
 
 MIN_BOX = 0.1
-"""Least half width of a box of estimates, as a fraction of the estimated parameter."""
+"""Smallest half-width of a box of estimates, as a fraction of the estimated parameter."""
 
 
 def _round_parameter(value: float) -> float:
-    """Returns a parameter rounded to 12 significant digits.
+    """Rounds a parameter to 12 significant digits.
 
-    Scaling by a factor gives numbers such as 0.30000000000000004, which would make the printed
+    Scaling by a factor yields numbers such as 0.30000000000000004, which would make the printed
     commands long.
     """
     return float(f"{value:.12g}")
@@ -141,18 +141,18 @@ class ModelInformation(NamedTuple):
 
 
 GainValues = Mapping[str, float]
-"""Values of the tuned gains of a law, by name."""
+"""Mapping from the names of a law's tuned gains to their values."""
 SiteControls = dict[str, dict[str, Any]]
-"""Complete table [control] of each site, by the name of the site."""
+"""Complete table [control] of each site, by site name."""
 
 
 class _TunedGain(NamedTuple):
-    """A gain of a control law, with the range in which its best value is searched.
+    """A gain of a control law, with the range in which its best value is searched for.
 
     Attributes:
         name: Name of the gain.
-        unit: Unit of the gain. Empty if the gain has no unit.
-        low: Least value.
+        unit: Unit of the gain. Empty if it is dimensionless.
+        low: Smallest value.
         high: Largest value.
         where: Role of the sites that have the gain. Empty if all sites have it.
     """
@@ -226,8 +226,8 @@ class SearchSpace(NamedTuple):
         Args:
             scenario: Scenario in which the laws are compared.
             site: Name of the site.
-            knowledge: Information about the arm's model that the law gets.
-            gains: Values of the gains, by their names.
+            knowledge: Information about the arm model that the law gets.
+            gains: Mapping from gain name to value.
             longest_ms: Half of the longest round trip between two sites, in ms.
         """
         if self.kind is None:  # a user's law
@@ -316,7 +316,8 @@ class SearchSpace(NamedTuple):
 def _find_longest_round_trip_ms(scenario: Scenario) -> float:
     """Returns the longest mean round trip between two sites, in ms.
 
-    A round trip is the sum of the mean delays of a link and of the link back.
+    A round trip is the sum of the mean delays of a link and of the link in the opposite
+    direction.
     """
     mean_delays_ms = {name: link.moments().mean_ms for name, link in scenario.links.items()}
     round_trips_ms = []
@@ -334,10 +335,10 @@ _TORQUE_GAINS = ("rho_nm", "Kp", "Kd", "K", "d", "P_e", "b", "B")
 def _spread_over_joints(table: dict[str, Any], weights: Sequence[float]) -> None:
     """Replaces each gain that produces a torque with a list of values, one per joint.
 
-    The joints of a chain have different inertias, and need gains in proportion to them.
+    The joints of a chain have different inertias, and their gains must be in proportion.
 
     Args:
-        table: Table [control] of a site, which is changed in place.
+        table: Table [control] of a site, which is modified in place.
         weights: For each joint, its fraction of the gain.
     """
     for key in _TORQUE_GAINS:
@@ -346,7 +347,9 @@ def _spread_over_joints(table: dict[str, Any], weights: Sequence[float]) -> None
 
 
 _STABLE_SHARE = 0.9
-"""Fraction of the largest stable product of damping rate and tick period that tuning uses."""
+"""Product of damping rate and tick period used in tuning, as a fraction of the largest stable
+one.
+"""
 
 
 def weigh_joints(scenario: Scenario) -> list[float]:
@@ -397,13 +400,13 @@ def weigh_joints(scenario: Scenario) -> list[float]:
 _KNOWN = "known"
 """Name of the search space of `adaptive` with known inertia."""
 _GRAVITY_ONLY = "gravity"
-"""Value of `known_facts` for a law that uses the gravity parameters only."""
+"""Value of `known_facts` for a law that uses only the gravity parameters."""
 
 
 def _list_search_spaces() -> Iterator[SearchSpace]:
-    """Yields the gains and their ranges for each built-in control law that can be tuned.
+    """Yields the search space of each built-in control law that can be tuned.
 
-    The law `known` has the gains of `adaptive` except for the adaptation gain Gamma.
+    The law `known` has the gains of `adaptive`, except for the adaptation gain Gamma.
     """
     for name, kind in BUILT_IN.items():
         knobs = tuple(_read_range(gain, entry) for gain, entry in kind.tune.items())
@@ -416,11 +419,11 @@ def _list_search_spaces() -> Iterator[SearchSpace]:
 
 
 def _read_range(gain: str, entry: GainRange) -> _TunedGain:
-    """Returns a control gain to tune, with its range as a built-in law states it in `tune`.
+    """Converts the range of a gain, as a built-in law states it in `tune`, to a `_TunedGain`.
 
     Args:
         gain: Name of the gain.
-        entry: Smallest value, largest value, unit, and possibly the role of the sites.
+        entry: Smallest value, largest value, unit, and optionally the role of the sites.
     """
     low, high, unit = entry[:3]
     role = entry[3] if len(entry) == 4 else ""
@@ -428,16 +431,16 @@ def _read_range(gain: str, entry: GainRange) -> _TunedGain:
 
 
 SEARCH_SPACES = {space.law: space for space in _list_search_spaces()}
-"""Search spaces of the laws that can be tuned, by the name of the law."""
+"""Search spaces of the laws that can be tuned, by law name."""
 
 DEFAULT_LAWS = ("adaptive", "adaptive_box", "p_d", "pd_d")
-"""Laws that are compared by default. All of them work with any number of sites."""
+"""Laws that are compared by default, all of which work with any number of sites."""
 PAPER_GAINS: GainValues = {"Lambda": 1.0, "Kp": 1.0, "Kd": 3.0, "Gamma": 1.0}
-"""Gains that the paper prints for `adaptive`."""
+"""Gains for `adaptive` that are printed in the paper."""
 
 
 def _parse_user_range(code: str, name: Any, entry: Any) -> _TunedGain:
-    """Returns the tuned gain that an entry of a user's attribute `tune` describes.
+    """Converts an entry of a user law's attribute `tune` to a `_TunedGain`.
 
     Args:
         code: Module and class, for the error message.

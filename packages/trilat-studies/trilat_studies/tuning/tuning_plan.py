@@ -145,16 +145,16 @@ def compute_crowding(points: Sequence[ObjectivePoint]) -> list[float]:
 
 
 REFINEMENT_STEPS = (0.12, 0.08, 0.05, 0.03)
-"""Standard deviation of the steps of each refinement round, as a fraction of the range of a
-gain in logarithms.
+"""Standard deviation of the steps in each refinement round, as a fraction of a gain's range on
+a logarithmic scale.
 """
 GAIN_DIGITS = 4
-"""Significant digits to which gains are rounded before they are run, so that commands stay
+"""Number of significant digits to which gains are rounded before a run, which keeps commands
 short.
 """
 
 CandidateGains = dict[str, float]
-"""Values of the gains of a candidate, by name."""
+"""Mapping from gain name to value, for one candidate."""
 
 
 class CandidateSearch:
@@ -286,7 +286,8 @@ class CandidateSearch:
             count: Number of parents.
 
         Returns:
-            Their positions in the search space, shape (count, gains), each number in [0, 1].
+            Their positions in the search space, shape (count, gains), with coordinates in [0,
+            1].
         """
         best, ranked = self._rank_candidates(count)
         parents = []
@@ -307,14 +308,13 @@ class CandidateSearch:
     def _rank_candidates(self, count: int) -> tuple[int, list[int]]:
         """Ranks the candidates that are worth refining.
 
-        If there is a front, the best candidate is the one with the least objective, and the
-        most isolated points of the front come first. If there is no front yet, the candidates
-        with the least error come first and those that diverged last, and only some of them are
-        kept.
+        If there is a front, the best candidate is the one with the smallest objective, and the
+        most isolated points of the front come first. Otherwise, candidates are ordered by
+        error, followed by those that diverged, and only some of them are kept.
 
         Args:
-            count: Number of candidates of the round. Without a front, a quarter of this number
-                is kept.
+            count: Number of candidates in the round. If there is no front, a quarter of this
+                number is kept.
 
         Returns:
             The index of the best candidate, and the indices of the ranked candidates.
@@ -336,8 +336,8 @@ class CandidateSearch:
         """Returns the gains at a position in the search space, rounded and within their ranges.
 
         Args:
-            position: Relative positions within the logarithms of the ranges, shape (gains,),
-                each in [0, 1].
+            position: Position on the logarithmic scale of each range, shape (gains,), with
+                coordinates in [0, 1].
         """
         logs = self._log_low + position * self._log_range
         gains = {}
@@ -352,7 +352,7 @@ DEFAULT_BUDGET = 64
 MAX_BUDGET = 100_000
 """Largest number of candidates per law."""
 MAX_TUNING_SEEDS = 1000
-"""Largest number of seeds of each candidate."""
+"""Largest number of seeds per candidate."""
 MAX_TICKS = 10_000_000
 """Largest number of ticks of a candidate, over all sites. A run of a minute with three sites at
 1 kHz has 180 000 ticks.
@@ -364,8 +364,8 @@ _PROBE_S = 2.0
 class _PaperGainsResult(NamedTuple):
     """Score of the published gains of the adaptive law, in the scenario of a comparison.
 
-    The gains are printed in the paper from which the law comes. The score shows how much tuning
-    improves on them.
+    These gains are printed in the paper that introduced the law. The score shows how much
+    tuning improves on them.
 
     Attributes:
         name: Name of the variant, such as "as printed".
@@ -566,7 +566,7 @@ class TuningPlan(NamedTuple):
         Args:
             bases: Scenario with each seed.
             space: The law and its gains.
-            candidates: Values of the gains of each candidate.
+            candidates: Gains of each candidate.
         """
         items = []
         for gains in candidates:
@@ -576,7 +576,8 @@ class TuningPlan(NamedTuple):
 
 
 _EDGE = 1.02
-"""Largest ratio of a gain and an end of its range at which the gain counts as at this end."""
+"""Largest ratio between a gain and an end of its range at which the gain counts as lying there.
+"""
 
 
 @dataclass(frozen=True, repr=False)
@@ -653,7 +654,7 @@ class TuningResult(Result):
         }
 
     def _describe_procedure(self) -> dict[str, Any]:
-        """Returns the parameters of the search, for `to_dict`: budget, seeds, steps and so on.
+        """Returns the parameters of the search for `to_dict`: budget, seeds, steps and others.
 
         They are needed to tune another law for comparison.
         """

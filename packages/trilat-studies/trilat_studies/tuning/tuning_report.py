@@ -45,7 +45,7 @@ if TYPE_CHECKING:
     from .tuning_plan import CandidateSearch, TuningPlan, TuningResult
 
 _MAX_FRONT_ROWS = 8
-"""Largest number of points of a front that the terminal shows. The files have all points."""
+"""Largest number of points of a front that are printed. The files contain all points."""
 
 
 class TuningReport:
@@ -177,11 +177,11 @@ class TuningReport:
         return TextTable(("law", *heads, *_SCORE_HEADS), rows, align="lr")
 
     def _tabulate_laws(self) -> TextTable:
-        """Returns a table that summarises the search of each law in a row.
+        """Returns a table that summarises the search, with one row per law.
 
-        A row has the number of candidates (choices of gains), the number of candidates of each
-        class, such as stable or diverged, the number of points on the law's Pareto front and on
-        the common front of all laws, and the two ends of the front.
+        A row shows the number of candidates in total and in each class, such as stable or
+        diverged, the number of points on the law's Pareto front and on the common front of all
+        laws, and the two ends of the front.
         """
         classes = list(reversed(CandidateClass))
         objective = f"{self._tuned.plan.objective} {self._tuned.plan.objective.unit}"
@@ -202,9 +202,9 @@ class TuningReport:
     def _tabulate_paper_gains(self) -> TextTable:
         """Returns a table of the scores of the adaptive law with its published gains.
 
-        The gains are printed in the paper from which the law comes. The scores are the error,
-        the effort and the class of behaviour. The table has a row for each variant: with and
-        without information about the arm.
+        These gains are printed in the paper that introduced the law. The scores are the error,
+        the effort and the behaviour class. The table has one row per variant: with and without
+        information about the arm.
         """
         rows = []
         for result in self._tuned.printed:
@@ -213,12 +213,9 @@ class TuningReport:
         return TextTable(("law", "class", *_SCORE_HEADS), rows, align="llr")
 
     def _build_page(self) -> str:
-        """Composes the Markdown page that reports a comparison of control laws.
+        """Composes the Markdown page that reports the comparison of control laws.
 
-        The page contains, for each point of a front, the command that repeats its run.
-
-        Returns:
-            The text of the page.
+        For each point of a front, the page contains the command that repeats its run.
         """
         scenario = self._tuned.plan.base.scenario
         parts = [
@@ -252,8 +249,8 @@ class TuningReport:
     def _draw_front(self) -> Figure:
         """Draws the Pareto fronts of all laws in one panel, with error against effort.
 
-        The Pareto front of a law contains the best compromises between both. The axes are
-        logarithmic if all numbers are positive.
+        The front of a law contains its best trade-offs between the two. The axes are
+        logarithmic if all values are positive.
         """
         with style.styled_figure(REPORT_SIZE, _HEIGHT_IN) as figure:
             figure.set_figwidth(FRONT_WIDTH_IN)
@@ -287,13 +284,11 @@ class TuningReport:
 
 
 def _format_front_ends(search: "CandidateSearch") -> list[str]:
-    """Returns two table cells with the best compromises of a law: least error, least effort.
-
-    They are the two ends of its Pareto front.
+    """Returns the table cells for the two ends of a law's Pareto front.
 
     Returns:
-        The least objective with its effort, and the least effort with its objective. All cells
-        are "-" if the law has no front.
+        The smallest objective with its effort, and the smallest effort with its objective. All
+        cells are "-" if the law has no front.
     """
     front = search.front_points
     if not front:
@@ -305,10 +300,9 @@ def _format_front_ends(search: "CandidateSearch") -> list[str]:
 
 
 def _tabulate_search(plan: "TuningPlan") -> TextTable:
-    """Returns a table of the gains that are tuned, with the ranges in which they are searched.
+    """Returns a table of the gains that are tuned and their search ranges, one row per gain.
 
-    There is a row per gain. The information that a law gets about the model of the arm is named
-    in its first row.
+    The first row of a law also names the information that it gets about the arm model.
 
     Args:
         plan: The comparison.
@@ -327,7 +321,7 @@ def _tabulate_search(plan: "TuningPlan") -> TextTable:
 
 
 _SCORE_HEADS = ("error rad", "spread rad", "pose rad", "effort N m", "settling s", "clamped %")
-"""Headers of the columns of a score."""
+"""Column headers of a score."""
 
 
 def _format_score(score: CandidateScore) -> tuple[str, ...]:
@@ -343,7 +337,7 @@ def _format_score(score: CandidateScore) -> tuple[str, ...]:
 
 
 def _format_mean(mean: float | None, half: float | None) -> str:
-    """Returns a mean as text, with the half-width of its confidence interval if known.
+    """Formats a mean, with the half-width of its confidence interval if known.
 
     Args:
         mean: The mean, or `None`.
@@ -405,7 +399,7 @@ def describe_procedure(plan: "TuningPlan") -> list[str]:
 
 
 def _list_class_meanings() -> list[str]:
-    """Returns a line for each class of behaviour, such as stable, with its meaning.
+    """Returns one line per behaviour class, such as stable, with its meaning.
 
     The report prints these lines below the table of control laws. A run belongs to the first
     class that applies.
@@ -414,17 +408,17 @@ def _list_class_meanings() -> list[str]:
 
 
 def _format_list(lines: Sequence[str]) -> str:
-    """Returns lines as a bulleted list in Markdown, one bullet per line."""
+    """Formats lines as a bulleted list in Markdown, one bullet per line."""
     return "\n".join(f"- {line}" for line in lines)
 
 
 def _format_code(lines: Sequence[str]) -> str:
-    """Returns lines as a block of code in Markdown, between fences."""
+    """Formats lines as a fenced code block in Markdown."""
     return "\n".join(["```", *lines, "```"])
 
 
 FRONT_WIDTH_IN = 3.5
-"""Width of the figure, in inches: a column of a page with two columns."""
+"""Width of the figure, in inches, equal to one column of a two-column page."""
 _HEIGHT_IN = 3.1
 """Height of the figure, in inches."""
 _SIZE_PT = 8.0
@@ -476,7 +470,7 @@ def _draw_law(axes: Axes, search: "CandidateSearch") -> Line2D:
 
 
 def _draw_paper_gains(axes: Axes, tuned: "TuningResult") -> list[Line2D]:
-    """Draws the scores of the gains that the paper prints as stars, for comparison.
+    """Draws the scores of the published gains as stars, for comparison.
 
     Returns:
         Their legend entries. If a variant has no point in the figure, its entry states why.
