@@ -342,7 +342,7 @@ class LogComparison(Result):
 
 
 def compare(*logs: str | Path | Log) -> LogComparison:
-    """Compares logs by their metrics and by the scenarios they were recorded from.
+    """Compares logs: their metrics, and the scenarios that they were recorded from.
 
     The command `trilat compare` does the same.
 

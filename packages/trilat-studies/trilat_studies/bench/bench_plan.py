@@ -768,7 +768,7 @@ class BenchPlan(NamedTuple):
         return sum(len(cell.seeds) for cell in self.cells)
 
     def cell(self, name: str) -> BenchCell:
-        """Looks up a cell by its name.
+        """Looks up a cell by name.
 
         Args:
             name: Task, law and link, as in "contact/wave/rtt272".

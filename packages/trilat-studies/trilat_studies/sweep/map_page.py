@@ -528,7 +528,7 @@ def _extend_positions(axis: PlaneAxis) -> Array:
 def _extrapolate_rows(rows: Array, positions: Array) -> Array:
     """Returns a field with an extrapolated row before the first and after the last row.
 
-    The lines of a map are thereby extended to its border, half a cell beyond the grid points.
+    This extends the lines of a map to its border, half a cell beyond the grid points.
 
     Args:
         rows: The field, shape (n, m).
@@ -617,8 +617,8 @@ def _set_ticks(axis: Axis, plane_axis: PlaneAxis) -> None:
 def _find_exponent_limit(plane: MapPlane) -> float:
     """Returns the growth exponent at which the colour scale of a map ends, in 1/s.
 
-    The limit is 1, 2 or 5 times a power of ten. It is at least as large as four fifths of the
-    exponents, so that a few large exponents do not make all others look pale.
+    The limit is 1, 2 or 5 times a power of ten. Up to a fifth of the exponents may exceed it,
+    because otherwise a few large exponents would make all others look pale.
     """
     # The cells that ran in a refined sweep lie along the edge, where exponents are small.
     panels = plane.panels

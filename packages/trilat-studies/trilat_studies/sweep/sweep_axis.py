@@ -1,4 +1,4 @@
-"""Parses the axes of a sweep, each of which is a scenario key with the values it takes.
+"""Parses the axes of a sweep. An axis is a scenario key together with its swept values.
 
 Users write an axis as a string, such as "link.delay_ms=0:400:50". This module also defines the
 names and units that label an axis in figures and tables.
