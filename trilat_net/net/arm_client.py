@@ -1,8 +1,7 @@
-"""Connects a program to a site: the driver of a real arm, a dead-man switch, or an operator.
+"""Connects programs to a site: the driver of a real arm, a dead-man switch, or an operator.
 
-A site is a process that computes the torque of one arm. If the arm is external (`plant =
-"external"` in the scenario), its driver sends the measured joint positions to the site, and
-applies the torque that the site publishes:
+If an arm is external (`plant = "external"` in the scenario), its driver sends the measured
+joint positions to the site and applies the torque that the site publishes:
 
     with ArmClient.connected("two_sites", "s", ["tcp/127.0.0.1:10241"]) as client:
         while not client.over:
@@ -11,19 +10,18 @@ applies the torque that the site publishes:
             robot.brake() if tau is None else robot.apply(tau)
             robot.wait()
 
-`SwitchClient` reports whether somebody holds the dead-man switch of such an arm. `Hand` lets a
-person or a program move an arm as its operator. Clients read torques and forces from the
-records that the recorder stores as well. Therefore the log contains exactly what was applied to
-the arm.
+`SwitchClient` reports whether the dead-man switch of such an arm is held. `Hand` lets a person
+or a program move an arm as its operator. Clients read torques and forces from the same records
+that the recorder stores, so the log shows exactly what was applied to the arm.
 
 Invariant:
     - `ArmClient.torque` returns None if no valid torque is available. The arm must then brake.
-    - A client accepts only records that continue those that it has received: from the same
-      process of the site, newer, and not implausibly far in the future. Otherwise a second
-      process of the same name, or a forged message, could move the arm.
-    - While an operator sends no new target, a thread repeats the last message. If no more
-      messages arrive, the site knows that the operator's program has died, and releases the
-      arm.
+    - A client only accepts records from the site process it has been following, and only if
+      they are newer than the previous record and not implausibly far in the future. This
+      prevents a second process with the same name, or a forged message, from moving the arm.
+    - While the operator's target does not change, a thread keeps repeating the last message.
+      When the messages stop, the site concludes that the operator's program has died and
+      releases the arm.
 """
 
 import math
@@ -107,13 +105,13 @@ class _SiteSender:
         self._publish = bus.publisher(topics.key(session, site, channel))
 
     def send(self, kind: type[R], **fields: object) -> R:
-        """Sends a message to an arm controller (site), under the next number.
+        """Sends a message to a site and gives it the next sequence number.
 
         Args:
             kind: Class of the message.
-            **fields: Fields of the message other than the site, the boot and the number. They
-                may replace the time stamp `sent_ns`, which is otherwise the present time of the
-                clock.
+            **fields: Fields of the message other than the site, the boot and the sequence
+                number. Pass `sent_ns` to override the time stamp, which is otherwise the
+                current time.
 
         Returns:
             The message that was sent.
@@ -126,23 +124,22 @@ class _SiteSender:
         return message
 
     def repeat(self, message: R) -> None:
-        """Sends a message again with the same number, to show that the program still runs.
+        """Repeats a message with its original number, showing that the program still runs.
 
-        The site recognises the number, and does not execute the message a second time.
+        The site recognises the number and does not execute the message a second time.
 
         Args:
-            message: Message that `send` has returned.
+            message: A message returned by `send`.
         """
         self._publish(encode(message))
 
 
 class HandSender(_SiteSender):
-    """Sends the messages of an operator to the site of an arm.
+    """Sends an operator's messages to the site of an arm.
 
-    The operator is the person or program that moves the arm. A random number in 1 ... 2^32 - 1
-    identifies the operator's program. The records of the site store this number as a float,
-    which represents such numbers exactly. In a record, the number 0 means that no operator
-    moves the arm.
+    The operator's program is identified by a random number in 1 ... 2^32 - 1, which the records
+    of the site store as a float without loss of precision. In a record, 0 means that no
+    operator is moving the arm.
 
     Args:
         bus: Network connection of the operator's program.
@@ -171,8 +168,8 @@ class HandSender(_SiteSender):
         """Sends a target or a force to the site, or releases its arm.
 
         Args:
-            source: Name of the operator for people.
-            **fields: Further fields of `HandMessage`.
+            source: Name of the operator, as shown to people.
+            **fields: Other fields of `HandMessage`.
 
         Returns:
             The message that was sent.
@@ -181,15 +178,12 @@ class HandSender(_SiteSender):
 
 
 class SiteClient:
-    """Connection of a program to one site, from which it receives records and events.
+    """Receives the records and events of one site.
 
-    The object is a context manager that closes the network connection.
-
-    A site is a process that runs one arm and its control loop. A record is the result of one
-    period of this loop.
+    Use the client as a context manager to close the network connection.
 
     Args:
-        bus: Network connection that reaches the site.
+        bus: Network connection through which the site can be reached.
         clock: Clock of this process.
         session: Name of the session.
         site: Name of the site.
@@ -225,21 +219,19 @@ class SiteClient:
 
     @property
     def record(self) -> State | None:
-        """Newest record of the arm controller (site) that has arrived, with angles and torque.
+        """Newest record received from the site, which contains the joint angles and the torque.
 
-        A record is the result of one period of the control loop. The value is None before the
-        first record has arrived.
+        None until the first record arrives.
         """
         self._read_messages()
         return self._record
 
     @property
     def fresh(self) -> bool:
-        """True if the newest record can still be used to control the arm.
+        """True if the newest record is recent enough to control the arm.
 
-        This is the case if the record is at most `FRESH_NS` old and the run continues. It is
-        False before the first tick (period of the control loop), after the run, and once the
-        run has diverged.
+        The record must be at most `FRESH_NS` old. False before the first tick, after the end of
+        the run, and once the run has diverged.
         """
         record = self.record
         if record is None or self._is_over or record.mode == "diverged":
@@ -248,9 +240,9 @@ class SiteClient:
 
     @property
     def over(self) -> bool:
-        """True once no more records of the site (arm controller) will arrive.
+        """True once the site will send no more records.
 
-        This is the case if the run of the site has ended, or if its process is gone.
+        Either its run has ended or its process has disappeared.
         """
         self._read_messages()
         return self._is_over
@@ -357,15 +349,15 @@ class _OutsideClient(SiteClient):
         connect: Sequence[str],
         keys: str | Path | None = None,
     ) -> Self:
-        """Connects a program to an arm controller (site) over the network.
+        """Connects a program to a site over the network.
 
         Args:
             session: Name of the session, by default the name of the scenario.
-            site: Name of the site, the process that runs the arm.
+            site: Name of the site.
             connect: Endpoints of the site, which the site prints while it waits for its arm.
-            keys: Folder with the keys of one member, as `trilat keys new` creates it. The
-                program of an arm uses the keys of its site. The program of a dead-man switch
-                uses the keys of the operator. If None, the connection uses no keys.
+            keys: Folder with the keys of one member, as created by `trilat keys new`. An arm's
+                driver uses the keys of the arm's site; the program of a dead-man switch uses
+                the keys of the operator. If None, the connection uses no keys.
 
         Returns:
             The client.
@@ -379,10 +371,10 @@ class _OutsideClient(SiteClient):
 
 
 class SwitchClient(_OutsideClient):
-    """Connection of the program of a dead-man switch to the site of the arm.
+    """Connects the program of a dead-man switch to the site of the arm.
 
-    The program reports regularly whether somebody holds the switch. The arm stops if the switch
-    is released, or if no message has arrived for 100 ms.
+    The program regularly reports whether the switch is held. The arm stops when the switch is
+    released, or when no report has arrived for 100 ms.
 
     >>> endpoints = ["tcp/127.0.0.1:10241"]
     >>> with tn.SwitchClient.connected("two_sites", "s", endpoints) as switch:  # doctest: +SKIP
@@ -396,23 +388,22 @@ class SwitchClient(_OutsideClient):
     """Member whose keys the program uses. Empty stands for the site."""
 
     def send(self, *, held: bool) -> None:
-        """Reports to the site whether somebody holds the dead-man switch.
+        """Reports to the site whether the dead-man switch is held.
 
-        The program of the switch must report at least every 100 ms, because the arm stops
-        otherwise.
+        Call this at least every 100 ms; otherwise the arm stops.
 
         Args:
-            held: True while somebody holds the switch. False stops the arm at once.
+            held: True while the switch is held. False stops the arm at once.
         """
         self._sender.send(ArmEnable, held=held)
 
 
 class ArmClient(_OutsideClient):
-    """Connection of the driver of an external arm to the site that controls the arm.
+    """Connects the driver of an external arm to the site that controls the arm.
 
-    The driver sends measurements with `send`, and reads the torque to apply with `torque`. The
-    attribute `record` is the newest record of the site, the result of one period of its control
-    loop. The object is a context manager that closes the network connection.
+    The driver sends measurements with `send` and reads the torque to apply with `torque`. The
+    attribute `record` holds the newest record of the site. Use the client as a context manager
+    to close the network connection.
 
     >>> endpoints = ["tcp/127.0.0.1:10241"]
     >>> with tn.ArmClient.connected("two_sites", "s", endpoints) as client:  # doctest: +SKIP
@@ -430,19 +421,19 @@ class ArmClient(_OutsideClient):
         tau_x: Sequence[float] = (),
         stamp_ns: int | None = None,
     ) -> None:
-        """Sends a measurement of a real arm, such as its joint angles, to its controller.
+        """Sends measured joint angles (rad) and velocities (rad/s) of a real arm to its site.
 
         Args:
             q: Joint angles in rad.
             qd: Joint velocities in rad/s.
-            tau_x: Torque of the operator and the environment in N m per joint, if the arm
-                measures it. The sign is that of the paper: the torque that acts ON the arm is
-                the negative of `tau_x`.
+            tau_x: Torque exerted by the operator and the environment, in N m per joint, if the
+                arm measures it. The sign convention is that of the paper: `tau_x` is the
+                negative of the torque that acts ON the arm.
             stamp_ns: Time of the measurement in ns, on any monotonic clock of the arm. If None,
-                the present time of this program's monotonic clock is used.
+                the current time of this program's monotonic clock is used.
 
         Raises:
-            ValueError: `tau_x` and `q` have different lengths, or a number is not finite.
+            ValueError: `tau_x` and `q` have different lengths, or a value is not finite.
         """
         vectors = {"q": q, "qd": qd, "tau_x": tau_x}
         vectors_by_name = {
@@ -452,19 +443,16 @@ class ArmClient(_OutsideClient):
         self._sender.send(ArmMeasurement, **vectors_by_name, **optional_stamp)
 
     def torque(self) -> tuple[float, ...] | None:
-        """Returns the torque to apply now, or None if the arm must brake.
+        """Returns the torque to apply now, in N m per joint, or None if the arm must brake.
 
-        The torque is that of the newest record, the result of one tick (period of the control
-        loop) of the site (arm controller). The arm must brake in these cases:
+        The torque is taken from the newest record of the site. The arm must brake in these
+        cases:
 
-        - before the first tick and after the run,
+        - before the first tick and after the end of the run,
         - if the newest record is older than `FRESH_NS`,
-        - `_BRAKE_NS` after a fault or after the release of the dead-man switch. Until then the
-          torque brings the arm to rest. If the switch is released while the arm is stopped by
-          order, this time counts from the stop.
-
-        Returns:
-            The torque in N m per joint. None if the arm must brake.
+        - `_BRAKE_NS` after a fault or after the release of the dead-man switch. Until then, the
+          torque brings the arm to rest. If the arm had already been stopped by a command when
+          the switch was released, this time is measured from the stop.
         """
         record = self.record
         if record is None or not self.fresh:
@@ -490,24 +478,23 @@ class ArmClient(_OutsideClient):
 
 
 class Hand(SiteClient):
-    """Connection of a person or a program that moves an arm as its operator.
+    """Lets a person or a program move an arm as its operator.
 
-    `tn.hand` and the commands of the live page create it. The first call of `move`, `turn` or
-    `push` starts to move the arm. Which of them is permitted depends on whether the operator in
-    the scenario has a target position, target angles, or a force. `release` ends the operator's
-    influence. The object is a context manager that releases the arm at its end.
+    Instances are created by `tn.hand` and by the commands of the live page. The first call to
+    `move`, `turn` or `push` takes hold of the arm. Which of the three is allowed depends on
+    whether the scenario gives the operator a target position, target angles or a force.
+    `release` lets go of the arm. When used as a context manager, the arm is released on exit.
 
     Args:
         bus: Network connection.
         clock: Clock of this process.
         session: Name of the session.
         site: Site of the arm.
-        operator: Settings of the live operator in the scenario, as the simulation kernel stores
-            them.
-        compute_pose: Function that returns the arm's pose for given joint angles, in the
+        operator: Settings of the scenario's live operator, as stored by the simulation kernel.
+        compute_pose: Function that computes the arm's pose from its joint angles, in the
             coordinates of the operator's target: the position of the end effector in m, or the
             joint angles in rad.
-        source: Name of the person or program, which events of the session mention.
+        source: Name of the person or program, which is mentioned in the events of the session.
         repeats: True if a thread repeats the last message. Without the thread, the site
             releases the arm if the program hangs.
     """
@@ -554,23 +541,23 @@ class Hand(SiteClient):
             self._ended.set()
 
     def move(self, *place_m: float) -> int:
-        """Pulls the end effector of the arm towards a target position, like a spring.
+        """Pulls the end effector towards a target position in m, like a spring.
 
         Args:
-            *place_m: Coordinates x and y of the target, for an arm in space also z, in m.
+            *place_m: Coordinates of the target in m: x and y, plus z for an arm in space.
 
         Returns:
-            The number of the message. The property `number` has this value once the site (arm
-            controller) follows the message.
+            The number of the message. The property `number` changes to this value once the site
+            follows the message.
 
         Raises:
-            UsageError: The scenario's operator is not moved in this way, or a number is not
-                finite.
+            UsageError: The scenario's operator cannot be moved in this way, or a coordinate is
+                not finite.
         """
         return self._send("move", place_m)
 
     def turn(self, *angles_rad: float) -> int:
-        """Pulls the joints of the arm towards target angles, like springs.
+        """Pulls the joints of the arm towards target angles in rad, like springs.
 
         Args:
             *angles_rad: Target angle of each joint, in rad.
@@ -579,30 +566,30 @@ class Hand(SiteClient):
             The number of the message, see `move`.
 
         Raises:
-            UsageError: The scenario's operator is not moved in this way, or a number is not
+            UsageError: The scenario's operator cannot be moved in this way, or an angle is not
                 finite.
         """
         return self._send("turn", angles_rad)
 
     def push(self, *force_n: float) -> int:
-        """Pushes the end effector of the arm with a force, as a person would with a hand.
+        """Pushes the end effector of the arm with a force in N, as a person's hand would.
 
         Args:
-            *force_n: Coordinates of the force that acts ON the end effector, in N.
+            *force_n: Components of the force that acts ON the end effector, in N.
 
         Returns:
             The number of the message, see `move`.
 
         Raises:
-            UsageError: The scenario's operator does not apply forces, or a number is not
+            UsageError: The scenario's operator does not apply forces, or a component is not
                 finite.
         """
         return self._send("push", force_n)
 
     def release(self) -> None:
-        """Stops moving the arm. The force on it fades within 100 ms, so that it does not jump.
+        """Lets go of the arm. The force fades within 100 ms, to avoid a sudden movement.
 
-        Afterwards, `move`, `turn` or `push` may take hold of the arm again.
+        `move`, `turn` or `push` can take hold of the arm again.
         """
         with self._lock:
             is_gripping = self._message is not None
@@ -612,20 +599,19 @@ class Hand(SiteClient):
 
     @property
     def holds(self) -> bool:
-        """True if this program moves the arm, as its operator, in the newest record.
+        """True if, according to the newest record, this program is the operator moving the arm.
 
-        A record contains the state of the site in one period of its control loop. The value is
-        False if another operator or nobody moves the arm, or if there is no record yet.
+        False if another operator or nobody is moving the arm, or if no record has arrived yet.
         """
         hand = self.in_force
         return hand is not None and hand.source == self._sender.boot
 
     @property
     def number(self) -> int:
-        """Number of the message from this program that the arm followed in its newest record.
+        """Number of this program's message that the arm followed in the newest record.
 
-        It is the number that `move`, `turn` or `push` returned, or -1 if this program does not
-        move the arm at present.
+        Matches the number returned by `move`, `turn` or `push`. -1 if this program is not
+        moving the arm.
         """
         hand = self.in_force
         if hand is None or hand.source != self._sender.boot:
@@ -634,11 +620,10 @@ class Hand(SiteClient):
 
     @property
     def in_force(self) -> HandInForce | None:
-        """Operator who moves the arm in the newest record, with the present target or force.
+        """The operator moving the arm in the newest record, with the current target or force.
 
-        A record contains the state of the site in one period of its control loop. The operator
-        may be this program or another program. The value is None if nobody moves the arm, or if
-        there is no record yet.
+        The operator may be this program or another one. None if nobody is moving the arm, or if
+        no record has arrived yet.
         """
         record = self.record
         if record is None or not record.hand:
@@ -647,25 +632,25 @@ class Hand(SiteClient):
 
     @property
     def pose(self) -> tuple[float, ...]:
-        """Pose of the arm in the newest received record.
+        """Pose of the arm in the newest record received.
 
-        It is the position of the end effector in m, or for `turn` the joint angles in rad.
+        This is the position of the end effector in m or, for `turn`, the joint angles in rad.
         """
         record = self._wait_for_record()
         return tuple(map(float, self._compute_pose(record.q)))
 
     @property
     def force(self) -> tuple[float, ...]:
-        """Force of the operator ON the arm in the newest record, in N.
+        """Force that the operator exerts ON the arm in the newest record, in N.
 
-        For `turn`, these are the torques on the joints in N m.
+        For `turn`, these are joint torques in N m.
 
         An operator with a target pulls the arm like a spring and a damper,
 
             F = K (target - pose) + B (target rate - pose rate).
 
-        The force is limited in size, and scaled by the grip between 0 and 1. The operator feels
-        the negative of this force.
+        The magnitude of the force is limited, and the force is scaled by the grip (0 to 1). The
+        operator feels the negative of this force.
         """
         record = self._wait_for_record()
         operator = self._operator
