@@ -1,14 +1,13 @@
-"""Remembers which arms run on this machine, so that `trilat stop` reaches them immediately.
+"""Remembers which arms run on this machine, so that `trilat stop` can reach them immediately.
 
-The process that controls an arm (the site) stores its network endpoints in a small file while
-it runs. `trilat stop` reads these files and connects to the sites at once, instead of first
-searching for the session on the network.
+While a site runs, it stores its network endpoints in a small file. `trilat stop` reads these
+files and connects to the sites at once, instead of first searching the network for the session.
 
 Invariant:
-    - The files are only a shortcut. A site runs without its file, and a file whose process is
-      gone is ignored.
-    - Only the user who runs the site can read the file.
-    - If the arms cannot be stopped in this way, the command continues with the search for the
+    - The files are only a shortcut. A site runs without its file, and a file whose process no
+      longer exists is ignored.
+    - A file can only be read by the user who runs the site.
+    - If the arms cannot be stopped in this way, the command falls back to searching for the
       session.
 """
 
@@ -94,24 +93,22 @@ def make_site_known(
     connection: "Connection",
     stop: bytes,
 ) -> Iterator[None]:
-    """Publishes the endpoints of a site in a file, with which `trilat stop` finds the site.
+    """Publishes the endpoints of a site in a file, which lets `trilat stop` find the site.
 
-    This is a context manager: the file exists while the site runs, and is removed afterwards.
-    If the file cannot be written, the site runs without it, and `trilat stop` searches the
-    network instead.
+    This is a context manager: the file exists while the site runs and is removed afterwards. If
+    the file cannot be written, the site runs without it, and `trilat stop` searches the network
+    instead.
 
-    No file is written if the user has configured the network connection with a Zenoh file.
-    Other processes need the same Zenoh file to reach the site. Therefore the endpoints alone
-    would not help.
+    No file is written if the network connection is configured with a Zenoh file. Other
+    processes need that Zenoh file to reach the site, so the endpoints alone would not help.
 
     Args:
         session: Name of the session.
         site: Name of the site.
         sites: Names of all sites of the session.
-        boot: Random number that identifies this start of the site. It is part of the file's
-            name.
+        boot: Random number that identifies this start of the site. It is part of the file name.
         connection: Network connection of the site.
-        stop: The message that `trilat stop` sends to stop the arm, encoded.
+        stop: The encoded message that `trilat stop` sends to stop the arm.
     """
     endpoints = [*connection.listen, *(connection.connect or ())]
     known = _KnownSite(
@@ -142,15 +139,15 @@ def make_site_known(
 
 
 def find_known_sites(session: str) -> list[_KnownSite]:
-    """Lists the sites (arm controllers) of a session that run on this machine.
+    """Lists the sites of a session that run on this machine.
 
-    The files of sites whose process is gone are removed.
+    The files of sites whose process no longer exists are deleted.
 
     Args:
         session: Name of the session.
 
     Returns:
-        The content of the file of each site. Empty if no site of the session runs here.
+        The content of each site's file. Empty if no site of the session runs here.
     """
     running = []
     machine = SystemClock().identity()
@@ -196,18 +193,18 @@ def _list_endpoints(known_sites: Sequence[_KnownSite]) -> list[Endpoint]:
 
 
 def find_known_endpoints(session: str, connection: "Connection") -> list[Endpoint] | None:
-    """Finds the endpoints of a session whose sites (arm controllers) all run on this machine.
+    """Returns the endpoints of a session whose sites all run on this machine.
 
-    Every running site stores its endpoints in a file, so no search in the network is needed.
+    Every running site stores its endpoints in a file, so the network does not have to be
+    searched.
 
     Args:
         session: Name of the session.
-        connection: Network connection of this process. Sites with another mode are ignored.
-            Sites with keys are ignored if this process has no keys, and sites without keys if
-            it has.
+        connection: Network connection of this process. Sites in another mode are ignored, as
+            are sites with keys if this process has none, and sites without keys if it has some.
 
     Returns:
-        The endpoints. None if not all sites of the session are known.
+        The endpoints, or None unless all sites of the session are known.
     """
     has_keys = bool(connection.keys_of)
     known_sites = [
@@ -225,19 +222,19 @@ def find_known_endpoints(session: str, connection: "Connection") -> list[Endpoin
 
 
 def stop_at_once(arguments: Sequence[str]) -> int | list[str]:
-    """Stops arms immediately, as the command line of `trilat stop` requests.
+    """Stops arms immediately, as requested by the command line of `trilat stop`.
 
-    Only sites that run on this machine can be stopped in this way, because their endpoints are
-    read from local files. No other part of the program is loaded first, so that the arms stop
-    without delay.
+    Only sites on this machine can be stopped in this way, because their endpoints are read from
+    local files. No other part of the program is loaded first, which lets the arms stop without
+    delay.
 
     Args:
         arguments: Command line after `trilat stop`.
 
     Returns:
         The exit code of the command if all arms have been stopped or if the keys are missing.
-        Otherwise the arguments for the full command, which continues, for example by searching
-        the network for the remaining sites.
+        Otherwise, the arguments for the full command, which then continues, for example by
+        searching the network for the remaining sites.
     """
     options, sites, is_simple = _parse_arguments(arguments)
     session = options["--session"]

@@ -1,20 +1,19 @@
-"""Creates, renews and reads the keys with which the processes of a session prove who they are.
+"""Creates, renews and reads the keys that prove the identity of a session's processes.
 
-Without keys, any program that can reach the process of an arm over the network could send
-messages to it. `trilat keys new` creates a private certificate authority for the session, which
-signs one certificate per member, that is per process that takes part, such as the process of an
-arm. Zenoh, the library that transports the messages, encrypts all connections with these keys
-(TLS or QUIC with certificates of both ends).
+Without keys, any program that can reach a site over the network could send it messages. `trilat
+keys new` creates a private certificate authority for the session and signs one certificate per
+member. Zenoh, the library that transports the messages, uses these keys to encrypt all
+connections (TLS or QUIC with certificates at both ends).
 
-Every member loads the keys in its own folder. The folder contains its private key, its
-certificate, the certificate of the authority, and the list of all members, from which the
-access rules are derived. No other user of the machine can read the private key or change a file
-in the folder. The private key of the authority has a separate folder, which should be stored
-safely.
+Each member loads the keys from its own folder. The folder contains its private key, its
+certificate, the certificate of the authority and a list of all members, from which the access
+rules are derived. No other user of the machine can read the private key or change a file in the
+folder. The private key of the authority is kept in a separate folder, which should be stored in
+a safe place.
 
-The keys expire one day earlier than their certificate. During this day, no member can start
-with the keys, but `trilat stop` can still connect and stop the arms. Zenoh needs a valid
-certificate for each new connection, and each time a connection is opened again.
+The keys expire one day before their certificate. During this day, no member can start with the
+keys, but `trilat stop` can still connect and stop the arms. Zenoh needs a valid certificate
+whenever it opens or reopens a connection.
 """
 
 import datetime
@@ -79,16 +78,16 @@ MOST_LETTERS = 64
 
 
 class MemberKeys(NamedTuple):
-    """Cryptographic keys by which one process of a session proves its identity.
+    """Cryptographic keys with which one member of a session proves its identity.
 
     Attributes:
-        member: Name of the member, a process that takes part in the session.
-        members: Names of all members of the session that the keys were created for.
-        ends: Time at which the validity of the keys ends, in UTC. The certificate is valid for
-            `STOPPING_TIME` longer, so that the keys can still be used to stop arms.
+        member: Name of the member.
+        members: Names of all members of the session for which the keys were created.
+        ends: Expiry time of the keys, in UTC. The certificate remains valid for another
+            `STOPPING_TIME`, so that the keys can still be used to stop arms.
         settings: Zenoh settings that use the keys, see `make_zenoh_config`.
-        hosts: Names and addresses at which other members can reach the member. Nobody can
-            connect to a member at any other address.
+        hosts: Names and addresses under which other members can reach this member. Connections
+            to any other address fail.
     """
 
     member: str
@@ -107,15 +106,15 @@ def create_keys(
     """Creates a folder of keys for each member of a session, as `trilat keys new` does.
 
     With keys, the members encrypt their messages and prove their identities. The keys are
-    signed by an authority, which is also created and can renew them later.
+    signed by an authority, which is created along with them and can renew them later.
 
     >>> [folder.name for folder in tn.create_keys("keys", ["m", "s", "recorder"])]
     ['m', 's', 'recorder']
 
     Args:
         folder: Folder to create. If it exists, it must be empty.
-        members: Names of the sites, and `recorder`, `operator` and `router` if they take part.
-        hosts: Names and addresses at which members listen, in addition to those of the local
+        members: Names of the sites, plus `recorder`, `operator` and `router` if they take part.
+        hosts: Names and addresses on which members listen, in addition to those of the local
             machine.
         days: Validity of the keys, in days.
 
@@ -123,8 +122,8 @@ def create_keys(
         The folders of the members.
 
     Raises:
-        UsageError: A name is not valid, or the folder is not empty or cannot be created.
-        LogRefused: The disk refused to write. No files are left.
+        UsageError: A name is invalid, or the folder is not empty or cannot be created.
+        LogRefused: Writing to the disk failed. No files are left behind.
     """
     folder = Path(folder)
     faults = [_find_name_fault(members), *map(_find_host_fault, hosts)]
@@ -201,24 +200,24 @@ def _find_host_fault(host: str) -> str:
 def renew_keys(folder: str | Path, members: Sequence[str] = (), days: int = 30) -> list[Path]:
     """Renews the certificates of members in place, as `trilat keys renew` does.
 
-    Private keys, host names and the lists of members are not changed.
+    Private keys, host names and member lists stay the same.
 
     >>> folders = tn.create_keys("lab-keys", ["m", "s"], days=1)
     >>> [folder.name for folder in tn.renew_keys("lab-keys", days=30)]
     ['m', 's']
 
     Args:
-        folder: Folder that `create_keys` created, including its folder `authority`.
+        folder: Folder created by `create_keys`, including its folder `authority`.
         members: Members whose certificates are renewed. If empty, all members that have a
             folder.
         days: Validity of the keys from now on, in days.
 
     Returns:
-        The renewed folders.
+        The folders whose certificates were renewed.
 
     Raises:
         UsageError: The authority, the folder of a member or a file in it is missing or damaged.
-        LogRefused: The disk refused to write.
+        LogRefused: Writing to the disk failed.
     """
     folder = Path(folder)
     if not 0 <= days <= _MOST_DAYS:
@@ -286,20 +285,20 @@ def add_keys(
     hosts: Sequence[str] = (),
     days: int = 30,
 ) -> list[Path]:
-    """Creates keys for further members of a session, as `trilat keys add` does.
+    """Creates keys for additional members of a session, as `trilat keys add` does.
 
-    The keys of the other members stay valid. Only the list of all members in their folders, the
-    file members.json, is replaced.
+    The keys of the existing members stay valid. Only the list of all members in their folders
+    (members.json) is replaced.
 
     >>> folders = tn.create_keys("lab-keys", ["m", "s"])
     >>> [folder.name for folder in tn.add_keys("lab-keys", ["s2"])]
     ['s2']
 
     Args:
-        folder: Folder that `create_keys` created, with its folder `authority` and the folders
-            of all members.
+        folder: Folder created by `create_keys`, with its folder `authority` and the folders of
+            all members.
         members: Names of the new members.
-        hosts: Names and addresses at which the new members listen, in addition to those of the
+        hosts: Names and addresses on which the new members listen, in addition to those of the
             local machine.
         days: Validity of the new keys, in days.
 
@@ -307,9 +306,9 @@ def add_keys(
         The folders of the new members.
 
     Raises:
-        UsageError: A name is not valid or in use, or the authority or the folder of a member is
-            missing or damaged.
-        LogRefused: The disk refused to write. The folder is as it was before.
+        UsageError: A name is invalid or already in use, or the authority or the folder of a
+            member is missing or damaged.
+        LogRefused: Writing to the disk failed. The folder is unchanged.
     """
     folder = Path(folder)
     faults = [_find_name_fault(members), *map(_find_host_fault, hosts)]
@@ -773,22 +772,22 @@ def _check_permissions(path: Path, status: os.stat_result) -> None:
 
 
 def read_member_keys(folder: str | Path, *, stops: bool = False) -> MemberKeys:
-    """Reads and checks the keys in the folder of a member, as `trilat keys info` does.
+    """Reads and checks the keys in a member's folder, as `trilat keys info` does.
 
     >>> tn.read_member_keys(tn.create_keys("lab-keys", ["m", "s"])[0]).member
     'm'
 
     Args:
-        folder: Folder of one member, a process that takes part in a session.
-        stops: True if the keys are only used to stop arms. Keys whose validity has ended are
-            then still accepted for `STOPPING_TIME`, until their certificate ends as well.
+        folder: Folder of one member.
+        stops: True if the keys are only used to stop arms. Expired keys are then accepted for
+            another `STOPPING_TIME`, until their certificate expires too.
 
     Returns:
         The keys.
 
     Raises:
-        UsageError: A file is missing or damaged, the validity of the keys has ended, or the
-            files do not belong together.
+        UsageError: A file is missing or damaged, the keys have expired, or the files do not
+            belong together.
     """
     folder = Path(folder)
     if (folder / _AUTHORITY_FOLDER).is_dir():

@@ -12,25 +12,27 @@ each message therefore limits the offset at one time of the local clock:
 
 In an exchange with the stamps t1 (local sending), t2 (other receipt), t3 (other sending) and t4
 (local receipt), the ceiling is t2 - t1 and the floor is t3 - t4. Their mean is the classical
-estimate of the offset, as in NTP. Their difference is the round trip time, and half of it is
-the error bound.
+estimate of the offset, as used by NTP. Their difference is the round trip time, and half of the
+difference is the error bound.
 
-The time stamps are divided into windows. Of each window, only the lowest ceiling and the
-highest floor are kept. They may come from different exchanges. Therefore the error bound is
-half of the shortest delay in one direction plus half of the shortest delay in the other. Over
-the windows, the offset is modelled as a straight line. All lines below every ceiling and above
-every floor are admissible, and the range of their values at present is the range of the offset.
+The time stamps are divided into windows. Only the lowest ceiling and the highest floor of each
+window are kept, which may come from different exchanges. The error bound is therefore half of
+the shortest delay in one direction plus half of the shortest delay in the other. Across the
+windows, the offset is modelled as a straight line. Every line below all ceilings and above all
+floors is admissible, and the present values of the admissible lines form the range of the
+offset.
 
 Assumptions: the clocks drift apart by less than DRIFT_LIMIT, and their drift deviates from its
 mean by less than WANDER over the stored windows.
 
 Invariant:
-    - The time stamps prove each error bound, however long the delays are, and however different
-      they are in the two directions. No symmetry of the network is assumed.
+    - Each error bound follows from the time stamps alone, however long the delays are and
+      however much they differ between the two directions. The network is not assumed to be
+      symmetric.
     - Delays are computed with a smoothed offset (`SlewedOffset`) that never steps, because a
-      step would appear as a jump of all delays. The smoothed offset reaches each new estimate
+      step would appear as a jump in all delays. The smoothed offset reaches each new estimate
       within SLEW_NS, and then follows the estimated drift.
-    - The error bound of the smoothed offset is also valid while the offset still approaches a
+    - The error bound of the smoothed offset also holds while the offset is still approaching a
       new estimate.
 """
 
@@ -63,14 +65,14 @@ _WEIGHTING_ROUNDS = 3
 
 
 class OffsetLimit(NamedTuple):
-    """Limit of the offset between two clocks that follows from the time stamps of one message.
+    """Limit on the offset between two clocks, derived from the time stamps of one message.
 
     A message cannot arrive before it was sent. A message in one direction therefore gives an
-    upper limit (ceiling), one in the other direction a lower limit (floor).
+    upper limit (ceiling), and one in the other direction a lower limit (floor).
 
     Attributes:
-        local_ns: Time on the local clock for which the limit holds, in ns.
-        offset_ns: The limit of the offset, the other clock minus the local clock, in ns.
+        local_ns: Time on the local clock at which the limit holds, in ns.
+        offset_ns: The limit on the offset (other clock minus local clock), in ns.
     """
 
     local_ns: int
@@ -84,8 +86,8 @@ class OffsetEstimate(NamedTuple):
         local_ns: Time on the local clock for which the estimate holds, in ns.
         offset_ns: The other clock minus the local clock at that time, in ns.
         drift: Growth of the offset, in ns/s.
-        low_ns, high_ns: Limits of the offset at that time, in ns.
-        drift_low, drift_high: Limits of the drift, in ns/s.
+        low_ns, high_ns: Limits on the offset at that time, in ns.
+        drift_low, drift_high: Limits on the drift, in ns/s.
     """
 
     local_ns: int
@@ -97,26 +99,24 @@ class OffsetEstimate(NamedTuple):
     drift_high: float
 
     def extrapolate_ns(self, local_ns: int) -> int:
-        """Returns the estimated offset between two clocks at another time, in ns.
-
-        One clock may run slightly faster (drift), so the offset is assumed to grow at the
-        estimated rate.
+        """Extrapolates the estimated offset to another time, in ns, assuming a constant drift.
 
         Args:
-            local_ns: The time on the local clock, in ns.
+            local_ns: Time on the local clock, in ns.
         """
         return self.offset_ns + round((local_ns - self.local_ns) * self.drift / NS_PER_S)
 
     def widen(self, *limits: OffsetLimit | None) -> "OffsetEstimate":
-        """Extends the range of possible offsets, so that it includes further limits.
+        """Extends the range of possible offsets to include additional limits.
 
         Args:
-            *limits: Upper and lower limits of the true offset, from the time stamps of
+            *limits: Upper and lower limits on the true offset, from the time stamps of
                 messages. Limits that are None are ignored.
 
         Returns:
-            A new estimate with the same offset and drift. The range from `low_ns` to `high_ns`
-            includes the values of all given limits.
+            A new estimate with the same offset and drift, whose range from `low_ns` to
+            `high_ns`
+            includes all given limits.
         """
         offsets = [limit.offset_ns for limit in limits if limit is not None]
         low_ns = min([self.low_ns, *offsets])
@@ -124,15 +124,14 @@ class OffsetEstimate(NamedTuple):
         return self._replace(low_ns=low_ns, high_ns=high_ns)
 
     def error_bound_ns(self, local_ns: int, offset_ns: int) -> int:
-        """Returns how far an assumed offset can be from the true offset at a time, in ns.
+        """Returns how far an assumed offset can be from the true offset at a given time, in ns.
 
-        The true offset lies between the limits of this estimate. The limits become wider with
-        the distance from the time of the estimate.
+        The true offset lies between the limits of this estimate, which widen with the distance
+        from the time of the estimate.
 
         Args:
-            local_ns: The time on the local clock, in ns.
-            offset_ns: Assumed offset at that time, the other clock minus the local clock, in
-                ns.
+            local_ns: Time on the local clock, in ns.
+            offset_ns: Assumed offset at that time (other clock minus local clock), in ns.
         """
         passed_s = (local_ns - self.local_ns) / NS_PER_S
         # Before the time of the estimate, a smaller drift gives a larger offset.
@@ -145,12 +144,12 @@ class OffsetEstimate(NamedTuple):
 
     @classmethod
     def exact(cls, offset_ns: int) -> "OffsetEstimate":
-        """Returns the estimate of a constant offset that is known exactly.
+        """Returns the estimate for a constant offset that is known exactly.
 
-        Such an offset exists between two readings of the same clock.
+        Used when two readings come from the same clock.
 
         Args:
-            offset_ns: The offset, the other clock minus the local clock, in ns.
+            offset_ns: The offset (other clock minus local clock), in ns.
         """
         return cls(
             local_ns=0,
@@ -164,28 +163,25 @@ class OffsetEstimate(NamedTuple):
 
 
 def format_offset(offset_ns: int, bound_ns: int) -> str:
-    """Writes an offset between two clocks and its error bound as text for the user.
+    """Formats a clock offset and its error bound as a short string with units.
 
     Args:
         offset_ns: The offset, in ns.
         bound_ns: Largest possible error of the offset, in ns.
-
-    Returns:
-        A short text with units, for example for an event or a table.
     """
     return f"offset {offset_ns / 1e9:.6f} s +- {-(-bound_ns // 1000)} us"
 
 
 class OffsetEstimator:
-    """Estimates the offset of another clock from the limits of the latest windows.
+    """Estimates the offset of another clock from the limits of the most recent windows.
 
-    Time stamps of messages are evaluated in windows of time. Each window contributes its lowest
-    upper limit (ceiling) and its highest lower limit (floor).
+    Each time window contributes the lowest upper limit (ceiling) and the highest lower limit
+    (floor) of its messages.
 
     Attributes:
-        broken: Number of times that the limits contradicted each other. The older half of the
-            limits was discarded each time. Such a contradiction shows that a clock has stepped,
-            or has drifted by more than DRIFT_LIMIT.
+        broken: Number of times that the limits contradicted each other and the older half of
+            them was discarded. A contradiction shows that a clock has stepped, or has drifted
+            by more than DRIFT_LIMIT.
     """
 
     def __init__(self) -> None:
@@ -194,16 +190,15 @@ class OffsetEstimator:
         self._floors: deque[OffsetLimit] = deque(maxlen=WINDOWS_KEPT)
 
     def add(self, ceiling: OffsetLimit | None, floor: OffsetLimit | None) -> None:
-        """Adds the tightest limits of the offset from one window of time.
+        """Adds the tightest limits on the offset from one time window.
 
-        Each message in the window limits the offset between the clocks. A message from this
-        machine gives an upper limit (ceiling), and a message to this machine a lower limit
-        (floor).
+        A message sent by this machine gives an upper limit (ceiling), and a message received by
+        this machine gives a lower limit (floor).
 
         Args:
             ceiling: Lowest upper limit in the window. None if the other machine acknowledged no
-                message of this machine.
-            floor: Highest lower limit in the window. None if no message of the other machine
+                message from this machine.
+            floor: Highest lower limit in the window. None if no message from the other machine
                 arrived.
         """
         if ceiling is not None:
@@ -212,20 +207,20 @@ class OffsetEstimator:
             self._floors.append(floor)
 
     def estimate(self, now_ns: int) -> OffsetEstimate | None:
-        """Estimates the offset of the other clock at the present time.
+        """Estimates the present offset of the other clock.
 
         The offset is modelled as a straight line over time, below every stored ceiling and
         above every stored floor. If no such line exists, a clock has stepped, and the older
-        limits belong to the time before the step. The older half of the limits is then
-        discarded, until such a line exists.
+        limits date from before the step. The older half of the limits is then discarded,
+        repeatedly if necessary, until a line exists.
 
         Args:
             now_ns: Present time on the local clock, in ns. It must not be earlier than any of
                 the stored limits.
 
         Returns:
-            The estimate. None if there is no ceiling or no floor, because the offset is then
-            limited on one side at most.
+            The estimate, or None if there is no ceiling or no floor, since the offset is then
+            bounded on one side at most.
         """
         while self._ceilings and self._floors:
             lines = _AdmissibleLines(self._ceilings, self._floors, now_ns)
@@ -307,22 +302,22 @@ class _AdmissibleLines:
         return times_s, np.array(offsets_ns, dtype=np.float64)
 
     def estimate(self) -> OffsetEstimate:
-        """Estimates the offset from all straight lines that the time stamps permit.
+        """Estimates the offset from all straight lines consistent with the time stamps.
 
         A line describes the offset between the clocks over time. Let t be the time in s
         relative to the present, so that t <= 0 for all limits. The line
 
             offset(t) = v + slope t
 
-        has the value v at present. It is permitted if it is below every ceiling c at its time
+        has the present value v. It is admissible if it lies below every ceiling c at its time
         t_c, and above every floor f at its time t_f:
 
             f - slope t_f <= v <= c - slope t_c.
 
-        Ceilings and floors are relaxed, moved apart by `WANDER` per second of their age,
-        because the drift is not exactly constant. The most probable slope is computed first.
-        The estimated offset is in the middle of the permitted values v for that slope. The
-        limits of the estimate include all permitted lines.
+        Because the drift is not exactly constant, ceilings and floors are first moved apart by
+        `WANDER` per second of their age. The most probable slope is computed next. The
+        estimated offset is the middle of the admissible values v for that slope. The limits of
+        the estimate cover all admissible lines.
 
         Returns:
             The estimate for the present time.
@@ -429,28 +424,28 @@ class _SlewSegment:
         self.bound_ns = max(start_bound_ns, joined_bound_ns)
 
     def evaluate_ns(self, local_ns: int) -> int:
-        """Returns the offset in use at a time: the other clock minus the local clock, in ns.
+        """Returns the smoothed offset (other clock minus local clock) at a given time, in ns.
 
         It approaches its estimate gradually, because a jump would disturb the control loop.
 
         Args:
-            local_ns: The time on the local clock, in ns.
+            local_ns: Time on the local clock, in ns.
         """
         passed_ns = local_ns - self._joined_ns
         rate = self._approach_rate if passed_ns < 0 else self._drift_per_ns
         return self._joined_offset_ns + int(passed_ns * rate)
 
     def error_bound_ns(self, local_ns: int) -> int:
-        """Returns the largest possible error of the smoothed offset at a time, in ns.
+        """Returns the largest possible error of the smoothed offset at a given time, in ns.
 
-        The error is the difference between the smoothed offset (the other clock minus the local
-        clock) and the true offset. While the smoothed offset still approaches the estimate,
-        until `SLEW_NS` after the start of the segment, the result is `bound_ns`, the largest
-        error in that phase. Afterwards, it is the largest distance of the smoothed offset from
-        the offsets that the estimate permits at that time.
+        The error is the difference between the smoothed offset and the true offset (other clock
+        minus local clock). Until `SLEW_NS` after the start of the segment, while the smoothed
+        offset is still approaching the estimate, the result is `bound_ns`, the largest error in
+        that phase. Afterwards, it is the largest distance of the smoothed offset from any
+        offset that the estimate admits at that time.
 
         Args:
-            local_ns: The time on the local clock, in ns.
+            local_ns: Time on the local clock, in ns.
         """
         is_approaching = self.start_ns <= local_ns <= self._joined_ns
         if is_approaching:
@@ -462,11 +457,10 @@ class _SlewSegment:
 class SlewedOffset:
     """Offset between two clocks (other clock minus local clock) that changes without steps.
 
-    Delays are computed with this offset and not with the latest estimate, because a new
-    estimate would appear as a step of all delays. The smoothed offset instead approaches each
-    estimate along a straight line. Two segments are stored: one for the latest estimate and one
-    for the estimate before it. The offset is therefore defined only from the start of the
-    earlier segment on.
+    Delays are computed with this offset and not with the latest estimate, because each new
+    estimate would appear as a step in all delays. The smoothed offset instead approaches each
+    estimate along a straight line. Two segments are stored, for the latest estimate and the one
+    before it, so the offset is defined only from the start of the earlier segment onwards.
 
     Args:
         estimate: First estimate. The smoothed offset equals it from the beginning.
@@ -481,7 +475,7 @@ class SlewedOffset:
     def estimate(self) -> OffsetEstimate:
         """Latest estimate of the offset between two clocks.
 
-        The offset in use approaches the estimate gradually, because a jump would disturb the
+        The smoothed offset approaches this estimate gradually, because a jump would disturb the
         control loop.
         """
         return self._segment.estimate
@@ -491,17 +485,17 @@ class SlewedOffset:
         """Largest error of the smoothed offset while it approaches the latest estimate, in ns.
 
         Afterwards, the possible error grows with the age of the estimate. `error_bound_ns`
-        returns the error bound at any time.
+        gives the error bound for any time.
         """
         return self._segment.bound_ns
 
     def slew_to(self, local_ns: int, estimate: OffsetEstimate) -> None:
         """Makes the offset approach a new estimate gradually, instead of jumping to it.
 
-        The offset reaches the estimate after the time SLEW_NS, and then follows its drift.
+        The offset reaches the estimate after SLEW_NS, and then follows its drift.
 
         Args:
-            local_ns: Time on the local clock at which the approach begins, in ns.
+            local_ns: Time on the local clock at which the transition begins, in ns.
             estimate: The new estimate.
         """
         segment = _SlewSegment(local_ns, self.evaluate_ns(local_ns), estimate)
@@ -509,24 +503,21 @@ class SlewedOffset:
         self._segment = segment
 
     def evaluate_ns(self, local_ns: int) -> int:
-        """Returns the clock offset in use at a time, which changes only gradually, in ns.
+        """Returns the smoothed clock offset at a given time (other minus local clock), in ns.
 
         Args:
-            local_ns: The time on the local clock, in ns. It must not be earlier than the start
-                of the stored segments, at which the offset began to approach the second latest
+            local_ns: Time on the local clock, in ns. It must not be earlier than the start of
+                the earlier stored segment, when the offset began to approach the second latest
                 estimate.
-
-        Returns:
-            The other clock minus the local clock, in ns.
         """
         return self._select_segment(local_ns).evaluate_ns(local_ns)
 
     def error_bound_ns(self, local_ns: int) -> int:
-        """Returns how far the clock offset in use can be from the true offset at a time, in ns.
+        """Returns the largest possible error of the smoothed offset at a given time, in ns.
 
         Args:
-            local_ns: The time on the local clock, in ns. It must be a time that `evaluate_ns`
-                accepts.
+            local_ns: Time on the local clock, in ns, subject to the same limit as in
+                `evaluate_ns`.
         """
         return self._select_segment(local_ns).error_bound_ns(local_ns)
 
