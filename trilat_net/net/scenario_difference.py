@@ -1,11 +1,12 @@
 """Names the settings in which the scenarios of two members of a session differ.
 
-A session starts only if all of its members (processes) have the same scenario. Their identities
-contain its text, so an error message can say which setting was forgotten on one machine.
+A session starts only if all of its members have the same scenario. Each member's identity
+contains the text of its scenario, so an error message can say which setting was forgotten on
+one machine.
 
 Invariant:
     - The text of another member may come from any program on the network. Whatever it contains,
-      the result is one short line without control characters.
+      the result is one short line with no control characters.
 """
 
 import hashlib
@@ -32,7 +33,7 @@ def describe_scenario_difference(
 ) -> str:
     """Returns a phrase that names the settings in which two scenarios differ.
 
-    An example is "link.delay_ms is 150.0 at s and 100.0 at m1".
+    For example: "link.delay_ms is 150.0 at s and 100.0 at m1".
 
     Args:
         first_text: Text of the first member's scenario, in TOML.
@@ -41,7 +42,7 @@ def describe_scenario_difference(
         second_member: Name of the second member.
 
     Returns:
-        The phrase. Empty if a text cannot be read, or if no setting differs.
+        The phrase, or an empty string if a text cannot be read or no setting differs.
     """
     first = _read_settings(first_text)
     second = _read_settings(second_text)

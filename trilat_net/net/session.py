@@ -1,31 +1,30 @@
 """Starts a session: its processes find each other and agree on a common start time.
 
-The processes are called members: sites, which each run one arm and its control loop, and
-recorders. The first site of the scenario is the leader. A normal start has three steps, each of
-which is an event that a member publishes:
+The members of the session are sites, each of which runs one arm and its control loop, and
+recorders. The first site of the scenario is the leader. A normal start has three steps, each
+announced by an event that a member publishes:
 
-1. `epoch`: Once all members are known, the leader proposes an epoch, the time of the first
-   period (tick 0) of all control loops, about half a second ahead. The event also lists the
-   members.
+1. `epoch`: Once all members are known, the leader proposes an epoch about half a second ahead.
+   The epoch is the time of tick 0 of all control loops. The event also lists the members.
 2. `ready`: Each member agrees.
 3. `start`: If all members have agreed in time, the leader confirms the epoch. Otherwise it
    proposes another one.
 
-A member may also join a session that is already running. A recorder only reads the epoch from
-the running sites. A site first asks for permission: it publishes the event `coming`, which
+A member may also join a session that is already running. A recorder simply reads the epoch from
+the running sites. A site first asks for permission by publishing the event `coming`, which
 states its first tick. It joins if every running site replies with the event `admit` before that
 tick. If an earlier process of the same site exists, the running sites wait until it has
 disappeared.
 
-The epoch is a time on the leader's monotonic clock. A member on another machine converts it to
-its own clock. It measures the offset between the clocks by pings, with an error of at most half
-a round trip, and is ready only when it knows all clocks that it needs.
+The epoch is a time on the leader's monotonic clock, which members on other machines convert to
+their own clocks. They measure the offset between the clocks with pings, to within half a round
+trip, and are ready only when they know all the clocks they need.
 
 Invariant:
-    - The members agree on one epoch, in whatever order they were started.
-    - No member starts without the event `start`. A member that joins late does not start
-      without a running site.
-    - The time of day decides nothing, because the time of day of two machines may differ.
+    - The members agree on a single epoch, whatever the order in which they were started.
+    - No member starts without the event `start`, and no member joins late without a running
+      site.
+    - No decision depends on the time of day, which may differ between machines.
     - No method waits. The caller polls `SessionJoin` until the epoch is known.
 """
 
@@ -56,14 +55,13 @@ LATE_GATHER_NS = 1_500_000_000
 
 
 class SessionJoin:
-    """Makes one process join a session, and finds the epoch, the common time of tick 0.
+    """Joins a session on behalf of one process, and determines the epoch (the time of tick 0).
 
-    The process first declares its subscriptions, because the other members may send messages to
-    it as soon as they know it. It then creates this object, which announces the process, and
-    calls `poll` regularly until the epoch is returned.
+    The process must declare its subscriptions before it creates this object, because the object
+    announces the process and other members may send messages immediately. The process then
+    calls `poll` regularly until it returns the epoch.
 
-    The first site (arm controller) of the scenario is the leader, which decides when the
-    session starts.
+    The first site of the scenario is the leader, which decides when the session starts.
 
     Args:
         bus: Network connection of this member.
@@ -71,11 +69,10 @@ class SessionJoin:
         session: Name of the session.
         publisher: Publishes the events of this member.
         sites: Names of the scenario's sites. The first one is the leader. Empty for a recorder.
-        late: Rules about sites that join while the session runs.
+        late: Rules for sites that join while the session is running.
 
     Attributes:
-        refusal: Reason why a running site has refused this site. Empty if no site has refused
-            it.
+        refusal: Reason why a running site has rejected this site. Empty if no site has done so.
         membership: The other members of the session.
         pinger: Measures the offsets of the other members' clocks.
     """
@@ -127,10 +124,10 @@ class SessionJoin:
 
     @property
     def reason(self) -> str:
-        """Why this site could not join a running session, as text for an error message.
+        """Explains why this site could not join a running session, for an error message.
 
-        The reason is the text with which a running site (arm controller) has refused it, or the
-        names of the running sites that have not admitted it. Empty if the reason is not known.
+        This is either the message with which a running site has rejected it, or the names of
+        the running sites that have not admitted it. Empty if the reason is not known.
         """
         running = {info.member for info in self.membership.list_running()}
         silent_sites = sorted(running - self._admitted_by)
@@ -144,10 +141,10 @@ class SessionJoin:
 
     @property
     def announced_first_tick(self) -> int:
-        """First control period (tick) of this site, as it requested to join a running session.
+        """First tick that this site announced when it asked to join a running session.
 
-        The site executes its control loop from this tick on. It is 0 if the site has not
-        requested to join.
+        The site executes its control loop from this tick onwards. 0 if the site has not asked
+        to join.
         """
         if self._coming is None:
             return 0
@@ -160,19 +157,19 @@ class SessionJoin:
         return self._publisher.info
 
     def poll(self) -> Epoch | None:
-        """Receives messages, replies to them, and takes the next step towards the start.
+        """Receives and answers messages, and takes the next step towards the start.
 
-        If the session runs already and this member may join late, it joins the session. A
-        recorder always may, because it only receives. Otherwise the leader, the first site of
-        the scenario, proposes and confirms the epoch, the common start time. The other members
-        agree to the proposal, and wait for the confirmation.
+        If the session is already running and this member may join late, it joins. (A recorder
+        always may, since it only receives.) Otherwise the leader, which is the first site of
+        the scenario, proposes and confirms the epoch, and the other members agree to the
+        proposal and wait for the confirmation.
 
-        A member that has agreed to a proposal may find other members running because they have
-        received the confirmation earlier. It waits for the confirmation as well, until the
-        proposed epoch has passed. Only then does it join late.
+        A member that has agreed to a proposal may see others already running because they
+        received the confirmation earlier. It still waits for the confirmation until the
+        proposed epoch has passed, and joins late only after that.
 
         Returns:
-            The epoch once it is fixed. None until then.
+            The epoch once it is fixed, and None until then.
 
         Raises:
             SessionError: This member cannot be part of the session.
@@ -285,7 +282,7 @@ class SessionJoin:
         indices = {name: index for index, name in enumerate(self._sites)}
 
         def rank(info: Info) -> tuple[bool, int]:
-            """Returns a sort key: sites on this machine first, then the order of the scenario.
+            """Returns a sort key: sites on this machine first, then in scenario order.
 
             A site on this machine has the same clock, so its start time needs no conversion.
             """
