@@ -1,13 +1,13 @@
-"""Checks a log by executing its run again, and reports one finding for each check.
+"""Checks a log by re-executing its run, and reports one finding per check.
 
-A log contains the inputs and the results of every control period. Therefore the results can be
-computed again. The checks answer these questions:
+A log contains the inputs and the results of every tick, so the results can be computed again.
+The checks answer these questions:
 
-- Are records missing, and is the file as it was written?
-- Does the scenario, the description of the experiment, have the hash that the log states?
-- Which control laws of users does the scenario name?
-- Does a repeated execution give the same records?
-- Does a simulation of the whole session, without clocks and network, give the same records?
+- Are records missing, and is the file unchanged since it was written?
+- Does the scenario match the hash stated in the log?
+- Which control laws written by users does the scenario name?
+- Does re-execution give the same records?
+- Does a simulation of the whole session, without clocks or a network, give the same records?
 - Was an arm moved by something outside this program, such as a real robot?
 
 Invariant:
@@ -41,14 +41,13 @@ _MAX_GAPS_NAMED = 60
 class LogCheckReport(CheckReport):
     """Findings of all checks of a log, which decide whether the log can be trusted.
 
-    The report passes under three conditions. The log must be unchanged since it was written,
-    enough of its records (results of control periods) must have been compared, and every
-    repeated execution must agree with the log.
+    The report passes if the log is unchanged since it was written, enough of its records have
+    been compared, and every re-execution agrees with the log.
 
     Attributes:
         log: The checked log.
-        result: Result of executing the sites (arm controllers) of the log again.
-        findings: One finding for each check, in the order in which they are shown.
+        result: Result of re-executing the sites of the log.
+        findings: One finding per check, in display order.
     """
 
     log: Log
@@ -57,25 +56,16 @@ class LogCheckReport(CheckReport):
 
     @property
     def records(self) -> int:
-        """Number of records that were checked by executing their control periods again.
-
-        A record is the stored result of one control period.
-        """
+        """Number of records that were checked by re-executing their ticks."""
         return self.result.records
 
     @property
     def identical(self) -> int:
-        """Number of records whose control periods were executed again with the same bits.
-
-        Every field that a control period computes must agree.
-        """
+        """Number of records whose re-execution was bit-identical in every computed field."""
         return self.result.identical
 
     def to_dict(self) -> dict[str, Any]:
-        """Returns the whole report on a log as plain values, ready for JSON.
-
-        The keys are those that `trilat verify --json` prints.
-        """
+        """Converts the report to plain JSON values, with the keys of `trilat verify --json`."""
         result = self.result
         first_difference = None
         if result.first is not None:
@@ -113,17 +103,16 @@ class LogCheckReport(CheckReport):
         min_coverage: float = MIN_COVERAGE,
         resume_every: int = 0,
     ) -> "LogCheckReport":
-        """Executes the control periods of a log again, and checks the log against the results.
+        """Re-executes the ticks of a log, and checks the log against the results.
 
         Args:
-            log: Log of a run or of a rerun that is to be checked.
+            log: Log of a run or rerun.
             virtual: If True, the log is also compared with a simulation of its scenario in
-                virtual time, as `compare_with_virtual` does.
-            progress: Function that is called now and then with the amount of work done and the
-                total. None if progress is not reported.
-            min_coverage: Smallest fraction of the ticks (control periods) of every site (arm
-                controller) that must be compared. A log with a smaller fraction fails even if
-                all compared records agree.
+                virtual time, see `compare_with_virtual`.
+            progress: Function that is called from time to time with the amount of work done and
+                the total. If None, progress is not reported.
+            min_coverage: Smallest fraction of every site's ticks that must be compared. A log
+                with a smaller fraction fails even if all compared records agree.
             resume_every: Interval, in ticks, at which a site is restored from the records, see
                 `verify_log`. 0 means never.
 
@@ -144,21 +133,20 @@ class LogCheckReport(CheckReport):
     def check_files(
         cls, sources: Sequence[str], min_coverage: float, allowed: CodeConsents
     ) -> list[Finding]:
-        """Checks one log, as a function that a worker process of a pool can run.
+        """Checks one log in a form that can run in a worker process of a pool.
 
-        Many logs can thus be checked in parallel: the arguments and the result can be sent to
-        another process. A user's control law that cannot be created gives a failed finding
-        instead of an error.
+        The arguments and the result can be sent to another process, so many logs can be checked
+        in parallel. A user's control law that cannot be created yields a failed finding instead
+        of an error.
 
         Args:
-            sources: Paths of the files that the log consists of.
-            min_coverage: Smallest fraction of the ticks (control periods) of every site that
-                must be compared.
+            sources: Paths of the files that make up the log.
+            min_coverage: Smallest fraction of every site's ticks that must be compared.
             allowed: Permissions to run users' code, in addition to the permissions of this
                 process.
 
         Returns:
-            One finding for each check.
+            One finding per check.
         """
         allowed_code.update(allowed)
         log = open_log(*sources)

@@ -1,8 +1,8 @@
 """Converts the records of a log to arrays, so that compiled code can verify them quickly.
 
-A record is the stored result of one control period (tick) of an arm. To verify a log, each tick
-is computed again. The compiled loop `TickRepeater` does so for many consecutive ticks in one
-call, if all inputs of these ticks are in the log. `verify` executes the other ticks one by one.
+A log is verified by computing each tick again. The compiled loop `TickRepeater` does so for
+many consecutive ticks in one call, provided all inputs of these ticks are in the log. `verify`
+executes the other ticks one by one.
 
 Invariant:
     - Only records in the exact layout that this program writes are converted.
@@ -29,16 +29,14 @@ _MASK_64 = (1 << 64) - 1
 
 
 class SampleTable(NamedTuple):
-    """States that all sites of a log sent (samples), for a fast look-up by site and tick.
-
-    A site is the controller of one arm, and a tick one of its control periods.
+    """Samples sent by all sites of a log, for fast look-up by site and tick.
 
     Attributes:
-        bits: Position, velocity and external torque of each sample in the coordinates that
-            the sites (arm controllers) share, as the bits of the numbers, shape (N, 3 m).
-        rows: Row in `bits` of the sample of each site and tick (control period), shape (sites,
-            ticks). -1 if the log has no record of the tick.
-        sites: Index of each site in `rows`.
+        bits: Position, velocity and external torque of each sample in the coordinates that the
+            sites share, stored as the bit patterns of the floats, shape (N, 3 m).
+        rows: Row in `bits` of the sample of each site and tick, shape (sites, ticks). -1 if the
+            log has no record of the tick.
+        sites: Mapping from site to its index in `rows`.
     """
 
     bits: IntArray
@@ -47,17 +45,15 @@ class SampleTable(NamedTuple):
 
     @classmethod
     def of_log(cls, log: Log) -> "SampleTable | None":
-        """Collects the states (samples) that all sites of a log sent, for the compiled loop.
+        """Collects the samples that all sites of a log sent, for use by the compiled loop.
 
-        The loop executes a site (arm controller) again, and looks up the content of each sample
-        that arrived.
+        When the loop re-executes a site, it looks up the content of each sample that arrived.
 
         Args:
             log: The log.
 
         Returns:
-            The samples. None if a record (result of a control period) of the log does not have
-            the exact layout.
+            The samples, or None if a record of the log does not have the exact layout.
         """
         bits = []
         last_tick = max(site_log.last_tick for site_log in log.values())
@@ -118,17 +114,16 @@ def _find_samples(
 
 
 class PlainRows:
-    """Reads records of one site in blocks whose ticks compiled code can execute again.
+    """Reads the records of one site in blocks that compiled code can re-execute.
 
-    Only ordinary (plain) records are read: those for which all inputs of the tick (control
-    period) are in the log.
+    Only plain records are read, meaning that all inputs of the tick are in the log.
 
     Args:
-        site_log: Records of the site (arm controller).
+        site_log: Records of the site.
         indexed: The same records with the positions of their values.
         samples: Samples of all sites.
         resume_every: Interval, in ticks, at which the site is restored from its records. The
-            record there does not count as plain. 0 means never.
+            record at such a tick does not count as plain. 0 means never.
     """
 
     def __init__(
@@ -150,19 +145,18 @@ class PlainRows:
         self._arrivals = np.zeros((0, 3), np.int64)
 
     def read_boot(self, row: int) -> int:
-        """Returns the random number in a record that tells two starts of a process apart."""
+        """Returns the boot in a record (the random number that identifies a process start)."""
         return int(self._boots[row]) & _MASK_64
 
     def count_plain(self, row: int, before_tick: int | None) -> int:
-        """Counts the records that compiled code can execute next in one block.
+        """Counts the records that compiled code can execute next in a single block.
 
-        The caller makes sure that the first record is from the present start of the site's
-        process, and is the record of the next tick (control period). A block has at most
-        `BLOCK_ROWS` records (results of control periods).
+        The caller ensures that the first record comes from the current start of the site's
+        process and belongs to the next tick. A block has at most `BLOCK_ROWS` records.
 
         Args:
             row: Index of the first record.
-            before_tick: Tick before which the records end. None if there is no such limit.
+            before_tick: Tick before which the records end. If None, there is no such limit.
         """
         # `_stops` has the indices of the records that are not plain. The block ends before the
         # next of these records.
@@ -235,10 +229,10 @@ class PlainRows:
         return _sum_before(counts), bits
 
     def read_rows(self, first: int, count: int) -> RecordedRows:
-        """Reads consecutive records as arrays, to execute their ticks in compiled code.
+        """Reads consecutive records as arrays, so that compiled code can execute their ticks.
 
         Args:
-            first: Index of the first record (result of a control period).
+            first: Index of the first record.
             count: Number of records, all of which must be plain (see `PlainRows`).
         """
         last = first + count
@@ -260,16 +254,16 @@ class PlainRows:
         )
 
     def repeat(self, repeater: TickRepeater, first: int, count: int, *, external: bool) -> int:
-        """Executes the control periods of records again in compiled code, to verify them.
+        """Re-executes the ticks of records in compiled code, to verify them.
 
         Args:
-            repeater: Executes the ticks (control periods) of the site (arm controller).
+            repeater: Executes the ticks of the site.
             first: Index of the first record.
             count: Number of records, all of which must be plain (see `PlainRows`).
             external: True if the motion of the arm was measured, as with a real robot.
 
         Returns:
-            The number of records before the first record that differs from its execution.
+            The number of records before the first one that differs from its re-execution.
         """
         rows = self.read_rows(first, count)
         if external:

@@ -1,21 +1,18 @@
-"""Executes arms of a log again with changed settings, and rejects changes without effect.
+"""Re-executes arms of a log with changed settings, and rejects changes that have no effect.
 
-A log has one record per control period (tick) for each arm. `what_if` uses this module to
-compute some or all arms again, for example with another gain at the slave. A setting that
-concerns only arms that are not executed is rejected, because it would have no effect. A setting
-that concerns both kinds of arms changes only the executed ones, and the result reports this.
-
-Below, a site is the control process of an arm, and a sample is the state that a site sends to
-the others in each tick.
+A log has one record per tick for each arm. `what_if` uses this module to compute some or all
+arms again, for example with a different gain at the slave. A setting that affects only arms
+that are not executed is rejected, because it would have no effect. A setting that affects both
+kinds of arms changes only the executed ones, and the result reports this.
 
 Invariant:
-    - A site advances only by `Site.step`.
+    - A site advances only through `Site.step`.
     - A site receives the recorded samples of sites that are not executed, and the new samples
       of executed sites. Each sample arrives in the tick in which it arrived according to the
       log.
-    - Without changed settings, no tick is executed whose inputs are unknown because records are
-      missing. After a gap, the execution resumes as soon as two consecutive records exist. The
-      recorded result is used for a tick that has a record, but cannot be executed.
+    - Without changed settings, a tick is not executed if its inputs are unknown because records
+      are missing. After a gap, execution resumes as soon as two consecutive records exist. If a
+      tick has a record but cannot be executed, the recorded result is used.
     - With changed settings, ticks without a record are executed too. The arrivals of samples in
       these ticks are estimated.
 """
@@ -78,17 +75,17 @@ class _ChangedValue(NamedTuple):
 class RerunRequest:
     """A checked request for a rerun: which sites of a log to execute again, and how.
 
-    `RerunRequest.resolve` creates it. The sites (arm controllers) that are not executed keep
-    the records (results of control periods) of the log.
+    Created by `RerunRequest.resolve`. Sites that are not executed keep the records of the log.
 
     Attributes:
         original: Scenario of the log.
         scenario: Scenario of the rerun. It contains the changes for the executed sites; the
-            recorded sites are as in the log.
-        replaced: Names of the executed sites, in the order of the scenario.
-        recorded: Names of the other sites, in the order of the scenario.
+            recorded sites are the same as in the log.
+        replaced: Names of the executed sites, in scenario order.
+        recorded: Names of the other sites, in scenario order.
         changes: Changed values.
-        without_effect: Requested changes that concern recorded sites, and have no effect.
+        without_effect: Requested changes that affect only recorded sites, and therefore have no
+            effect.
     """
 
     original: Scenario
@@ -100,21 +97,18 @@ class RerunRequest:
 
     @property
     def mode(self) -> str:
-        """Kind of the repeated run: "closed loop" if every site is executed, else "open loop".
+        """Kind of the rerun: "closed loop" if every site is executed, otherwise "open loop".
 
-        In an open loop, sites (arm controllers) that are not executed keep their records, so
-        that they do not react to changes.
+        In an open loop, the sites that are not executed keep their records, and therefore do
+        not react to changes.
         """
         return "open loop" if self.recorded else "closed loop"
 
     def describe_changes(self) -> list[str]:
-        """Describes which settings the rerun changes, in lines for the user.
+        """Describes the settings that the rerun changes, with one line per kind of change.
 
-        If several sites (arm controllers) or links are changed in the same way, they share a
-        line.
-
-        Returns:
-            One line for each kind of change. Empty if nothing is changed.
+        Sites or links that are changed in the same way share a line. Empty if nothing is
+        changed.
         """
         owners: dict[tuple[str, str], list[str]] = {}
         for subject, owner, change in _describe_changes(self):
@@ -139,17 +133,17 @@ class RerunRequest:
         """Checks a request for a rerun, and applies its changes to the scenario of the log.
 
         A rerun executes sites of a log again, usually with changed settings. In a closed loop,
-        all sites are executed. Otherwise the sites that are not executed keep their records.
+        all sites are executed. Otherwise, the sites that are not executed keep their records.
 
         Args:
             log: Log of a run, which contains its scenario.
-            replace: Names of the sites to execute. Empty in a closed loop.
-            overrides: Changed settings, in the form that `load_scenario` accepts.
+            replace: Names of the sites to execute. Empty for a closed loop.
+            overrides: Changed settings, in the form accepted by `load_scenario`.
             closed_loop: If True, all sites are executed.
 
         Raises:
             UsageError: The sites are not named, or are named in two ways.
-            ScenarioError: There is no such site, or a change is not valid or cannot have an
+            ScenarioError: There is no such site, or a change is invalid or cannot have an
                 effect.
         """
         original = log.scenario
@@ -402,19 +396,18 @@ def _shorten(value: object) -> str:
 
 
 class RerunTick(NamedTuple):
-    """One tick of a site that is executed again, with the record that it produced.
-
-    A tick is one period of the control loop, and its record is the stored result.
+    """One re-executed tick of a site, with the record that it produced.
 
     Attributes:
-        site: Name of the site (arm controller).
+        site: Name of the site.
         tick: Number of the tick.
         t_ns: Nominal time of the tick, in ns after the epoch (the common start time).
         mode: Operating mode in which the site executed the tick, for example running or at
             rest.
-        payload: Encoded record, as the site would publish it. If `kept`, the record of the log.
-        same: True if the log contains a record of the tick, and all computed fields have the
-            same bits.
+        payload: Encoded record, as the site would publish it. If `kept`, the record from the
+            log.
+        same: True if the log contains a record of the tick, and all computed fields are
+            bit-identical.
         kept: True if the record was copied, because the log does not contain enough to execute
             the tick.
         stats: Statistics of the site's links. None if they are not due in this tick.
@@ -506,31 +499,28 @@ class _RerunSite:
 
     @property
     def is_done(self) -> bool:
-        """True if the site has executed its last control period, so that nothing is left."""
+        """True if the site has executed its last tick."""
         return self.diverged or self.k > self._last_tick
 
     @property
     def t_ns(self) -> int:
-        """Nominal time of the control period that is executed next, in ns after the epoch.
-
-        The epoch is the common start time of the sites (arm controllers).
-        """
+        """Nominal time of the next tick to execute, in ns after the epoch (common start)."""
         return self.k * NS_PER_S // self._site.rate_hz
 
     def execute_tick(self) -> RerunTick:
-        """Executes the next tick of the site (arm controller).
+        """Executes the next tick of the site, or copies its record if execution is impossible.
 
-        A tick is a period of the control loop. It can be executed only if the state of the site
-        before it is known (certain). There are three cases:
+        A tick can be executed only if the state of the site before it is certain. There are
+        three cases:
 
         - The state follows from the previous tick: the tick is executed.
-        - The state is uncertain, for example after a gap of the log, but the two records before
-          the tick determine it: the state is restored, and the tick is executed.
-        - The state stays uncertain: the record of the tick is copied from the log.
+        - The state is uncertain, for example after a gap in the log, but is determined by the
+          two records before the tick: the state is restored, and the tick is executed.
+        - The state remains uncertain: the record of the tick is copied from the log.
 
-        Afterwards, `k` is the next tick. In a gap, which has no records to copy and to compare,
-        ticks are executed only if settings were changed, because then the result is new there
-        too. Otherwise the gap is skipped.
+        Afterwards, `k` is the next tick. A gap contains no records to copy or compare, so its
+        ticks are executed only if settings were changed, in which case their results are new.
+        Otherwise the gap is skipped.
 
         Returns:
             The tick with its record.
@@ -664,15 +654,15 @@ No sample is in transit for longer.
 class RerunExecution:
     """Executes all requested sites of a log again, together.
 
-    A site is the control process of an arm. The executed sites exchange the samples (states)
-    that they compute now. The samples of the other sites are those of the log.
+    The executed sites exchange newly computed samples. The samples of the other sites are taken
+    from the log.
 
     Args:
         log: The log.
         request: Executed sites and changed settings of the rerun.
 
     Attributes:
-        sites: The executed sites, by name.
+        sites: Mapping from name to executed site.
 
     Raises:
         LogError: The log does not contain enough to execute the sites.
@@ -746,14 +736,13 @@ class RerunExecution:
     def run(self, progress: Progress | None = None) -> Iterator[RerunTick]:
         """Executes all ticks of the requested sites, and yields the result of each tick.
 
-        A site is a simulated process that runs one arm, and a tick is a period of its control
-        loop. Ticks are executed in order of time, but a site waits until the data that it
-        receives exists. A site stops when its arm leaves its limits. If settings were changed,
+        Ticks are executed in order of time, except that a site waits until the samples that it
+        receives exist. A site stops when its arm leaves its limits. If settings were changed,
         all sites stop at this time.
 
         Args:
-            progress: Function that is called now and then with the number of executed ticks,
-                and an upper bound on their total. None if progress is not reported.
+            progress: Function that is called from time to time with the number of executed
+                ticks, and an upper bound on their total. If None, progress is not reported.
 
         Yields:
             The result of each tick.

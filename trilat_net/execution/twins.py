@@ -1,19 +1,19 @@
 """Shows whether a run is stable, by repeating it with small disturbances.
 
 A repetition is called a twin, and its disturbance a push: a small displacement of the state at
-one time. If the distance between the twin and the run grows, the run is unstable.
+one instant. If the distance between the twin and the run grows, the run is unstable.
 
-A distance that has become large is scaled down again (Benettin, Galgani, Giorgilli and
-Strelcyn, Meccanica 15, 1980). Let x be a number of the twin's state, which includes the samples
-in transit on the network, and x_run the same number in the run. Then x is replaced by x_run +
-factor (x - x_run), with the same factor for all numbers. The sum of the logarithms of all
-factors gives the total growth. If the distance has decayed to rounding errors, the twin is
-pushed again.
+When the distance becomes large, it is scaled down again (Benettin, Galgani, Giorgilli and
+Strelcyn, Meccanica 15, 1980). Let x be a component of the twin's state, which includes the
+samples in transit on the network, and x_run the same component in the run. Then x is replaced
+by x_run + factor (x - x_run), with the same factor for all components. The sum of the
+logarithms of all factors gives the total growth. If the distance has decayed to rounding
+errors, the twin is pushed again.
 
 Invariant:
-    - The run is executed again from its recorded inputs, and compared with its records.
-    - A twin receives the same arrivals, changes, actions of operators and random delays as the
-      run. Therefore the difference is the effect of the push alone.
+    - The run is re-executed from its recorded inputs, and compared with its records.
+    - A twin receives the same arrivals, changes, operator actions and random delays as the run,
+      so any difference is caused by the push alone.
     - The difference is computed from two complete nonlinear runs, not from a linear model.
 """
 
@@ -50,20 +50,16 @@ WINDOWS = 16
 class Push(NamedTuple):
     """Small displacement of the state of a twin, for example by 1e-6 rad at one joint.
 
-    A twin is a second execution of the same run. Its difference from the run then shows whether
-    small disturbances grow or die away.
-
     Attributes:
         name: Description for the user, for example "1e-06 rad at m1 joint 1".
         field: Displaced part of the state: joint angles "q" in rad, joint velocities "qd" in
             rad/s, or estimated arm parameters "theta_hat".
-        by: Displacement of every number of this part, shape (N, n), with one row per site (arm
-            controller).
+        by: Displacement of every element of this part, shape (N, n), with one row per site.
         at_s: Time of the push, in s after the epoch (the common start time).
         again: If True, a twin whose difference has decayed to rounding errors is pushed again.
             Otherwise the twin ends.
         largest: Difference beyond which the twin is moved closer to the run, in the unit of the
-            field. Infinite if this is never done.
+            field. Infinite to disable this.
         direction: Number of the random direction in which all joints are pushed, from 1. 0 if
             the joints were chosen in another way.
     """
@@ -82,17 +78,16 @@ class Push(NamedTuple):
     ) -> "Push":
         """Converts a user's description of a push to a `Push` object.
 
-        A push is a small displacement of the state of a twin, which is a second execution of
-        the run. Examples of descriptions are "m1.q1" (joint 1 of site m1), "s.qd2" (velocity of
-        joint 2), "m2.theta3" (estimate 3) and "m1.q". Without a number, all joints or estimates
-        of the site are pushed in a random direction. Without a site, the joints or estimates of
+        Examples of descriptions are "m1.q1" (joint 1 of site m1), "s.qd2" (velocity of joint
+        2), "m2.theta3" (estimate 3) and "m1.q". Without an index, all joints or estimates of
+        the site are pushed in a random direction. Without a site, the joints or estimates of
         all sites are pushed.
 
         The twin is pushed only once. A push that is itself larger than `LARGEST` is never
         scaled down.
 
         Args:
-            scenario: Description of the experiment.
+            scenario: The scenario.
             target: Description of what is pushed, for example "m1.q1".
             size: Size of the push, in rad, rad/s, or the unit of an estimate.
             at_s: Time of the push, in s after the epoch (the common start time).
@@ -140,22 +135,21 @@ class Push(NamedTuple):
     def choose(cls, scenario: Scenario, count: int | None = None) -> "list[Push]":
         """Chooses pushes that together can reveal every kind of instability.
 
-        A push is a small displacement of the state of a twin, which is a second execution of
-        the run. Different pushes displace different joints or estimates:
+        Different pushes displace different joints or estimates:
 
-        - one push of all estimated parameters if the control law of a site (arm controller)
-          estimates any;
+        - one push of all estimated parameters, if the control law of any site estimates
+          parameters;
         - up to three pushes of all joints in a random direction, with sizes around `PUSH_RAD`.
-          The sizes differ, because growth may depend on the amplitude;
-        - one push of each joint, because a joint that does not act on the others shows its
-          growth clearly only if it is pushed itself.
+          The sizes differ because growth may depend on the amplitude;
+        - one push per joint, because growth at a joint that does not act on the others is
+          clearly visible only if that joint itself is pushed.
 
         If there are not enough pushes for all joints, the joints are not pushed one by one, but
         all together in several random directions.
 
         Args:
-            scenario: Description of the experiment.
-            count: Number of pushes. If None, each joint is pushed, in addition to the other
+            scenario: The scenario.
+            count: Number of pushes. If None, each joint is pushed in addition to the other
                 pushes above, up to `MAX_PUSHES` in total.
         """
         # The target of "m1 joint 1" is "m1.q1".
@@ -184,18 +178,17 @@ class Push(NamedTuple):
 class TwinPath(NamedTuple):
     """Distance between a twin and the run over time, in intervals of 50 ms.
 
-    A twin is a second execution of the run in which the state received a small push. If the
-    difference becomes large, it is scaled down, and if it has decayed, the twin is pushed
-    again. The run has K intervals, and all sites (arm controllers) together have J joints.
+    A large difference is scaled down, and a twin whose difference has decayed is pushed again.
+    The run has K intervals, and all sites together have J joints.
 
     Attributes:
         push: Push of the twin.
         t_s: Ends of the intervals, in s, shape (K,).
-        largest: Natural logarithm of the largest difference of velocity of each joint in each
+        largest: Natural logarithm of the largest velocity difference of each joint in each
             interval, in rad/s, shape (K, J). It is computed as if the difference had never been
             scaled down. -inf if the twin and the run are equal.
-        last: Difference of velocity in the last tick (control period) of each interval, in
-            rad/s, shape (K, J). It is the actual difference, which may have been scaled down.
+        last: Velocity difference in the last tick of each interval, in rad/s, shape (K, J).
+            This is the actual difference, which may have been scaled down.
         scale: Natural logarithm of the factor by which `last` must be multiplied to undo the
             scaling, shape (K,).
         pushed: Indices of the intervals in which the twin was pushed.
@@ -213,19 +206,18 @@ class TwinPath(NamedTuple):
 
 
 class Twins(NamedTuple):
-    """A run and slightly displaced copies of it, which show whether the run is stable.
+    """A run and slightly displaced copies of it (twins), which show whether the run is stable.
 
     A twin is a second execution of the run in which the state received a small push. The twins
-    show whether small disturbances grow or die away. `of_log` and `of_scenario` create the
-    object.
+    show whether small disturbances grow or die away. Use `of_log` or `of_scenario` to create
+    the object.
 
     Attributes:
         paths: Difference between each twin and the run, over time.
-        joints: Names of the joints of all sites (arm controllers), for example "m1 joint 1".
+        joints: Names of the joints of all sites, for example "m1 joint 1".
         speed: Largest speed of each joint of the run in each interval of 50 ms, in rad/s, shape
-            (K, J). The differences can be compared with it.
-        same: True if the repeated run has the same bits as the records (results of control
-            periods) of the log.
+            (K, J), for comparison with the differences.
+        same: True if the repeated run is bit-identical to the records of the log.
     """
 
     paths: Sequence[TwinPath]
@@ -235,19 +227,16 @@ class Twins(NamedTuple):
 
     @classmethod
     def of_log(cls, log: Log, pushes: Sequence[Push], *, own_laws: bool = False) -> "Twins":
-        """Repeats the run of a log, together with a twin for every push.
-
-        A twin is a further execution of the run that receives a small push. The differences
-        between the twins and the run show whether small disturbances grow or die away.
+        """Repeats the run of a log, together with one twin per push.
 
         Args:
             log: Log of the run.
-            pushes: Small displacements of the state, one for each twin.
-            own_laws: True if control laws that are code of users may run.
+            pushes: Small displacements of the state, one per twin.
+            own_laws: True if control laws written by users may run.
 
         Raises:
             NotRepeatable: The run cannot be repeated, or the repeated run differs from the
-                records (results of control periods).
+                records.
             LogError: A record cannot be read.
         """
         reason = FusedRun.explain_not_repeatable(log, own_laws=own_laws)
@@ -267,16 +256,15 @@ class Twins(NamedTuple):
     ) -> "Twins":
         """Simulates an experiment, and repeats it with small pushes to see whether they grow.
 
-        A repetition with a push is called a twin. There is one twin for each push. The run and
-        its twins are simulated faster than real time.
+        The run and its twins (one per push) are simulated faster than real time.
 
         Args:
-            scenario: Description of the experiment.
-            pushes: Small displacements of the state of the arms, one for each twin.
+            scenario: The scenario.
+            pushes: Small displacements of the state of the arms, one per twin.
             duration_s: Duration of the run, in s.
 
         Returns:
-            The difference between each twin and the run, over time.
+            The run and its twins, with the difference of each twin over time.
 
         Raises:
             ScenarioError: The scenario cannot be simulated.
@@ -506,7 +494,7 @@ class _TwinRuns:
     def run(self) -> Twins:
         """Simulates a run and slightly displaced copies of it, and returns their differences.
 
-        Differences that grow show that the system is unstable.
+        Growing differences show that the system is unstable.
         """
         for twin_index, push in enumerate(self._pushes):
             if push.at_s == 0.0:

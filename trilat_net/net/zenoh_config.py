@@ -1,30 +1,28 @@
-"""Composes the Zenoh configuration of a member, and checks the Zenoh file of a user.
+"""Composes the Zenoh configuration of a member, and checks the user's Zenoh file.
 
-Zenoh is the library that transports the messages. A member is a process that takes part in a
-session. Its Zenoh settings differ from Zenoh's defaults in three points that matter for a
-control loop at 1 kHz:
+Zenoh is the library that transports the messages. The settings of a member differ from Zenoh's
+defaults in three points that matter for a control loop at 1 kHz:
 
-- The transmission queue holds 16 batches instead of 2. A loop that was late sends the messages
-  of several ticks in one burst.
-- A publisher does not wait for room in the queue (the default is 1 ms), because the loop must
-  not wait. Receivers count the messages that are dropped.
+- The transmission queue holds 16 batches instead of 2, because a loop that is late sends the
+  messages of several ticks in one burst.
+- A publisher does not wait for space in the queue (1 ms by default), because the loop must not
+  wait. Receivers count the dropped messages.
 - The option `express`, which sends each message separately, stays off. Bursts of thousands of
-  small messages fit into the queue only in batches.
+  small messages only fit into the queue as batches.
 
-With keys, Zenoh's access control limits what each kind of member may do: which messages it may
-publish, receive, query and answer. A router forwards the messages of others, and is therefore
-permitted to do everything. The size of messages is limited as well, but not their rate: a rate
-limit of Zenoh would drop messages of a burst.
+With keys, Zenoh's access control restricts which messages each kind of member may publish,
+receive, query and answer. A router forwards messages for others, and is therefore allowed to do
+everything. The size of messages is limited too, but not their rate, since Zenoh's rate limit
+would drop messages in a burst.
 
 Invariant:
-    - Members connect only to endpoints that are named explicitly, so that two sessions on one
+    - Members only connect to endpoints that are named explicitly, so two sessions on one
       machine never connect by accident. Zenoh's automatic discovery (multicast and gossip) is
       off.
-    - No setting in a user's file is overruled silently. It is accepted, or the file is refused
-      with a message that lists all settings that do not suit a session, and the required
-      values.
-    - With keys, everything that is not permitted explicitly is denied. A member can publish
-      only under its own name, because its connections show a certificate with that name.
+    - No setting in a user's file is silently overridden. Either the file is accepted, or it is
+      rejected with a message that lists all unsuitable settings and the required values.
+    - With keys, everything that is not explicitly allowed is denied. A member can only publish
+      under its own name, because its connections present a certificate with that name.
 """
 
 import json
@@ -125,7 +123,7 @@ def make_zenoh_config(
     """Returns the complete Zenoh configuration for one process of a session.
 
     Args:
-        listen: Endpoints at which the member listens.
+        listen: Endpoints on which the member listens.
         connect: Endpoints to which the member connects.
         mode: Mode of the member: "peer", "client" or "router".
         user_settings: Settings that take precedence, from a user's file (`ZenohFile.settings`)
@@ -164,10 +162,10 @@ def make_zenoh_config(
 
 
 def merge_settings(base: Mapping[str, Any], overrides: Mapping[str, Any]) -> dict[str, Any]:
-    """Returns nested settings in which some values are replaced, for example by a user's file.
+    """Merges nested settings, with overrides taking precedence over the base settings.
 
     Args:
-        base: The settings.
+        base: The base settings.
         overrides: Values that replace those of `base`, at any level. Settings that appear only
             in `base` are kept.
     """
@@ -197,9 +195,9 @@ def _require_value(required: object, text: str) -> _Requirement:
     """
 
     def is_required_value(value: Any) -> bool:
-        """Returns True if a setting of Zenoh has the required value, and the same type.
+        """Returns True if a Zenoh setting has the required value and type.
 
-        The type matters, because 0 == False in Python.
+        The type is compared because 0 == False in Python.
         """
         return value == required and isinstance(value, type(required))
 
@@ -229,10 +227,9 @@ def _require_session_value(session_values: Mapping[str, Any]) -> _Requirement:
     """
 
     def equals_session_value(mode: str, value: Any) -> bool:
-        """Returns True if a user's value for one mode of Zenoh is the one that a session uses.
+        """Returns True if a user's value for one Zenoh mode is the one that a session uses.
 
-        The type must be the same, too. The result is False for a mode in which a session sets
-        no value.
+        The types must be equal too. False for a mode in which a session sets no value.
         """
         if mode not in session_values:
             return False
@@ -241,9 +238,9 @@ def _require_session_value(session_values: Mapping[str, Any]) -> _Requirement:
         return is_equal and type(value) is type(session_value)
 
     def are_session_values(values: Any) -> bool:
-        """Returns True if a setting that depends on Zenoh's mode agrees with the session.
+        """Returns True if a mode-dependent Zenoh setting agrees with the session's values.
 
-        A mode is "peer", "client" or "router".
+        The modes are "peer", "client" and "router".
         """
         if not isinstance(values, dict):
             return False
@@ -310,11 +307,11 @@ when it connects, and then tries again forever.
 
 @dataclass(frozen=True, slots=True)
 class ZenohFile:
-    """Settings of a user's Zenoh file, after they were checked.
+    """Checked settings from a user's Zenoh file.
 
     Attributes:
         source: Name of the file, for error messages.
-        mode: Mode in the file. Empty if the file has none.
+        mode: Mode given in the file. Empty if the file gives none.
         settings: All settings except the mode and the endpoints.
     """
 
@@ -326,15 +323,15 @@ class ZenohFile:
     def endpoints(
         self, side: Literal["listen", "connect"], mode: ZenohMode
     ) -> list[Endpoint] | None:
-        """Returns the network addresses that a user's Zenoh file names for one direction.
+        """Returns the endpoints that the Zenoh file names for listening or for connecting.
 
         Args:
-            side: "listen" for the endpoints at which the member (process of a session) listens,
-                or "connect" for those to which it connects.
+            side: "listen" for the endpoints on which the member listens, or "connect" for those
+                to which it connects.
             mode: Mode of the member. The file may name different endpoints for each mode.
 
         Returns:
-            The endpoints. None if the file names none.
+            The endpoints, or None if the file names none.
         """
         endpoints = self._endpoints.get(side)
         # A dictionary is either a group of locators or a table by mode.
@@ -348,20 +345,20 @@ class ZenohFile:
     def check(
         cls, source: str, stated: object, refusal: Callable[[Mapping[str, Any]], str]
     ) -> "ZenohFile":
-        """Checks a user's file of Zenoh settings, because a session needs some fixed values.
+        """Checks that a user's Zenoh settings meet the requirements of a session.
 
         Args:
             source: Name of the file, for error messages.
             stated: Parsed content of the file.
-            refusal: Function that returns Zenoh's reason for refusing settings, or an empty
-                text if Zenoh accepts them.
+            refusal: Function that returns Zenoh's reason for rejecting settings, or an empty
+                string if Zenoh accepts them.
 
         Returns:
-            The content.
+            The checked content.
 
         Raises:
             UsageError: The file is not a Zenoh configuration, or contradicts the requirements
-                of a session. The message lists all keys with such contradictions.
+                of a session. The message lists all contradicting keys.
         """
         if not isinstance(stated, dict):
             raise UsageError(
@@ -638,13 +635,13 @@ _CHANNEL_WORDS = {
 
 
 def describe_role(member: str) -> list[str]:
-    """Describes for the user what a member with keys may send, one line per kind of receiver.
+    """Describes what a member with keys may send, with one line per kind of receiver.
 
-    A member is a process of a session. Replies, queries for information and signs of presence
-    are left out, because every member may send them.
+    Replies, queries for information and liveliness tokens are left out, because every member
+    may send them.
 
     Args:
-        member: Name of the member. It determines the role.
+        member: Name of the member, which determines its role.
     """
     if member == ROUTER:
         return ["forwards the messages of all members, whatever they contain"]
@@ -667,11 +664,11 @@ def describe_role(member: str) -> list[str]:
 def make_access_rules(members: Sequence[str]) -> dict[str, Any]:
     """Returns the Zenoh settings that let each member send only what its role requires.
 
-    A member (process of a session) proves its role by the name in its certificate.
+    A member proves its role through the name in its certificate.
 
     Args:
-        members: Names of all members of the session. Members other than the recorder, the
-            operator and the router are sites (arm controllers).
+        members: Names of all members of the session. All members other than the recorder, the
+            operator and the router are sites.
     """
     rules: list[dict[str, Any]] = []
     policies: list[dict[str, Any]] = []
@@ -732,10 +729,7 @@ def _derive_rules(member: str, role: _Role) -> Iterator[dict[str, Any]]:
     """
 
     def keys(owner: str, channels: Sequence[str]) -> list[str]:
-        """Returns the keys under which a member publishes messages, for some of its channels.
-
-        A member is a process that takes part in a session, and a channel is a kind of message.
-        The keys apply to any session.
+        """Returns the keys under which a member publishes on the given channels.
 
         Args:
             owner: Name of the member. "*" stands for any member.
