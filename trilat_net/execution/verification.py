@@ -1,17 +1,17 @@
-"""Verifies a log: executes every site again, and compares every computed field of every record.
+"""Verifies a log by re-executing every site and comparing every computed field of every record.
 
-A record is the logged result of one tick of a site's control loop. The inputs of the tick, such
-as the samples that arrived, are in the log as well. Therefore the tick can be computed again.
+This is possible because the log contains not only the result of each tick, but also its inputs,
+such as the samples that arrived.
 
 Invariant (L3, L5):
-    - `Site.step` gets its inputs only from the log, and its code from the program and from
-      files of users' control laws, whose hashes are in the log.
+    - The inputs of `Site.step` come only from the log, and its code comes from the program and
+      from files with users' control laws, whose hashes are in the log.
     - On the platform on which the log was recorded (equal fingerprint), whole runs are
-      executed, and must agree with the log bit for bit.
-    - On another platform, rounding differs. Each tick is then computed from the two records
-      before it, and two numbers a and b agree if |a - b| <= 1e-9 (1 + |a|).
-    - Gaps of the log are reported. After a gap, the execution resumes from two consecutive
-      records. Records that cannot be judged are counted, but never reported as differences.
+      executed, and must be bit-identical to the log.
+    - On other platforms, rounding differs. Each tick is then computed from the two preceding
+      records, and two values a and b agree if |a - b| <= 1e-9 (1 + |a|).
+    - Gaps in the log are reported. After a gap, execution resumes from two consecutive records.
+      Records that cannot be judged are counted, but never reported as differences.
 """
 
 from array import array
@@ -74,17 +74,17 @@ def _equal_bits(a: float, b: float) -> bool:
 
 
 class RecordDifference(NamedTuple):
-    """Difference between a record of a log and the result of executing the same tick again.
+    """Difference between a record of a log and the result of re-executing its tick.
 
-    Only the first field that differs is stated.
+    Only the first differing field is stored.
 
     Attributes:
-        site: Name of the site (arm controller) whose record it is.
-        tick: Number of the tick (control period).
-        field: Name of the field. For a vector, it includes the index of the number, for example
-            "q[1]".
+        site: Name of the site that produced the record.
+        tick: Number of the tick.
+        field: Name of the field. For a vector, the name includes the index of the element, for
+            example "q[1]".
         logged: Value in the log.
-        computed: Value of the repeated execution.
+        computed: Value computed by the re-execution.
     """
 
     site: str
@@ -102,14 +102,14 @@ class RecordDifference(NamedTuple):
 
     @classmethod
     def of_law_failure(cls, failure: LawFailed) -> "RecordDifference":
-        """Describes a user's control law that fails when a log is executed again.
+        """Describes a user's control law that fails when a log is re-executed.
 
-        The law did not fail in the logged session. The site with the law (process that runs one
-        arm) cannot be executed further. The report counts the failure as a logged record
-        (result of a control period) that the new execution did not reproduce.
+        The law did not fail in the logged session. The site that uses the law cannot be
+        executed any further, and the report counts the failure as a logged record that the
+        re-execution did not reproduce.
 
         Args:
-            failure: The error of the control law.
+            failure: The error raised by the control law.
         """
         return cls(
             site=failure.site,
@@ -128,19 +128,19 @@ class RecordDifference(NamedTuple):
         equal: NumberEquality = _equal_bits,
         channel: LawChannel = LawChannel(),  # noqa: B008
     ) -> "RecordDifference | None":
-        """Finds the first field of a record that differs from a repeated control period.
+        """Finds the first field of a record that differs from a re-execution of its tick.
 
         Args:
-            logged: Record of a tick (control period), as the log contains it.
-            computed: Result of executing the same tick again.
-            peers: Names of the other sites (arm controllers), in the order of the scenario.
-            equal: Function that decides whether two numbers count as equal. By default, they
-                must have the same bits.
-            channel: Layout of the vectors that the site's control law sends, with their names.
-                By default, the law sends no vectors.
+            logged: Record of the tick in the log.
+            computed: Result of re-executing the tick.
+            peers: Names of the other sites, in scenario order.
+            equal: Function that decides whether two numbers are considered equal. By default,
+                they must be bit-identical.
+            channel: Layout and names of the vectors that the site's control law sends. By
+                default, the law sends no vectors.
 
         Returns:
-            The difference. None if all computed fields agree.
+            The difference, or None if all computed fields agree.
         """
         comparisons = _compare_fields(
             logged=logged, computed=computed, peers=peers, equal=equal, channel=channel
@@ -180,16 +180,16 @@ def _pack_vectors(record: State | TickRecord) -> bytes:
 
 
 def equal_record(logged: State, computed: TickRecord, peers: tuple[str, ...]) -> bool:
-    """True if a record has the same bits as the result of executing its tick again.
+    """Returns True if a record is bit-identical to the result of re-executing its tick.
 
     All computed fields are compared. Nearly all records are equal, so this function is
-    optimised for speed. If it returns False, `RecordDifference.find` finds the field that
-    differs.
+    optimised for speed. If it returns False, use `RecordDifference.find` to find the differing
+    field.
 
     Args:
-        logged: Record of a tick (control period), as the log contains it.
-        computed: Result of executing the same tick again.
-        peers: Names of the other sites (arm controllers), in the order of the scenario.
+        logged: Record of the tick in the log.
+        computed: Result of re-executing the tick.
+        peers: Names of the other sites, in scenario order.
     """
     return (
         _pack_vectors(logged) == _pack_vectors(computed)
@@ -253,28 +253,27 @@ def _compare_fields(
 
 @dataclass(slots=True)
 class VerifyResult:
-    """Result of executing the sites (arm controllers) of a log again, to check the log.
+    """Result of checking a log by re-executing its sites.
 
-    A record is the stored result of one tick (control period). It is judged by comparing it
-    with the result of executing the tick again. A record after a gap of the log may be
-    impossible to judge.
+    Each record is judged by comparing it with the result of re-executing its tick. It may be
+    impossible to judge a record after a gap in the log.
 
     Attributes:
-        whole_run: True if whole runs were executed, and bits were compared. False if single
-            ticks were executed, and numbers were compared within a tolerance.
+        whole_run: True if whole runs were executed and compared bit by bit. False if single
+            ticks were executed and compared within a tolerance.
         coverage: For each site, the number of judged ticks and the number of ticks of the run.
         min_coverage: Smallest fraction of the ticks of every site that must be judged.
         integrity: States whether the log is unchanged since it was written.
         records: Number of records that were examined.
-        identical: Number of records in which every computed field agrees with the execution.
+        identical: Number of records in which every computed field agrees with the re-execution.
         unjudged: Number of records after gaps that could not be judged.
-        differing: Number of records that differ from the execution.
+        differing: Number of records that differ from the re-execution.
         first: Difference in the earliest tick. None if there is no difference.
         gaps: Ranges of missing ticks, as (site, first tick, last tick).
         absences: Ranges of ticks that a site did not execute because it had left the session,
             as (site, first tick, last tick).
         withheld: Names of the sites that were not executed, because their control law is code
-            that may not run. They are not included in the other numbers.
+            that may not run. They are excluded from all other results.
     """
 
     whole_run: bool
@@ -292,9 +291,9 @@ class VerifyResult:
 
     @property
     def agreed(self) -> bool:
-        """True if no record of the log differs from a repeated execution of its control period.
+        """True if no record of the log differs from the re-execution of its tick.
 
-        The result is also True if few records or no records could be compared.
+        Also True if few or no records could be compared.
         """
         return self.first is None
 
@@ -302,24 +301,23 @@ class VerifyResult:
     def passed(self) -> bool:
         """True if the log can be trusted to contain what the controllers computed.
 
-        No record differs from the repeated execution, the log is unchanged since it was
-        written, and enough of the control periods of every site were compared.
+        This requires that no record differs from its re-execution, that the log is unchanged
+        since it was written, and that enough ticks of every site were compared.
         """
         enough = not self.withheld and self.coverage.share >= self.min_coverage
         return self.agreed and enough and self.integrity.passed
 
     def add(self, other: "VerifyResult") -> None:
-        """Adds the result for further sites of the same log to this result.
+        """Merges the result for other sites of the same log into this result.
 
-        A site is a process that runs one arm. The log of a rerun (repeated execution of a log)
-        contains some sites that were copied from an older log. They are checked with that log,
-        which gives a separate result.
+        The log of a rerun contains some sites that were copied from an older log. These sites
+        are checked against that log, which gives a separate result.
 
-        Numbers are added, and lists are joined. The sum counts as a whole run, or as intact,
-        only if both results do.
+        Counts are added, and lists are concatenated. The merged result covers whole runs, or is
+        intact, only if this holds for both results.
 
         Args:
-            other: Result for the further sites. It does not change.
+            other: Result for the other sites. It is not modified.
         """
         self.records += other.records
         self.identical += other.identical
@@ -339,11 +337,10 @@ class VerifyResult:
             self.integrity = other.integrity  # one failed log suffices to fail the whole check
 
     def add_difference(self, difference: RecordDifference) -> None:
-        """Counts one more record that differs from the repetition of its control period.
+        """Counts one more record that differs from the re-execution of its tick.
 
         Args:
-            difference: The difference. It is stored as `first` if it is the earliest
-                difference.
+            difference: The difference. It is stored as `first` if it is the earliest one.
         """
         self.differing += 1
         self._keep_first(difference)
@@ -438,16 +435,15 @@ class _SiteVerifier:
         )
 
     def run(self, report: Callable[[int], None] | None = None) -> None:
-        """Executes every recorded tick of a site again, and compares the results with the log.
+        """Re-executes every recorded tick of a site, and compares the results with the log.
 
-        A site is a process that runs one arm, and a tick is a period of its control loop. Long
-        sequences of ordinary records (results of control periods) are executed by a compiled
-        loop, and the other records one by one. The numbers of equal, different and missing
-        records are added to the `VerifyResult` of this object.
+        Long sequences of ordinary records are executed by a compiled loop, and all others one
+        by one. The counts of identical, differing and missing records are added to the
+        `VerifyResult` of this object.
 
         Args:
-            report: Function that is called now and then with the number of examined records of
-                all sites. None if progress is not reported.
+            report: Function that is called from time to time with the number of examined
+                records of all sites. If None, progress is not reported.
         """
         result = self._result
         name = self._log.name
@@ -842,21 +838,22 @@ def verify_log(
     min_coverage: float = MIN_COVERAGE,
     resume_every: int = 0,
 ) -> VerifyResult:
-    """Executes every site of a log again, and compares each record with the result.
+    """Re-executes every site of a log, and compares each record with the result.
 
-    If all records agree, the log contains what its scenario and its recorded inputs produce. A
-    rerun executes some sites with changed settings, and copies the records of the other sites
-    from a source log. The copied records are compared with the source log, and these sites are
-    executed from the source log. This requires that the source log is in the same folder.
+    If all records agree, the log contains exactly what its scenario and its recorded inputs
+    produce. The log of a rerun contains some sites that were executed with changed settings,
+    and others whose records were copied from a source log. The copied records are compared with
+    the source log, and these sites are re-executed from the source log, which must be in the
+    same folder.
 
     Args:
-        log: Log of a run or of a rerun that is to be checked.
-        progress: Function that is called now and then with the number of executed records and
-            their total.
+        log: Log of a run or rerun.
+        progress: Function that is called from time to time with the number of executed records
+            and their total.
         min_coverage: Smallest fraction of the ticks of every site that must be judged.
         resume_every: In every tick that is divisible by this number, the site is replaced by a
-            new site that is restored from the records. This reveals state that a law keeps
-            outside of its `memory`. 0 means never.
+            new site restored from the records. This reveals state that a law keeps outside its
+            `memory`. 0 means never.
 
     Raises:
         LogError: A record cannot be read.

@@ -1,16 +1,16 @@
 """Compares a log with a simulation of its run, to find the effect of late and lost messages.
 
-In each control period, an arm sends its state, a sample, to the other arms. The receiver holds
-a sample until the delay that the scenario prescribes has passed. Then the sample is due. As
-long as the real network delivers every sample before it is due, the network has no effect on
-the run, and a simulation without a network gives the same numbers. The first difference shows
-when the network was too slow.
+In each tick, an arm sends its state (a sample) to the other arms. The receiver holds a sample
+until the delay prescribed by the scenario has passed, at which point the sample is due. As long
+as the real network delivers every sample before it is due, the network has no effect on the
+run, and a simulation without a network gives the same results. The first difference shows when
+the network was too slow.
 
 Invariant (L2):
-    - A simulation in which all samples arrive when they arrived in the log equals the log in
-      every tick (control period).
-    - A simulation in which all samples arrive at once equals the log up to the first sample
-      that was late, or was lost in the network.
+    - A simulation in which all samples arrive when they arrived in the log agrees with the log
+      in every tick.
+    - A simulation in which all samples arrive at once agrees with the log up to the first
+      sample that was late or lost in the network.
 """
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -50,12 +50,12 @@ class _RecordComparison(NamedTuple):
     first: RecordDifference | None
 
     def to_finding(self, label: str, excused_from: int | None) -> Finding:
-        """Returns the finding that states whether a log equals another execution of its run.
+        """Returns the finding on whether a log agrees with another execution of its run.
 
         Args:
             label: Name of the check.
-            excused_from: Tick (control period) from which differences are expected and do not
-                fail the check. None if there is no such tick.
+            excused_from: Tick from which differences are expected and do not fail the check.
+                None if there is no such tick.
         """
         first = self.first
         text = f"{self.identical}/{count_nouns(self.records, 'record')} identical"
@@ -135,18 +135,18 @@ def _compare_records(
 def find_absent_samples(log: Log) -> list[_LateSample]:
     """Finds every sample that was late or lost in the network of a live session.
 
-    A sample is the state that a site (process that runs one arm) sends in one tick (period of
-    its control loop). It is due at its receiver after the delay that the scenario describes.
+    A sample is due at its receiver after the delay prescribed by the scenario.
 
-    If records (results of control periods) of the receiver are missing, the log does not show
-    whether a sample was lost or arrived in these ticks. The sample counts as lost if the
-    receiver still uses an older sample in its first recorded tick at or after the due tick.
+    If records of the receiver are missing, the log does not show whether a sample was lost or
+    arrived in the missing ticks. The sample counts as lost if the receiver still uses an older
+    sample in its first recorded tick at or after the due tick.
 
     Args:
         log: Log of a live session.
 
     Returns:
-        The samples, by the tick in which they were due. Empty if all samples were in time.
+        The samples, in order of the tick in which they were due. Empty if all samples were on
+        time.
     """
     absent: list[_LateSample] = []
     for name in log.sites:
@@ -261,27 +261,20 @@ class _VirtualComparison(NamedTuple):
 
     @property
     def late(self) -> list[_LateSample]:
-        """Messages that arrived later than the delay model of the scenario allows.
-
-        A message (sample) contains the state that a site (process that runs one arm) sends.
-        """
+        """Samples that arrived later than the scenario's delay model allows."""
         return [sample for sample in self.absent if sample.arrived_tick is not None]
 
     @property
     def lost(self) -> list[_LateSample]:
-        """Samples that the network lost, although it should have delivered them.
-
-        A sample is the state that a site (process that runs one arm) sends. Losses that the
-        scenario itself describes do not count.
-        """
+        """Samples that the network lost, excluding losses prescribed by the scenario."""
         return [sample for sample in self.absent if sample.arrived_tick is None]
 
     @property
     def excused_from(self) -> int | None:
         """First tick of the log that may differ from a simulation with a perfect network.
 
-        In this tick (period of the control loop), a site needed a sample, the state of another
-        site, that was late or lost. None if no sample was late or lost.
+        In this tick, a site needed a sample that was late or lost. None if no sample was late
+        or lost.
         """
         return self.absent[0].due_tick if self.absent else None
 
@@ -289,13 +282,13 @@ class _VirtualComparison(NamedTuple):
 def compare_with_virtual(log: Log, progress: Progress | None = None) -> _VirtualComparison:
     """Compares a log with two simulations of its scenario in virtual time.
 
-    In the first simulation, samples arrive as in the log. In the second simulation, they arrive
-    at once. Both end at the last record of the log.
+    In the first simulation, samples arrive as in the log. In the second, they arrive at once.
+    Both end at the last record of the log.
 
     Args:
         log: Log of a live session, which contains its scenario.
-        progress: Function that is called now and then with the number of executed ticks and
-            their total.
+        progress: Function that is called from time to time with the number of executed ticks
+            and their total.
     """
     scenario = virtual.cut_to_records(log)
     total = 2 * sum(map(scenario.ticks, scenario.names))
@@ -314,19 +307,17 @@ def compare_with_virtual(log: Log, progress: Progress | None = None) -> _Virtual
         def execute(
             network: Network | None, ticks_before: int
         ) -> Iterator[tuple[str, TickRecord]]:
-            """Simulates the scenario of the recorded session once more, tick by tick.
+            """Simulates the scenario of the recorded session again, tick by tick.
 
-            The simulation receives the commands, the actions of live operators and the motion
-            of external arms (arms that are not simulated) from the log. A tick (period of the
-            control loop) is executed when its record is read.
+            The commands, the actions of live operators and the motion of external arms are
+            taken from the log. A tick is executed when its record is read.
 
             Args:
-                network: Network that delivers the samples (sent states). If None, samples
-                    arrive at once.
-                ticks_before: Number of ticks of earlier simulations, for the progress.
+                network: Network that delivers the samples. If None, samples arrive at once.
+                ticks_before: Number of ticks of earlier simulations, for reporting progress.
 
             Yields:
-                Name of the site (arm controller), and record of the tick.
+                The name of the site and the record of the tick.
             """
             ticks = virtual.execute_virtual(
                 scenario=scenario,

@@ -731,6 +731,8 @@ def _derive_rules(member: str, role: _Role) -> Iterator[dict[str, Any]]:
     def keys(owner: str, channels: Sequence[str]) -> list[str]:
         """Returns the keys under which a member publishes on the given channels.
 
+        The keys match any session.
+
         Args:
             owner: Name of the member. "*" stands for any member.
             channels: Names of the channels.
