@@ -1,21 +1,20 @@
-"""Replies to requests of users who change something while an arm is running.
+"""Answers users' requests for changes while an arm is running.
 
 For example, `trilat set` changes the delay of a network link, and `trilat stop` stops an arm.
-Such a command sends a request to the site, the process that controls the arm. Before each tick
-of its control loop, the site checks the requests that have arrived, and replies to each of
-them.
+Such a command sends a request to the site. Before each tick of its control loop, the site
+checks the requests that have arrived and replies to each of them.
 
 Invariant:
-    - Every request gets a reply: it is accepted, or refused with a reason. An accepted change
-      is part of the log, in the record of the tick that accepts it, so that the run can be
-      reproduced.
+    - Every request is answered: it is either accepted, or rejected with a reason. An accepted
+      change is stored in the log, in the record of the tick that accepts it, so that the run
+      can be reproduced.
     - A change of a link or of weights takes effect `AHEAD_MS` after it was accepted, because
-      some decisions are made in advance. For example, the delay of a sample that has been sent
-      cannot change any more.
-    - An order to stop an arm is executed at once. The orders "enable" and "reset" are never
-      executed in the same tick as another order, so that they cannot undo a stop. They wait for
-      the next tick, as do the requests that arrived after them.
-    - A change of weights is spread over at least `MIN_RAMP_S`, whatever the request states, so
+      some decisions are made in advance. For example, the delay of a sample can no longer
+      change once the sample has been sent.
+    - A command to stop an arm is executed at once. The commands "enable" and "reset" are never
+      executed in the same tick as another command, so that they cannot undo a stop. They wait
+      for the next tick, as do the requests that arrived after them.
+    - A change of weights is spread over at least `MIN_RAMP_S`, whatever the request says, so
       that the reference of the arm does not jump. The log contains the actual duration.
 """
 
@@ -54,25 +53,25 @@ _NEEDED_MODES = {"reset": Mode.FAULT, "enable": Mode.STOPPED}
 
 
 class ChangeServer:
-    """Checks the requests to one site, replies, and keeps the accepted changes for its loop.
+    """Answers requests to a site, and keeps the accepted changes for its control loop.
 
-    A request changes for example the delay of a link, or orders the site to stop its arm. The
-    control loop of the site calls `pop_changes` before each tick, a period of the loop.
+    A request may, for example, change the delay of a link or tell the site to stop its arm. The
+    control loop of the site calls `pop_changes` before each tick.
 
     Args:
         scenario: Scenario of the session.
         site: Name of the site.
-        queries: Requests of the operator, who may change everything.
+        queries: Requests from the operator, who may change everything.
         mode: Function that returns the mode of the site after its last tick.
         held: Function that returns True if the dead-man switch is held or if there is none. If
-            it is not held, the orders "enable" and "reset" are refused.
-        stops: Requests of other members, who may only stop the site. None if there are none.
+            it returns False, the commands "enable" and "reset" are rejected.
+        stops: Requests from other members, who may only stop the site. None if there are none.
 
     Attributes:
         stopped: True if the next tick is the last one before a requested end of the run.
-        marks: Marks that are not published yet: pairs of a tick and a text.
-        sources: Who requested each accepted change, by the text of the change as the record of
-            the tick contains it. The entry is removed when the change is published.
+        marks: Marks that have not been published yet, as pairs of tick and text.
+        sources: Mapping from each accepted change, as written in the record of the tick, to the
+            name of its requester. An entry is removed when the change is published.
     """
 
     def __init__(
@@ -109,16 +108,16 @@ class ChangeServer:
         self.sources: dict[str, str] = {}
 
     def pop_changes(self, next_tick: int) -> Sequence[CoreChange]:
-        """Replies to all waiting requests of users, and returns the changes for the next tick.
+        """Answers all pending requests from users, and returns the changes for the next tick.
 
-        A tick is one period of the control loop of the arm, which calls this method before each
-        tick.
+        The control loop of the arm calls this method before each tick.
 
         Args:
             next_tick: Number of the next tick.
 
         Returns:
-            The changes that the site applies in that tick. Empty if none was accepted since the
+            The changes that the site applies in that tick. Empty if none were accepted since
+            the
             last call.
         """
         self._update_stopped(next_tick)

@@ -1,19 +1,19 @@
-"""Receives measurements of a real arm and its dead-man switch, and stops the arm without them.
+"""Monitors a real arm and its dead-man switch, and stops the arm if either falls silent.
 
-An arm is external (`plant = "external"` in the scenario) if it is a real arm, or a simulation
-in another program. Its driver sends the measured joint positions to the site, the process that
-computes the torque. A dead-man switch is a button that somebody must hold while the arm moves.
+An arm is external (`plant = "external"` in the scenario) if it is a real arm, or is simulated
+by another program. Its driver sends the measured joint positions to the site, which computes
+the torque. A dead-man switch is a button that somebody must hold while the arm moves.
 `ExternalArm` and `DeadManSwitch` measure how long each of the two has been silent, and derive
-orders for the site: to hold the position, to stop, or to continue.
+commands for the site: to hold the position, to stop, or to continue.
 
 Invariant:
     - A received message cannot raise an error in the control loop. The queue of messages is
       bounded.
     - The site does not start without a measurement. It holds its position after
       `HELD_SILENCE_NS` without a measurement, and enters the mode "fault" after
-      `SILENCE_LIMIT_NS`, because the torque would no longer fit the state of the arm.
-    - A measurement that the arm cannot have reached since the previous one is dropped, and does
-      not count as received, because the sensor or the driver must be faulty.
+      `SILENCE_LIMIT_NS`, when the torque would no longer match the state of the arm.
+    - A measurement that the arm cannot have reached since the previous one indicates a faulty
+      sensor or driver. It is dropped, and does not count as received.
     - A switch that has sent nothing for `SWITCH_SILENCE_NS` counts as released.
 """
 
@@ -58,15 +58,15 @@ If the site itself was suspended, it cannot know which messages it would have re
 class ExternalArm:
     """Receives the measurements of one external arm, and watches for interruptions.
 
-    An external arm is a real or simulated arm outside of this program, whose driver sends the
-    joint angles and velocities. If no measurement arrives for some time, the site has to stop
-    the arm.
+    The joint angles and velocities are sent by the arm's driver. If no measurement arrives for
+    some time, the site has to stop the arm.
 
     Args:
         site: Site of the arm in the simulation kernel.
         ring: Queue of the measurements.
         clock: Clock of this machine.
-        dropped: Number of dropped measurements by reason. The counts are increased in place.
+        dropped: Mapping from reason to number of dropped measurements. The counts are increased
+            in place.
         address: Where the site expects the measurements, for messages to the user.
 
     Attributes:
@@ -115,7 +115,7 @@ class ExternalArm:
     def wait_for_first(
         self, stopped: Callable[[], bool], give_up_ns: int, say: Callable[[str], None]
     ) -> bool:
-        """Waits for the first measurement of an arm outside of this program, such as a robot.
+        """Waits for the first measurement of an external arm, such as a robot.
 
         The session cannot start without it, because the controller would not know the arm's
         pose.
@@ -126,7 +126,7 @@ class ExternalArm:
             say: Function that prints a line for the user.
 
         Returns:
-            True if a measurement has arrived. False if `stopped` returned True.
+            True if a measurement has arrived, or False if `stopped` returned True.
 
         Raises:
             SessionError: No measurement arrived in time.
@@ -166,18 +166,17 @@ class ExternalArm:
         return SessionError(f"{text}; see {find_page('external-arm.md')}")
 
     def bind(self, q0_rad: Sequence[float]) -> str:
-        """Checks the arm's pose. From now on, only its present driver's measurements are used.
+        """Checks the arm's pose, and binds the site to the arm's current driver.
 
-        The driver is the program that sends the joint angles of an arm outside of this program.
-        The site that controls the arm calls this method at the start of the session.
-        Measurements that another program sends later are dropped.
+        The site calls this method at the start of the session. Measurements that another
+        program sends later are dropped.
 
         Args:
             q0_rad: Joint angles in rad at which the arm starts according to the scenario. The
                 other sites assume this pose.
 
         Returns:
-            A warning if the arm is not at this pose. Empty if it is.
+            A warning if the arm is not in this pose, or an empty string if it is.
         """
         self.poll()
         self._is_bound = True
@@ -195,10 +194,10 @@ class ExternalArm:
         )
 
     def poll(self) -> None:
-        """Receives measurements of an arm outside of this program, and detects its silence.
+        """Receives measurements of an external arm, and detects if they stop arriving.
 
-        The silence is the time since the last accepted measurement. The control loop calls this
-        method in every tick (period).
+        The control loop calls this method in every tick, and measures the time since the last
+        accepted measurement.
         """
         now_ns = self._clock.monotonic_ns()
         accepted_before = self.accepted
@@ -216,13 +215,13 @@ class ExternalArm:
         self._polled_ns = now_ns
 
     def pop_order(self, mode: Mode) -> SiteOrder:
-        """Returns the order with which the control loop reacts to missing measurements.
+        """Returns the command with which the control loop reacts to missing measurements.
 
-        Another order follows when measurements arrive again. Each order is returned once,
+        Another command follows when measurements arrive again. Each command is returned once,
         except that "arm_lost" is repeated until the site is in the mode "fault".
 
         Args:
-            mode: Present mode of the site.
+            mode: Current mode of the site.
 
         Returns:
             "arm_silent" to hold the position, after `HELD_SILENCE_NS` without a measurement.
@@ -332,20 +331,21 @@ class _Holder:
 
 
 class DeadManSwitch:
-    """State of the dead-man switch of one arm, for which several programs may report.
+    """State of the dead-man switch of one arm, which several programs may report.
 
     A person holds the switch while the arm may move. Releasing it stops the arm.
 
     The arm stops if any program that holds the switch releases it or falls silent. The others
-    then have to release the switch and press it again. The age of a message is measured on the
-    clock of this machine from its arrival. The switch therefore counts as released if this
-    process was suspended.
+    then have to release the switch and press it again. The age of a report is measured from its
+    arrival, on the clock of this machine, so the switch counts as released if this process was
+    suspended.
 
     Args:
         site: Name of the site of the arm.
-        ring: Queue of the reports, with the times of their arrival.
+        ring: Queue of the reports, with their times of arrival.
         clock: Clock of this machine.
-        dropped: Number of dropped messages by reason. The counts are increased in place.
+        dropped: Mapping from reason to number of dropped messages. The counts are increased in
+            place.
     """
 
     def __init__(
@@ -386,7 +386,7 @@ class DeadManSwitch:
 
     @property
     def held(self) -> bool:
-        """True if the dead-man switch is held, so that the arm may move.
+        """True if the dead-man switch is held and the arm may move.
 
         At least one program must report that a person holds the switch, and no program that has
         reported this may have been silent for longer than `SWITCH_SILENCE_NS`.
@@ -397,8 +397,8 @@ class DeadManSwitch:
     def poll(self) -> None:
         """Receives reports about the dead-man switch, and updates whether it is held.
 
-        If a program that holds the switch has been silent for too long, the switch counts as
-        released, because the program may have crashed.
+        If a program that holds the switch has been silent for too long, it may have crashed,
+        and the switch counts as released.
         """
         while (message := self._ring.poll()) is not None:
             payload, received_ns = message
@@ -406,19 +406,19 @@ class DeadManSwitch:
         self._release([holder for holder in self._list_holders() if self._is_silent(holder)])
 
     def pop_order(self, mode: Mode, reason: LifeReason) -> SiteOrder:
-        """Returns the order that follows from the dead-man switch: to stop, or to move again.
+        """Returns the command that follows from the dead-man switch: to stop, or to move again.
 
-        A dead-man switch is a button that a person holds while the arm may move. While the
-        switch is released, every call returns the order to stop, until the arm has stopped for
-        this reason or its site reports a fault.
+        While the switch is released, every call returns the command to stop, until the arm has
+        stopped for this reason or its site reports a fault.
 
         Args:
-            mode: Present mode of the site, for example stopped.
+            mode: Current mode of the site, for example stopped.
             reason: Reason why the site is in this mode.
 
         Returns:
-            "released" if the arm must stop. "held" if it may move again. Empty if the site need
-            not do anything.
+            "released" if the arm must stop, "held" if it may move again, or an empty string if
+            the
+            site does not have to do anything.
         """
         was_released = self._was_released
         self._was_released = False

@@ -1,13 +1,12 @@
 """Runs a user's operator class, which decides how to move an arm, in a separate process.
 
-The method `act` of the class receives a view, which is the present state of the arm and of the
-others, and returns a target or a force. The process of the arm sends views over the network at
-regular intervals. This process, the command `trilat hand`, replies with the decisions of the
-class.
+The class has a method `act` that receives a view (the current state of the arm and of the
+others) and returns a target or a force. The site sends views over the network at regular
+intervals. This process, started by `trilat hand`, replies with the decisions of the class.
 
 Invariant:
-    - Each decision names the tick of its view. It takes effect a fixed time after that tick, so
-      that delays on the network do not change the run.
+    - Each decision names the tick of its view, and takes effect a fixed time after that tick.
+      Delays on the network therefore do not change the run.
     - Views that are too old to be answered in time are skipped, so that a slow class does not
       fall further and further behind.
     - If the class fails, the arm is released and the process ends. If the process is killed,
@@ -51,20 +50,19 @@ _VIEWS_KEPT = 64
 
 
 class HandProcess(SiteClient):
-    """Runs an operator class that a user wrote, and connects it with the arm that it moves.
+    """Runs a user's operator class, and connects it to the arm that it moves.
 
-    The arm is controlled by another process, its site. The caller calls `serve` repeatedly.
-    Each call replies to one view, a state that the site has sent.
+    The caller calls `serve` repeatedly. Each call replies to one view sent by the site.
 
     Args:
         hand_site: Site whose arm the operator moves, and settings of the user's class.
-        program: The operator, an object of the user's class.
+        program: The operator, an instance of the user's class.
         bus: Network connection to the session.
         clock: Clock of this process.
         session: Name of the session.
 
     Attributes:
-        answered: Number of views (states that the site sent) to which the class has replied.
+        answered: Number of views to which the class has replied.
         skipped: Number of views that were skipped because they were too old.
     """
 
@@ -97,10 +95,9 @@ class HandProcess(SiteClient):
     def serve(self) -> None:
         """Calls the user's operator class with a view of the arm, and sends the decision.
 
-        The site of the arm regularly sends a view, which describes its present state. The
-        oldest waiting view that is not too old is used. If no view is waiting, nothing is
-        decided. Until the first view arrives, the method regularly tells the site that this
-        process exists.
+        The oldest pending view that is not too old is used. If there is none, the class is not
+        called. Until the first view arrives, this method regularly announces the process to the
+        site.
 
         Raises:
             RunFailed: The user's class failed. The arm has been released.
@@ -176,16 +173,16 @@ def _read_view(message: HandViewMessage) -> HandView:
     """
 
     def read_fields(source: Any, names: tuple[str, ...]) -> Any:
-        """Reads the fields of a message that have given names, with lists converted to arrays.
+        """Reads the given fields of a message, and converts lists to arrays.
 
         The field "peers" is left out, because it is converted separately.
 
         Args:
-            source: The message, or its part that describes one peer (another site).
+            source: The message, or the part of it that describes one peer.
             names: Names of the fields.
 
         Returns:
-            The values by the names of the fields.
+            A mapping from field name to value.
         """
         fields = {}
         for name in names:
@@ -207,24 +204,24 @@ def run_hand(
     say: Callable[[str], None],
     timeout_s: float,
 ) -> None:
-    """Runs a user's operator class until the session ends, in a process of its own.
+    """Runs a user's operator class in its own process until the session ends.
 
     An operator class is Python code that moves an arm in place of a person. It receives the
-    state of the arm over the network, and replies with a torque or a target. In its own
-    process, it cannot delay the control loop of the arm.
+    state of the arm over the network, and replies with a force or a target. Running it in a
+    separate process prevents it from delaying the control loop of the arm.
 
     Args:
-        scenario: Scenario (description) of the session. It names the operator class.
-        name: Name of the site, the process that controls the arm.
+        scenario: Scenario of the session, which names the operator class.
+        name: Name of the site.
         session: Name of the session.
         connection: Network addresses of the session, and keys.
         interrupt: Handler of the signals of this process.
         say: Function that prints a line for the user.
-        timeout_s: Longest wait for the first message with the state of the site, in s.
+        timeout_s: Longest wait for the first view from the site, in s.
 
     Raises:
-        UsageError: The scenario has no operator class for this site that runs in a process of
-            its own.
+        UsageError: For this site, the scenario has no operator class that runs in its own
+            process.
         SessionError: The site does not send its state in time.
         RunFailed: The class failed.
     """

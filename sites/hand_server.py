@@ -1,16 +1,16 @@
-"""Receives, at the process of an arm, the commands of the operator who moves the arm.
+"""Receives the commands of the operator who moves an arm, in the process of the arm's site.
 
-An operator is a person or a program, and commands a target position or a force by messages over
+An operator is a person or a program that sends messages with a target position or a force over
 the network. `HandServer` receives the commands of people and programs that connect to the
-session. `RemoteHand` receives those of a Python class of the user that runs in a process of its
-own, and sends the state of the arm to that process.
+session. `RemoteHand` receives those of a user's Python class that runs in its own process, and
+sends the state of the arm to that process.
 
 Invariant:
-    - A message cannot raise an error in the control loop, and each tick reads a limited number
-      of messages, so that many messages do not make a tick late. Refused messages are counted
-      by reason.
+    - A message cannot raise an error in the control loop. Each tick reads a limited number of
+      messages, so a flood of messages does not delay it. Rejected messages are counted per
+      reason.
     - Only one operator at a time moves the arm, and the site limits the motion of the target as
-      the scenario says. The sender of a message cannot circumvent these rules.
+      specified in the scenario. The sender of a message cannot circumvent these rules.
 """
 
 import math
@@ -78,15 +78,15 @@ def _read_messages(
 class HandServer:
     """Moves the arm of a site as requested by people and programs that connect to the session.
 
-    A site is the process that controls one arm. Each of these people and programs is an
-    operator. Only one operator moves the arm at a time.
+    Only one of these operators can move the arm at a time.
 
     Args:
-        site: Object that computes the ticks (control periods) of the site.
+        site: Object that computes the ticks of the site.
         hand: Settings in the scenario for operators that connect during the session.
         arm: Arm of the site.
         inbox: Queue of the operators' messages.
-        dropped: Number of dropped messages by reason. The counts are increased in place.
+        dropped: Mapping from reason to number of dropped messages. The counts are increased in
+            place.
         limits: Limits of the motion of the site. None if there are none.
 
     Attributes:
@@ -119,17 +119,16 @@ class HandServer:
         self.news: list[tuple[int, str]] = []
 
     def track(self, _site: Site, tick: int) -> list[float]:
-        """Reads the waiting messages of operators, and returns how to move the arm.
+        """Processes the pending messages of operators, and returns how to move the arm.
 
-        An operator is a person or a program that moves the arm by messages over the network.
-        The control loop calls this in every tick.
+        The control loop calls this method in every tick.
 
         Args:
-            tick: Number of the tick, a period of the control loop.
+            tick: Number of the tick.
 
         Returns:
-            The operator who moves the arm, and the target or force, as a list of numbers for
-            the computation of the tick. `HandInForce.read` describes the numbers.
+            The operator who moves the arm, and the target or force, as a list of floats for
+            the computation of the tick. The format is described in `HandInForce.read`.
         """
         messages = _read_messages(self._inbox, self._site, self._dropped)
         parsed = [self._parse_command(message) for message in messages]
@@ -203,19 +202,18 @@ class HandServer:
 class RemoteHand(HandPlayer):
     """Moves the arm of a site as decided by a user's Python class in another process.
 
-    At regular intervals, the site sends the process a view, which is the present state of the
-    site. The process replies with its decision: a target, a force, or to release the arm. The
-    decision takes effect a fixed time after the tick of the view. If it arrives too late, it
-    takes effect at once and is counted. Only decisions of the class that the scenario names are
-    accepted.
+    At regular intervals, the site sends a view (its current state) to that process. The process
+    replies with its decision: a target, a force, or to release the arm. The decision takes
+    effect a fixed time after the tick of the view. If it arrives too late, it takes effect at
+    once and is counted. Only decisions of the class named in the scenario are accepted.
 
     Args:
         hand_site: Site whose arm the operator moves, and settings of the user's class.
         boot: Random number that identifies this start of the site.
         inbox: Queue of the decisions.
         publish: Function that publishes a view.
-        dropped: Number of dropped and late messages by reason. The counts are increased in
-            place.
+        dropped: Mapping from reason to number of dropped and late messages. The counts are
+            increased in place.
         clock: Clock of this process.
     """
 
@@ -240,15 +238,15 @@ class RemoteHand(HandPlayer):
     def track(self, site: Site, tick: int) -> list[float]:
         """Reads the newest decision of the user's operator class on how to move the arm.
 
-        The class runs in a process of its own. The control loop calls this in every tick.
+        The control loop calls this method in every tick.
 
         Args:
             site: Object that computes the ticks of the site.
-            tick: Number of the tick, a period of the control loop.
+            tick: Number of the tick.
 
         Returns:
-            The target or force on the arm, as a list of numbers for the computation of the
-            tick. `HandInForce.read` describes the numbers.
+            The target or force on the arm, as a list of floats for the computation of the
+            tick. The format is described in `HandInForce.read`.
         """
         for message in self._read_decisions():
             self._decide(tick, message)
@@ -257,11 +255,10 @@ class RemoteHand(HandPlayer):
     def request_action(self, tick: int, arrays: SiteArrays) -> None:
         """Sends the state of the arm to the user's operator class, to request a new decision.
 
-        The class runs in a process of its own. The control loop does not wait for the reply,
-        which `track` reads in a later tick.
+        The control loop does not wait for the reply, which `track` reads in a later tick.
 
         Args:
-            tick: Number of the present tick, a period of the control loop.
+            tick: Number of the current tick.
             arrays: State of the site in this tick, from which the message is composed.
         """
         view = self.view(tick, arrays)
@@ -276,7 +273,7 @@ class RemoteHand(HandPlayer):
     ) -> bool:
         """Waits until the process of the user's operator class announces itself.
 
-        A session must not start before this, because nobody could move the arm.
+        The session must not start earlier, because nobody could move the arm.
 
         Args:
             stopped: Function that returns True to end the wait.
@@ -284,7 +281,7 @@ class RemoteHand(HandPlayer):
             say: Function that prints a line for the user.
 
         Returns:
-            True if the process has announced itself. False if `stopped` returned True.
+            True if the process has announced itself, or False if `stopped` returned True.
 
         Raises:
             SessionError: The process did not announce itself in time.

@@ -1,7 +1,7 @@
 """Warns before a session if other programs keep the processors of this machine busy.
 
-On a busy machine, control loops run late. The load is measured for 0.2 s, from the statistics
-that Linux provides in /proc/stat. On other operating systems there is no warning.
+On a busy machine, control loops run late. The load is measured over 0.2 s from the statistics
+that Linux provides in /proc/stat. On other operating systems, no warning is given.
 """
 
 from contextlib import suppress
@@ -28,14 +28,14 @@ _TIME_COLUMNS = slice(0, 8)  # without guests, whose time the column "user" incl
 def check_machine_load(clock: Clock) -> str:
     """Returns a warning if other programs keep this machine busy.
 
-    A control loop on a busy machine starts its periods late, which makes its arm move
-    differently.
+    On a busy machine, the ticks of a control loop begin late, which changes the motion of the
+    arm.
 
     Args:
         clock: Clock of this process.
 
     Returns:
-        The warning, with a remedy. Empty if the machine is not busy.
+        The warning and a remedy, or an empty string if the machine is not busy.
     """
     return _describe_load(_measure_busy_share(clock))
 
@@ -56,9 +56,9 @@ class _ProcessorTimes(NamedTuple):
 
     @classmethod
     def parse(cls, text: str) -> "_ProcessorTimes":
-        """Reads the idle and total processor times from the content of /proc/stat of Linux.
+        """Parses the idle and total processor times from the content of /proc/stat on Linux.
 
-        The first line of the file is used, which is the sum of all processors, see
+        The first line of the file is used, which is the sum over all processors, see
         proc_stat(5).
 
         Args:

@@ -1,14 +1,13 @@
 """Admits arms that join or rejoin a running session, and notices arms that stay away.
 
-Each arm is controlled by a process of its own, its site. If such a process has crashed and is
-started again, the other sites must know the first tick from which to use its messages. The
-modules `peer_monitor` and `peer_admission` share this work: the first notices processes, the
-second changes whose samples the control loop uses.
+If a site has crashed and is restarted, the other sites must know the first tick from which to
+use its messages. `peer_monitor` and `peer_admission` share this work: the former detects
+processes, the latter changes whose samples the control loop uses.
 
 Invariant:
-    - From the tick that an admitted peer has announced, samples of its new process are
-      accepted. Samples of its previous process are not accepted any more.
-    - A peer whose samples arrive counts as present, even if its token in the network was lost.
+    - From the tick announced by an admitted peer, samples from its new process are accepted,
+      and samples from its previous process are rejected.
+    - A peer whose samples arrive counts as present, even if its liveliness token was lost.
 """
 
 from msgspec.structs import asdict
@@ -22,22 +21,20 @@ from .site_parts import SiteParts
 
 
 class PeerAdmission:
-    """Decides, in a running session, from which tick the samples of a restarted peer are used.
+    """Decides from which tick onwards the samples of a restarted peer are used.
 
-    The process of a peer may crash and be started again. Samples of its old process that are
-    still in transit must then not be mixed with those of the new one.
-
-    A peer is another site of the session.
+    Samples of the old process that are still in transit must not be mixed with those of the new
+    one.
 
     Args:
         parts: Parts of the site.
         publisher: Publishes the events of the site.
         epoch: Common start time of the session, and the request of this site if it joined late.
         timing: Clocks of the peers.
-        inbox: Samples of the peers.
+        inbox: Samples from the peers.
 
     Attributes:
-        has_given_up: True if a peer has been away for longer than the user permits.
+        has_given_up: True if a peer has been away for longer than the user allows.
     """
 
     def __init__(
@@ -59,7 +56,7 @@ class PeerAdmission:
     def watch_members(self, t_ns: int) -> None:
         """Updates who takes part in the session, and checks if a peer is away for too long.
 
-        A member is present while its token exists in the network, which the monitor observes.
+        A member is present while its liveliness token exists, which is observed by the monitor.
         The monitor also collects the events of new processes of peers that may join.
 
         Args:
@@ -156,7 +153,8 @@ class PeerAdmission:
 
         A peer whose connection was interrupted has not received the request, and drops the
         samples of this site as those of an unknown process. The request is repeated at most
-        once a second, until every peer whose samples arrive has confirmed samples of this site.
+        once per second, until every peer whose samples arrive has acknowledged samples of this
+        site.
 
         Args:
             t_ns: Present time, in ns since the epoch (the common start of the session).

@@ -1,12 +1,11 @@
-"""Follows which processes join a session, leave it, and end, while an arm is running.
+"""Keeps track of which processes join, leave and end a session while an arm is running.
 
-The members of a session are the sites, processes that control one arm each, and the recorders.
-A process draws a random number at its start, which distinguishes it from earlier and later
-processes with the same name.
+The members of a session are sites and recorders. Each process draws a random number at its
+start, which distinguishes it from earlier and later processes with the same name.
 
-A site learns about the other members in two ways. They publish events. In addition, each has a
-liveliness token in the network (Zenoh), which disappears when the process ends or its
-connection is lost.
+A site learns about the other members in two ways: through the events that they publish, and
+through their liveliness tokens in the network (Zenoh). A token disappears when its process ends
+or loses its connection.
 
 Invariant:
     - Two processes never act as the same site. A new process of a site is admitted only after
@@ -34,29 +33,28 @@ _INBOX_CAPACITY = 256
 class PeerMonitor:
     """Keeps track of the other members of a session for one site.
 
-    A site is the process that controls one arm, and a recorder is the process that writes the
-    log. Processes may crash, join late or be restarted while the arm runs.
-
-    The site calls `watch` ten times a second, and reads the attributes.
+    Processes may crash, join late or be restarted while the arm is running. The site calls
+    `watch` ten times per second, and reads the attributes.
 
     Args:
         bus: Network connection of the site.
         session: Name of the session.
         site: Name of the site.
-        peers: Names of its peers, the sites whose samples it receives.
+        peers: Names of its peers.
         admits: True if the scenario lets sites leave a running session and come back.
 
     Attributes:
-        boots: Boot (number of the process start) of each member of the session, by name.
-        recorders: Boots of the recorders (processes that store the log) that are present.
-        stored: Boots of the recorders that have stored all messages of this site.
-        ended_by: Sentence of the event with which a member ended the run for all. Empty if
+        boots: Mapping from the name of each member of the session to its boot (the number of
+            the process start).
+        recorders: Boots of the recorders that are present.
+        stored: Boots of the recorders that have stored all messages from this site.
+        ended_by: Sentence of the event with which a member ended the run for everyone. Empty if
             there is none.
         ended_member: Name of that member.
-        departed: For each site that has left, by its name: the time in ns since the epoch (the
-            common start of the session), and a sentence for the user.
-        admitted: Events with which sites announced their join, and that the site must still
-            apply.
+        departed: For each site that has left, the time in ns since the epoch (the common start
+            of the session) and a sentence for the user, keyed by name.
+        admitted: Events with which sites announced that they join, and which this site must
+            still apply.
         changed: True once a peer has published a change of its settings.
     """
 
@@ -100,19 +98,17 @@ class PeerMonitor:
 
     @property
     def all_stored(self) -> bool:
-        """True if every recorder that is present has stored all messages of this site.
+        """True if every recorder that is present has stored all messages from this site.
 
-        It is False if no recorder is present. The site, the process that controls the arm, may
-        then not end without losing data.
+        False if no recorder is present. Data may be lost if the site ends while this is False.
         """
         return bool(self.stored) and self.recorders <= self.stored
 
     def watch(self, publisher: EventPublisher, t_ns: int) -> None:
         """Updates the list of members, and publishes an event for each that joins or leaves.
 
-        A member is a process of the session: a site (process that runs one arm) or a recorder.
-        The control loop calls this ten times a second, so that crashed processes are noticed
-        soon.
+        The control loop calls this method ten times per second, so that crashed processes are
+        noticed quickly.
 
         Args:
             publisher: Publishes the events of this site.
@@ -178,7 +174,7 @@ class PeerMonitor:
                 self.departed[member] = (t_ns, sentence)
 
     def mark_present(self, member: str, t_ns: int) -> None:
-        """Marks a site as present because its samples arrive, although it seemed to be lost.
+        """Marks a site that seemed to be lost as present, because its samples are arriving.
 
         A site that has published its end is not marked. Neither is a site that has just left,
         because its last samples may still arrive.
@@ -311,16 +307,16 @@ class PeerMonitor:
         )
 
     def read_stored(self, ticks: int) -> bool:
-        """Receives the messages in which recorders confirm that they have stored all data.
+        """Processes the messages in which recorders confirm that they have stored all data.
 
-        After the run, the process of the arm waits for them, because recorders may request lost
-        messages again until then.
+        After the run, the site waits for these confirmations, because until then recorders may
+        still request lost messages.
 
         Args:
-            ticks: Number of ticks (periods of the control loop) that this site has executed.
+            ticks: Number of ticks that this site has executed.
 
         Returns:
-            True if at least one further recorder has confirmed since the last call.
+            True if at least one more recorder has confirmed since the last call.
         """
         confirmed_before = len(self.stored)
         for event in read_messages(self._recorder_events, Event):

@@ -1,11 +1,11 @@
 """Requests real-time settings from the operating system, such as priority and locked memory.
 
-A tick is one period of the control loop of an arm, and must start at a given time. The settings
-reduce the time by which ticks are late: binding to a processor, precise sleeping (timer slack),
-memory that is not swapped to disk, real-time scheduling, and no garbage collection.
+The ticks of an arm's control loop must start on time. The settings reduce how late they start:
+pinning to a processor, precise sleeping (timer slack), memory that is not swapped to disk,
+real-time scheduling, and no garbage collection.
 
 Invariant:
-    - If the operating system refuses a setting, the site continues without it.
+    - If the operating system denies a setting, the site continues without it.
     - The log contains the settings that each site has obtained, because they explain how
       punctual its ticks are.
 """
@@ -35,23 +35,23 @@ _MCL_ONFAULT = 4
 def prepare(cpu: int | None, sites: int = 1) -> dict[str, str]:
     """Requests all real-time settings for this process, such as priority and locked memory.
 
-    They make the control loop start its periods on time. Settings that the operating system
-    does not permit are left out.
+    The settings make the ticks of the control loop start on time. Those that the operating
+    system does not permit are left out.
 
     Args:
-        cpu: Processor to which the process is bound. If None, all processors are permitted.
-        sites: Number of sites of the session on this machine. If there are too many, the
-            scheduling stays normal.
+        cpu: Processor to which the process is pinned. If None, all processors may be used.
+        sites: Number of sites of the session on this machine. If there are too many, normal
+            scheduling is kept.
 
     Returns:
-        For each setting, by its name, a description of what was obtained, or the reason why it
-        was not obtained.
+        A mapping from each setting to a description of what was obtained, or to the reason why
+        it was not obtained.
     """
     cpus = os.cpu_count() or 1
     has_room = sites <= _SITES_PER_PROCESSOR * cpus
 
     def describe_crowded_machine() -> str:
-        """Returns why no real-time scheduling is requested: sites would share a processor.
+        """Explains why real-time scheduling is not requested on a crowded machine.
 
         Example: "normal (3 sites share 2 processors)".
         """

@@ -1,13 +1,13 @@
-"""Leaves a session: publishes how a run ended, and waits until the recorders have stored it.
+"""Leaves a session: publishes how the run ended, and waits until recorders have stored it.
 
 The last messages explain why a run ended, for example because an arm left its limits. They
-would be lost if the process of the arm ended while a recorder still misses messages.
+would be lost if the site ended while a recorder is still missing messages.
 
 Invariant:
     - After its last tick, the process continues until every recorder that is present has stored
-      all its messages, or until a time limit.
-    - The exit code of the process is determined by the run. A signal during the wait for the
-      recorders only ends the wait.
+      all its messages, or until a time limit is reached.
+    - The exit code of the process is determined by the run. A signal received while waiting for
+      the recorders only ends the wait.
 """
 
 import signal
@@ -68,14 +68,11 @@ def _summarise_loop(ticks: int, parts: SiteParts) -> str:
 class SiteEnd:
     """Ends a site: publishes the result, waits for the recorders, and informs the user.
 
-    A site is the process that controls one arm. After its last control period it still has
-    messages that the log needs.
-
     Args:
         parts: Parts of the site.
         publisher: Publishes the events of the site.
-        link_monitors: Timing monitors of the links, which know whether the peers (the other
-            sites) have received the last samples of this site.
+        link_monitors: Timing monitors of the links, which know whether the peers have received
+            the last samples of this site.
         output: Record of the last tick. None if no tick was executed.
         failure: Error that ended the run. None if there was none.
     """
@@ -100,15 +97,15 @@ class SiteEnd:
     def leave_session(self) -> int:
         """Publishes how the run ended, waits for the recorders, and tells the user the result.
 
-        The process of the arm stays until then, because the recorders may still request
-        messages that were lost on the network.
+        The process must stay until then, because the recorders may still request messages that
+        were lost on the network.
 
         Returns:
             Exit code of the process: 0, or 128 plus the number of the signal that ended the
             run.
 
         Raises:
-            PeerLeft: A peer left before the end and did not return.
+            PeerLeft: A peer left early and did not return.
             RunFailed: The run failed, at this site or at a peer.
         """
         parts = self._parts

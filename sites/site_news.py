@@ -1,11 +1,11 @@
 """Reports what happens at an arm: events for the log and other processes, lines for the user.
 
-While the control loop of the arm runs, a `SiteNews` publishes an event for each change that
-took effect, such as a new delay or a new mode, and prints alarms and a status line.
+While the control loop of the arm is running, a `SiteNews` publishes an event for each change
+that took effect, such as a new delay or a new mode, and prints alarms and a status line.
 
 Invariant:
     - Every event is published after the record of the tick to which it belongs.
-    - An event or alarm that would repeat in every tick is issued at most once a second.
+    - An event or alarm that would repeat in every tick is issued at most once per second.
 """
 
 from collections.abc import Sequence
@@ -36,11 +36,11 @@ _STATUS_PERIOD_S = 5
 class SiteNews:
     """Publishes the events of a running site, and prints lines for its user.
 
-    Events tell the recorder and the other processes what happened at this arm, for example that
-    it stopped because the network was interrupted.
+    Events inform the recorder and the other processes of what happened at this arm, for example
+    that it stopped because the network was interrupted.
 
     The control loop calls `report_tick` after ticks in which something changed, and
-    `publish_news` ten times a second.
+    `publish_news` ten times per second.
 
     Args:
         parts: Parts of the site.
@@ -63,11 +63,10 @@ class SiteNews:
         """Publishes an event for each change that took effect in a tick, such as a new delay.
 
         A new mode of the site, such as "fault", is also a change. Skipped ticks are only stored
-        here, because `publish_news` later publishes them together in one event. A tick is a
-        period of the control loop.
+        here; `publish_news` later publishes them together in one event.
 
         Args:
-            output: Record of the tick: what the site measured and computed.
+            output: Record of the tick.
         """
         parts = self._parts
         skipped = count_skipped_ticks(output.cmd)
@@ -137,7 +136,7 @@ class SiteNews:
     def publish_news(self, output: TickRecord) -> None:
         """Publishes events about what has happened since the last call, such as alarms.
 
-        The control loop calls this method ten times a second, between two periods. The status
+        The control loop calls this method ten times per second, between two ticks. The status
         line for the user is also printed when it is due.
 
         Args:
@@ -174,7 +173,7 @@ class SiteNews:
         news.clear()
 
     def publish_skipped(self, output: TickRecord) -> None:
-        """Publishes one event about all control periods (ticks) skipped since the last call.
+        """Publishes one event about all ticks skipped since the last call.
 
         Ticks are skipped only if the arm is external and the loop was late, because a real
         robot cannot catch up.

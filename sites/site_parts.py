@@ -1,14 +1,13 @@
-"""Creates everything that the process of an arm needs before it joins a session.
+"""Creates everything that a site needs before it joins a session.
 
-The process is called a site. `SiteParts` creates the arm and its control law in the simulation
-kernel, the queues for incoming messages, the publishers, the buffer from which lost messages
-are sent again, and whatever else the scenario requires. `site_process` then joins the session
-with these parts.
+`SiteParts` creates the arm and its control law in the simulation kernel, the queues for
+incoming messages, the publishers, the buffer from which lost messages are resent, and whatever
+else the scenario requires. `site_process` then joins the session with these parts.
 
 Invariant:
-    - When a `SiteParts` object has been created, all subscriptions of the site are declared and
-      its control step is compiled. A site announces itself only after that, so that it misses
-      no message and its first tick is not late.
+    - Once a `SiteParts` object has been created, all subscriptions of the site are declared and
+      its control step is compiled. A site announces itself only after that, so it misses no
+      message and its first tick is not late.
 """
 
 from collections.abc import Callable
@@ -61,22 +60,20 @@ from .site_loop import StateBlock
 
 @dataclass(frozen=True, slots=True)
 class SiteOptions:
-    """The user's options for how an arm's process joins a session and waits for others.
+    """The user's options for how a site joins a session and waits for others.
 
-    Such a process is called a site. The options come from the command line of `trilat site`.
+    The options are given on the command line of `trilat site`.
 
     Attributes:
         session: Name of the session.
         connection: Endpoints of the site, and keys.
         join_timeout_s: Longest wait for the start of the session, in s.
         needs_recorder: True if the session starts only when a recorder is present.
-        cpu: Processor to which the control loop is bound. If None, all processors are
-            permitted.
+        cpu: Processor to which the control loop is pinned. If None, all processors may be used.
         stay_s: Longest time for which the site stays after the run until the recorder has left,
             in s.
-        clock_offset_s: Offset that is added to the clock of the site, to emulate another
-            machine, in s.
-        clock_drift_ppm: Drift that is added to the clock of the site, in parts per million.
+        clock_offset_s: Offset added to the clock of the site to emulate another machine, in s.
+        clock_drift_ppm: Drift added to the clock of the site, in parts per million.
         without: Sites that the session does not wait for. They may join the running session.
         leave_timeout_s: How long the site continues after a peer has left and not returned, in
             s. If None, it continues until the end of the run.
@@ -95,10 +92,9 @@ class SiteOptions:
 
 
 class SiteParts:
-    """All objects of which a site consists: arm, control law, network queues and buffers.
+    """All objects that make up a site: arm, control law, network queues and buffers.
 
-    A site is a process that runs one arm and its control loop. The constructor creates the
-    objects that the scenario needs. All others are None.
+    The constructor creates the objects that the scenario needs. All others are None.
 
     Args:
         scenario: Scenario of the session.
@@ -116,11 +112,9 @@ class SiteParts:
         hand: The live operator, a person or program that moves the arm.
         step: Function that computes one tick. If the control law is the user's own, the
             watchdog measures its computing time.
-        rings: Queues of the samples, the states that the peers publish, in the order of the
-            links.
+        rings: Queues of the samples from the peers, in the order of the links.
         buffer: Recent messages, for recorders that missed them.
-        states: Records (results of ticks of the control loop) that wait to be sent to the
-            recorders.
+        states: Records that are waiting to be sent to the recorders.
         monitor: Presence of the other members of the session.
         changes: Requests to change something during the run.
     """
@@ -325,7 +319,7 @@ class SiteParts:
         publish = self.bus.publisher(self._key(channel))
 
         def store_and_publish(payloads: list[bytes]) -> None:
-            """Stores messages for requests to send them again, and publishes them in blocks.
+            """Stores messages so that they can be resent, and publishes them in blocks.
 
             Args:
                 payloads: The encoded messages.
@@ -340,9 +334,9 @@ class SiteParts:
     def pop_changes(self, tick: int) -> list[CoreChange]:
         """Returns the changes of settings or mode that the site applies in the next tick.
 
-        Some changes were requested by users. Others come from an external arm, a robot or
-        simulator outside of this program: ticks (periods of the control loop) were skipped, the
-        arm has become silent, or its dead-man switch was released or is held again.
+        Some changes were requested by users. Others are caused by an external arm: ticks were
+        skipped, the arm has become silent, or its dead-man switch was released or is held
+        again.
 
         Args:
             tick: Number of the tick.
@@ -429,10 +423,10 @@ WARM_UP_TICKS = 200
 def warm_up(scenario: Scenario, name: str, clock: Clock | None = None) -> None:
     """Executes the control loop of a temporary site, so that all code is compiled.
 
-    The first ticks (periods of the control loop) of the actual site would otherwise be late.
+    Otherwise, the first ticks of the actual site would be late.
 
     Args:
-        scenario: The scenario, which describes the arms, their links and the run.
+        scenario: The scenario.
         name: Name of the site.
         clock: Clock of this process. If None, a clock is created.
 

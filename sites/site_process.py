@@ -1,14 +1,13 @@
 """Runs the process of one arm in a session: joins, controls the arm, and leaves.
 
-The process is called a site. `run_site` connects to the network, builds the parts of the site,
-agrees with the other members on the epoch (the time of tick 0), runs the control loop, and
-waits until the recorders have stored everything. The loop is in `running_site`, the end in
-`site_end`.
+`run_site` connects to the network, builds the parts of the site, agrees with the other members
+on the epoch (the time of tick 0), runs the control loop, and waits until the recorders have
+stored everything. The loop is in `running_site`, the end in `site_end`.
 
 Invariant:
     - A site announces itself only after it has declared its subscriptions and compiled its
-      control step. A site that is announced can thus be expected to execute its first tick in
-      time, and to receive all messages.
+      control step. A site that has been announced is therefore ready to execute its first tick
+      on time and to receive all messages.
     - The arm is braked until the epoch.
 """
 
@@ -49,9 +48,8 @@ def run_site(
 ) -> int:
     """Runs the control loop of one arm as a member of a session, from its start to its end.
 
-    Such a process is called a site. It waits for the other sites of the scenario, exchanges the
-    state of its arm with them over the network in every control period, and publishes its
-    results for the recorder.
+    The site waits for the other sites of the scenario, exchanges the state of its arm with them
+    over the network in every tick, and publishes its results for the recorder.
 
     Args:
         scenario: Scenario of the session.
@@ -65,8 +63,8 @@ def run_site(
     Raises:
         SessionError: The session could not begin.
         UsageError: An endpoint cannot be used.
-        ScenarioError: The user's control law cannot be imported or differs from the law that
-            the scenario names, or the scenario lacks the limits of an external arm.
+        ScenarioError: The user's control law cannot be imported or differs from the law named
+            in the scenario, or the scenario lacks the limits of an external arm.
         RunFailed: The run diverged, the user's law failed, or the arm fell silent.
     """
     check_outside_arms(scenario)
@@ -132,10 +130,10 @@ class _LinePrinter:
         self._thread.join(1.0)
 
     def put(self, text: str) -> None:
-        """Queues a line that another thread prints, without waiting for the terminal.
+        """Queues a line to be printed by another thread, without waiting for the terminal.
 
-        A control loop must not wait for a slow terminal. The line is lost if too many lines
-        wait already.
+        A control loop must not wait for a slow terminal. The line is dropped if too many lines
+        are already waiting.
 
         Args:
             text: The line.
@@ -163,7 +161,7 @@ def join_and_run(parts: SiteParts) -> int:
         parts: Parts of the site, such as its network connection and its arm.
 
     Returns:
-        Exit code of the process, as `run_site` returns it.
+        Exit code of the process, as returned by `run_site`.
 
     Raises:
         SessionError: The session could not begin.

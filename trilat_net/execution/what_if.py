@@ -5,15 +5,14 @@ For example, one can repeat a session with a higher damping at the slave:
     result = rerun("run.mcap", replace=["s"], set={"control.Kd": 5})
     result.sites["s"].error_rms_rad, result.after["s"].q
 
-In open loop, only the replaced sites (the controllers of arms) are executed. The other sites
-keep their records and do not react. In closed loop, every site is executed, and each sample
-(the state that a site sends to the others) takes as long through the network as it did in the
-log.
+In open loop, only the replaced sites are executed. The other sites keep their records and do
+not react. In closed loop, every site is executed, and each sample spends as much time in the
+network as it did in the log.
 
 Invariant:
-    - Without changed settings, both modes reproduce the log, bit for bit.
-    - A figure such as the mean error is computed from the log and from the rerun over the same
-      times, at which the log contains a record and the rerun executed a tick (control period).
+    - Without changed settings, both modes reproduce the log bit for bit.
+    - A quantity such as the mean error is computed from the log and from the rerun over the
+      same ticks: those that have a record in the log and were executed in the rerun.
 """
 
 import io
@@ -56,11 +55,11 @@ from .virtual import SiteChannels, SiteEntry, render_accounts
 
 
 class LogAndRerun(NamedTuple):
-    """A figure, such as an error, of a recorded run and of its repetition with changes.
+    """A quantity, such as an error, in the recorded run and in its rerun.
 
     Attributes:
         before: Value in the log.
-        after: Value in the rerun, the repeated execution with possibly changed settings.
+        after: Value in the rerun.
     """
 
     before: float
@@ -138,8 +137,8 @@ class _LinkEffect(NamedTuple):
     def differs(self) -> bool:
         """True if the delays on a network link differ between the recorded and the new run.
 
-        The delay is measured as the age of the received data when they are used. Its mean and
-        its largest value are compared.
+        The delay is measured as the age of the received data when they are used. The mean and
+        the maximum are compared.
         """
         return any(pair.before != pair.after for pair in (self.age_mean_ms, self.age_max_ms))
 
@@ -163,14 +162,13 @@ class _CommonRecords(NamedTuple):
     after_rows: Ints
 
     def compare(self, figure: Callable[[Array], float], field: str) -> LogAndRerun:
-        """Computes the same number from the records of the log and of the rerun.
+        """Computes the same quantity from the records of the log and of the rerun.
 
-        A rerun executes a log again, and a record contains the values of one tick (period of
-        the control loop). Only ticks with a record in both are used.
+        Only ticks that have a record in both are used.
 
         Args:
-            figure: Function that computes the number from values of shape (K, n), for K records
-                with n values each.
+            figure: Function that computes the quantity from an array of shape (K, n), for K
+                records with n values each.
             field: Name of the field of the records that contains the values.
         """
         before = figure(getattr(self.before, field)[self.before_rows])
@@ -314,17 +312,18 @@ def _compare_links(
 
 @dataclass(frozen=True, repr=False)
 class Rerun(Result):
-    """A log and the result of executing some or all of its sites (arm controllers) again.
+    """A log and the result of re-executing some or all of its sites.
 
-    The function `rerun` creates it. It can be shown, written as a log of its own, or converted
-    to plain values.
+    Created by the function `rerun`. The result can be displayed, written as a log of its own,
+    or converted to plain values.
 
     Attributes:
-        before: The log that was executed again.
+        before: The log that was re-executed.
         request: Executed sites and changed settings.
-        ticks: Every tick (control period) of every executed site, in the order of execution.
-        sites: Effect on each executed site, by the name of the site.
-        links: Effect on each link that ends at an executed site, by the name of the link.
+        ticks: Every tick of every executed site, in order of execution.
+        sites: Mapping from the name of each executed site to the effect on it.
+        links: Mapping from the name of each link that ends at an executed site to the effect on
+            it.
     """
 
     before: Log
@@ -334,10 +333,9 @@ class Rerun(Result):
     links: dict[str, _LinkEffect]
 
     def headline(self) -> str:
-        """Returns one line for the user that describes the repeated run.
+        """Returns a one-line description of the rerun for the user.
 
-        The line names the log, the way of execution, the sites (processes that each run one
-        arm) that were executed, and the settings that were changed.
+        It names the log, the kind of rerun, the executed sites and the changed settings.
         """
         changes = "; ".join(self.request.describe_changes()) or "nothing changed"
         executed = f"{self.request.mode}, {', '.join(self.request.replaced)} executed"
@@ -345,10 +343,9 @@ class Rerun(Result):
 
     @cached_property
     def after(self) -> Log:
-        """The repeated run in the form of a log, so that it can be analysed like any log.
+        """The rerun as a log, which can be analysed like any other log.
 
-        Sites (arm controllers) that were executed appear as they were computed now, and other
-        sites as they were recorded.
+        Executed sites appear as newly computed, and all other sites as recorded.
         """
         stream = io.BytesIO()
         self.write(stream)
@@ -356,21 +353,21 @@ class Rerun(Result):
         return open_log(stream)
 
     def write(self, stream: Sink, views_hz: float = 0.0) -> None:
-        """Writes the rerun to a stream in the form of a log.
+        """Writes the rerun to a stream as a log.
 
-        Such a log can be read, displayed and checked like the log of a run. The records of
-        executed sites contain no measured values, such as computing times and round trips.
-        Recorded sites are copied byte for byte. The file states the SHA-256 hash of its source
-        log, the executed sites and the changes. Its scenario is that of the rerun.
+        The log can be read, displayed and checked like that of a run. The records of executed
+        sites contain no measured values, such as computing times and round trips. Recorded
+        sites are copied byte for byte. The file states the SHA-256 hash of its source log, the
+        executed sites and the changes. Its scenario is that of the rerun.
 
         Args:
             stream: Stream to which the log is written. It is not closed.
-            views_hz: Rate of the additional channels for viewers, in Hz, see
-                `offer_views`. 0 means none.
+            views_hz: Rate of the additional channels for viewers, in Hz, see `offer_views`. 0
+                means none.
 
         Raises:
-            LogError: The start time that the log states is not a time.
-            LogRefused: The disk refused to store the log.
+            LogError: The start time stated in the log is not a valid time.
+            LogRefused: Writing to the disk failed.
         """
         log = self.before
         request = self.request
@@ -403,7 +400,7 @@ class Rerun(Result):
         writer.finish(render_accounts(channels.values()))
 
     def save(self, path: Path, *, force: bool = False) -> None:
-        """Writes the repeated run as a log to a file, which viewers can also display.
+        """Writes the rerun to a file as a log, including channels for viewers.
 
         Args:
             path: File to which the log is written.
@@ -411,14 +408,14 @@ class Rerun(Result):
 
         Raises:
             UsageError: The file exists, or cannot be created.
-            LogRefused: The disk refused to store the log.
+            LogRefused: Writing to the disk failed.
         """
         with LogFile(path, force=force) as stream:
             self.write(stream, VIZ_HZ)
 
     @property
     def diverged(self) -> bool:
-        """True if an arm left its limits in the repeated run, but not in the recorded run."""
+        """True if an arm left its limits in the rerun, but not in the recorded run."""
         return any(
             effect.diverged_at_s is not None and self.before[name].states[-1].mode != "diverged"
             for name, effect in self.sites.items()
@@ -426,15 +423,15 @@ class Rerun(Result):
 
     @property
     def identical(self) -> bool:
-        """True if the repeated run gave the same bits in every record that was compared."""
+        """True if every compared record of the rerun is bit-identical to the log."""
         return all(effect.identical == effect.compared for effect in self.sites.values())
 
     @property
     def broken(self) -> bool:
-        """True if the rerun differs from the log although it should have the same bits.
+        """True if the rerun differs from the log although it should be bit-identical.
 
-        This indicates an error of the program or a damaged log. The bits should be the same
-        under three conditions:
+        This indicates a program error or a damaged log. The rerun should be bit-identical if
+        all of the following hold:
 
         - The log was written on this platform.
         - No setting was changed.
@@ -448,7 +445,7 @@ class Rerun(Result):
 
     @property
     def notes(self) -> list[str]:
-        """Sentences for the user about the limits of a repeated run.
+        """Sentences for the user about the limitations of the rerun.
 
         For example, records may have been copied because the log was incomplete. Empty if there
         is nothing to mention.
@@ -456,17 +453,14 @@ class Rerun(Result):
         return list(_describe_limits(self))
 
     def to_rows(self) -> list[dict[str, Any]]:
-        """Returns a table of differences between the repeated and the recorded run, for JSON.
+        """Returns a table of differences between the rerun and the recorded run, for JSON.
 
-        It has one row for each site (process that runs one arm) that was executed again.
+        The table has one row per re-executed site.
         """
         return list(self.to_dict()["sites"].values())
 
     def to_dict(self) -> dict[str, Any]:
-        """Returns the result of a repeated run as plain values, ready for JSON.
-
-        The keys are those that `trilat rerun --json` prints.
-        """
+        """Converts the result to plain JSON values, with the keys of `trilat rerun --json`."""
         return {
             "log": self.before.source,
             "mode": self.request.mode,
@@ -490,7 +484,7 @@ def rerun(
     closed_loop: bool = False,
     progress: Progress | None = None,
 ) -> Rerun:
-    """Executes sites of a log again, usually with changed settings, and compares the results.
+    """Re-executes sites of a log, usually with changed settings, and compares the results.
 
     The corresponding command is `trilat rerun`.
 
@@ -504,13 +498,13 @@ def rerun(
             react.
         set: Changed settings of these sites, for example `{"control.Kd": 5}`.
         closed_loop: If True, all sites are executed, and `replace` must be empty.
-        progress: Function that is called now and then with the number of executed ticks, and an
-            upper bound on their total.
+        progress: Function that is called from time to time with the number of executed ticks,
+            and an upper bound on their total.
 
     Raises:
         LogError: The log cannot be read, or does not contain enough to execute the sites.
         UsageError: The sites are not named, or are named in two ways.
-        ScenarioError: There is no such site, or a change is not valid or cannot have an effect.
+        ScenarioError: There is no such site, or a change is invalid or cannot have an effect.
         CodeWithheld: The control law of an executed site is code that may not run.
     """
     before = log if isinstance(log, Log) else open_log(log)
