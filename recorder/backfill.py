@@ -1,16 +1,15 @@
-"""Requests messages again from their sender if they were lost on the network.
+"""Requests messages that were lost on the network from their sender again.
 
-The process of each arm (the site) publishes numbered messages, and the recorder writes them to
-a log. A gap in the numbers shows that a message was lost. If the last messages are lost, there
-is no gap. Therefore, if nothing arrives from a site for a while, the recorder requests the
-newest messages of that site (a probe). The functions do not wait. They receive the present time
-as an argument.
+Sites publish numbered messages, which the recorder writes to a log. A gap in the numbers shows
+that a message was lost. Losing the last messages leaves no gap. If nothing arrives from a site
+for a while, the recorder therefore requests the newest messages of that site (a probe). The
+functions never wait, and receive the present time as an argument.
 
 Invariant:
     - At most one request to a site is open at a time.
     - No request for missing messages is sent if no message is missing.
     - A message that the site no longer has is not requested again.
-    - Messages from the buffer of the site pass the same checks as published messages.
+    - Messages from the buffer of the site undergo the same checks as published messages.
 """
 
 from collections import Counter
@@ -73,10 +72,10 @@ class _OpenRequest(NamedTuple):
 
 
 class GapRepair:
-    """Requests messages that were lost on the network again from the site that sent them.
+    """Requests messages that were lost on the network from the site that sent them.
 
-    A site is the process that controls one arm. It keeps its recent messages in a buffer.
-    Without repair, the log would have gaps. An object serves one start of the site.
+    A site keeps its recent messages in a buffer for this purpose. Each object serves one start
+    of a site.
 
     Args:
         bus: Network connection of the recorder.
@@ -85,12 +84,12 @@ class GapRepair:
         site: Name of the site.
         boot: Random number that identifies the start of the site. None if the site has not
             appeared yet.
-        dropped: Numbers of dropped messages by reason. Invalid replies are added.
+        dropped: Mapping from reason to number of dropped messages. Invalid replies are added.
         now_ns: Present time on the monotonic clock, in ns.
         before: Repair of the previous start of the site. None for the first start.
 
     Attributes:
-        reception: Received messages of the site. It knows which numbers are missing.
+        reception: Messages received from the site, which determine the missing numbers.
     """
 
     def __init__(
@@ -135,7 +134,7 @@ class GapRepair:
 
     @property
     def is_active(self) -> bool:
-        """True if messages are missing that the site may still have, or if a reply is awaited.
+        """True if messages are missing that the site may still have, or if a reply is pending.
 
         The recorder then checks for replies more often than it writes to the disk.
         """
@@ -145,13 +144,12 @@ class GapRepair:
     def progress_ns(self) -> int:
         """Time at which the last missing message arrived, on the monotonic clock, in ns.
 
-        If this time lies far in the past, the site probably has none of the missing messages
-        any more.
+        If this was long ago, the site probably no longer has any of the missing messages.
         """
         return self._progress_ns
 
     def follow_start(self, boot: int) -> "GapRepair":
-        """Returns the repair of the next start of the site, which continues the counts.
+        """Returns the repair for the next start of the site, which continues the counts.
 
         Args:
             boot: Random number that identifies the next start.
@@ -169,23 +167,22 @@ class GapRepair:
     def probe(self) -> None:
         """Makes `poll` request the newest messages of every channel of the site.
 
-        The messages of a channel are numbered. Therefore a message reveals whether earlier ones
-        were lost. The loss of the last messages is revealed only by this request.
+        Because messages are numbered, each one shows whether earlier ones were lost. The loss
+        of the last messages can only be detected with this request.
         """
         self._probes = set(SITE_CHANNELS)
 
     def poll(self, now_ns: int, *, alive: bool) -> Iterator[RepairedMessage]:
-        """Receives the replies of the site, and sends the next request if messages are missing.
+        """Receives replies from the site, and sends the next request if messages are missing.
 
-        The recorder calls this regularly for each site, the process that runs one arm. The
-        method does not wait for replies.
+        The recorder calls this method regularly for each site. It never waits for replies.
 
         Args:
             now_ns: Present time on the monotonic clock, in ns.
-            alive: True if the site is present on the network, so that it can reply.
+            alive: True if the site is present on the network and can reply.
 
         Yields:
-            The messages of the replies. Nothing if no reply has arrived.
+            The messages contained in the replies. Nothing if no reply has arrived.
         """
         if now_ns - self._polled_ns > SILENT_NS:
             # Nothing could arrive while this process was suspended, so the site was not silent.

@@ -1,14 +1,13 @@
 """Runs the recorder: a process that joins a session, writes its messages, and ends with it.
 
-The processes of a session, which each control one arm (the sites), publish the state of their
-arms, typically a thousand times per second. The recorder writes these messages to a log. Each
-site keeps its recent messages in a buffer, from which the recorder requests those that it
-missed.
+Sites publish the state of their arms, typically a thousand times per second, and the recorder
+writes these messages to a log. Each site keeps its recent messages in a buffer, from which the
+recorder requests those that it missed.
 
 Invariant:
-    - No message is lost that has arrived, or that a site still has in its buffer.
-    - Messages get the time of their arrival and wait in one bounded queue. One thread writes
-      them.
+    - A message is never lost once it has arrived, or while a site still has it in its buffer.
+    - Messages are stamped with their time of arrival and wait in a single bounded queue. One
+      thread writes them.
     - The file is flushed about every 65 ms, and completed whenever the process ends without a
       crash.
     - The first signal, such as Ctrl-C, ends the recorder after it has received the messages
@@ -80,9 +79,9 @@ CollectProvenance = Callable[[], Mapping[str, str]]
 
 
 class Recorder:
-    """Process that records one session: joins it, writes its messages, and completes the log.
+    """Records one session: joins it, writes its messages, and completes the log.
 
-    The recorder is a process of its own, so that a slow disk cannot delay the control loops of
+    The recorder runs in its own process, so that a slow disk cannot delay the control loops of
     the arms.
 
     Args:
@@ -91,11 +90,11 @@ class Recorder:
         session: Name of the session.
         boot: Random number that identifies this start of the recorder.
         storage: Place where the log is written.
-        read_scenario: Function that reads the text of the session's scenario.
-        provenance: Facts about this program that the log contains.
+        read_scenario: Function that parses the text of the session's scenario.
+        provenance: Information about this program that is stored in the log.
         stopped: Function that returns True if the recorder must end at once.
         say: Function that prints a line for the user.
-        is_ending: Function that returns True if the recorder must end when it has the messages
+        is_ending: Function that returns True if the recorder must end once it has the messages
             that the sites still have, or after `END_NS`.
     """
 
@@ -138,17 +137,18 @@ class Recorder:
         )
 
     def join(self, timeout_s: float | None) -> Epoch | None:
-        """Waits until the session begins, or joins a session that is running already.
+        """Waits until the session begins, or joins a session that is already running.
 
-        All processes of a session, the recorder included, first agree on a common start time.
+        All members of a session, including the recorder, first agree on a common start time.
 
         Args:
-            timeout_s: Longest time to wait, in s. If None, there is no limit.
+            timeout_s: Longest wait, in s. If None, there is no limit.
 
         Returns:
-            The common start time of the session, and the boot number of each member, which
-            identifies a start of its process. None if the recorder has to stop before the
-            session begins.
+            The common start time of the session, and the boot of each member (the number that
+            identifies a start of its process). None if the recorder has to stop before the
+            session
+            begins.
 
         Raises:
             SessionError: The session did not begin in time.
@@ -171,10 +171,7 @@ class Recorder:
         return None
 
     def record(self, epoch: Epoch) -> Recording:
-        """Writes the messages of the session to the log file until the session ends.
-
-        A session is a group of processes that each control one arm. They publish their results
-        on the network, and the recorder stores them in a log, an MCAP file.
+        """Writes the messages of the session to the log (an MCAP file) until the session ends.
 
         Args:
             epoch: Common start time of the session.
@@ -184,12 +181,12 @@ class Recorder:
 
         Raises:
             UsageError: The file cannot be created.
-            LogRefused: The disk refused the data. The error states which part is saved.
+            LogRefused: Writing to the disk failed. The error states which part is saved.
         """
         scenario, make_views = self._find_scenario(epoch)
 
         def open_part(stream: Sink, part: Mapping[str, str]) -> LogWriter:
-            """Creates the writer for one MCAP file. A long log is divided into several files.
+            """Creates the writer for one MCAP file. A long log is split into several files.
 
             Args:
                 stream: The open file.
@@ -368,23 +365,19 @@ def record_session(
 ) -> int:
     """Records a session in this process, from finding it on the network to the finished log.
 
-    A session is a group of processes (sites) that each control one arm. They publish the
-    results of every control period, which the recorder writes to an MCAP file.
-
     Args:
         session: Name of the session.
-        storage: Place where the log is written.
+        storage: Place where the log (an MCAP file) is written.
         connection: How to connect to the session, see `connect_to_session`.
-        read_scenario: Function that reads the text of the session's scenario.
-        collect_provenance: Function that returns the facts about this program that the log
-            contains. It is called once the recorder is connected.
-        join_timeout_s: Longest time to wait until the session begins, in s. If None, there is
-            no limit.
+        read_scenario: Function that parses the text of the session's scenario.
+        collect_provenance: Function that returns the information about this program that is
+            stored in the log. It is called once the recorder is connected.
+        join_timeout_s: Longest wait for the session to begin, in s. If None, there is no limit.
         clock: Clock of the recorder.
         say: Function that prints a line for the user.
         afterwards: Function that processes the finished log, unless the session was
-            interrupted. The recorder remains a member of the session until then. Sites with
-            `--stay` wait for that.
+            interrupted. The recorder remains a member of the session until it returns, and
+            sites with `--stay` wait for that.
         warn: Function that is called when the connection is open, to warn the user of risks.
 
     Returns:

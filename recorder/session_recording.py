@@ -1,18 +1,17 @@
 """Records one session: writes its messages, finds missing ones, and publishes statistics.
 
-The messages come from sites, the processes that each run one arm. A site may be started again
-while the session runs. Each start has a boot, a random number that identifies it, and the new
-start continues the numbers of the records, the messages with the state of the arm in each
-period of its control loop.
+A site may be restarted while the session is running. Each start is identified by its boot (a
+random number). The numbering of the records continues across starts.
 
 Invariant:
     - A message of the session is written once, byte for byte. Any other message is counted as
       dropped, with the reason.
-    - The recorder publishes the event "stored" about a site when it has every message of the
+    - The recorder publishes the event "stored" about a site once it has every message from the
       site that can still be obtained. A site that has ended waits for this event, but only for
       a limited time.
-    - Statistics are published and recorded once a second, with a bounded size. All times are
-      measured by the monotonic clock. If the wall clock is set, only the statistics show it.
+    - Statistics are published and recorded once per second, with a bounded size. All times are
+      measured with the monotonic clock. If the wall clock is set, this is visible only in the
+      statistics.
 """
 
 from collections import Counter
@@ -64,15 +63,16 @@ class Recording:
         epoch: Common start time of the session, and the boots of its members. A boot is a
             random number that identifies one start of a process.
         bus: Network connection of the recorder.
-        publisher: Publishes the recorder's own events. It also puts them into the queue of the
+        publisher: Publishes the recorder's own events. It also puts them into the queue of
             received messages, so that they are recorded.
 
     Attributes:
         session: Name of the session.
         epoch: Common start time of the session, and the boots of its members.
         publisher: Publishes the recorder's own events.
-        accounts: For each channel, the counts of received and missing messages, by key.
-        dropped: Number of messages that were not written, by the reason.
+        accounts: Mapping from the key of each channel to the counts of received and missing
+            messages.
+        dropped: Mapping from reason to the number of messages that were not written.
     """
 
     def __init__(
@@ -148,7 +148,7 @@ class Recording:
         The recorder publishes the event "late" with the time at which it joins, and an event
         "lost" for each site that is not present. The sites keep their messages in buffers for
         some time. The newest messages of each site are requested (a probe), and their numbers
-        then show which earlier messages are missing. `write` requests those as well.
+        show which earlier messages are missing. `write` then requests those too.
 
         Args:
             now_ns: Present time on the monotonic clock, in ns.
@@ -167,16 +167,15 @@ class Recording:
             repair.probe()
 
     def assume_gone(self) -> None:
-        """Regards every site as gone until the network reports that it is present.
+        """Treats every site as gone until the network reports that it is present.
 
-        A site is a process that controls one arm. A recorder that joins a running session
-        cannot know which sites have left before. If it expected messages of such a site, it
-        would wait forever.
+        A recorder that joins a running session cannot know which sites have already left. If it
+        expected messages from such a site, it would wait forever.
         """
         self._gone_sites = set(self._sites)
 
     def write(self, queue: InboundQueue, now_ns: int) -> None:
-        """Writes the messages that have arrived into the log, and requests missing messages.
+        """Writes the messages that have arrived to the log, and requests missing messages.
 
         A site that has ended waits until the recorder has all its messages. As soon as this is
         the case, the recorder publishes the event "stored" for the site.
@@ -199,17 +198,16 @@ class Recording:
     def is_repairing(self) -> bool:
         """True while messages are missing that may still be obtained from their sender.
 
-        This is so if a site that has the messages is still present, or if the recorder waits
-        for its reply to a request. The log is not closed in the meantime.
+        This is the case if a site that has the messages is still present, or if its reply to a
+        request is pending. The log is not closed in the meantime.
         """
         return any(repair.is_active for repair in self._repairs.values())
 
     @property
     def repaired_ns(self) -> int:
-        """Time at which the latest missing message of any site arrived, in ns.
+        """Arrival time of the latest recovered message, on the monotonic clock, in ns.
 
-        It is a time of the monotonic clock. A recorder that ends stops waiting for missing
-        messages if this time lies too far in the past.
+        If this was too long ago, a recorder that is ending stops waiting for missing messages.
         """
         return max(repair.progress_ns for repair in self._repairs.values())
 
@@ -507,19 +505,19 @@ class Recording:
             self._writer.add(key, payload, sent_ns, log_time_ns, number, event)
 
     def note_presence(self, key: str, alive: bool) -> None:
-        """Notes that a site appeared on the network, or disappeared from it.
+        """Registers that a site has appeared on the network or disappeared from it.
 
-        The network announces each start of a site by a token, which disappears with the
+        The network announces each start of a site with a token, which disappears with the
         process.
 
-        A token may belong to another start than the one that is being recorded: an earlier one,
-        or one that may be recorded later. It says nothing about the recorded start. But its
-        disappearance is noted in case that start is recorded later, because the network does
-        not report it again (`_admit_starts`). The number of such notes is limited.
+        A token may belong to a start other than the one being recorded: an earlier one, or one
+        that may be recorded later. It does not affect the recorded start. Its disappearance is
+        noted anyway, since the other start may be recorded later and the network will not
+        report the disappearance again (`_admit_starts`). The number of such notes is limited.
 
         Args:
-            key: Key of the token, which contains the name of the site and the boot, the random
-                number that identifies the start.
+            key: Key of the token, which contains the name of the site and the boot (the random
+                number that identifies the start).
             alive: True if the token appeared, False if it disappeared.
         """
         token = topics.parse_key(key)
@@ -566,16 +564,13 @@ class Recording:
         return last_message_ns
 
     def is_over(self, now_ns: int) -> bool:
-        """Determines whether the recording can end, because no site can send any more messages.
+        """Returns True if the recording can end, because no site can send any more messages.
 
+        For every site, either all messages must be stored, or the site must be gone for good.
         The recorder then completes the log file and ends.
 
         Args:
             now_ns: Present time on the monotonic clock, in ns.
-
-        Returns:
-            True if, for every site, either all messages are stored or the site is gone for
-            good.
         """
         # Every site is examined, because `_has_left` notes the time at which a site
         # disappeared.
@@ -619,18 +614,18 @@ class Recording:
         return now_ns - absent_since_ns > wait_ns
 
     def is_up_to_date(self, ending_ns: int, now_ns: int) -> bool:
-        """Determines whether the recorder has every message that the sites have sent by now.
+        """Determines whether the recorder has every message that the sites have sent so far.
 
-        The recorder calls this method repeatedly after it was told to end while the session
-        still runs. A site is a process that runs one arm. There are three cases for each site:
+        The recorder calls this method repeatedly after it was told to end while the session is
+        still running. There are three cases for each site:
 
-        - The site has left: no more messages of it are expected (`_has_left`).
-        - The site runs and sends messages. Its messages are numbered. Gaps in the numbers show
-          which messages are missing. If there are no gaps `SETTLE_NS` after the recorder was
-          told to end, the messages that were in transit at that time have arrived.
+        - The site has left, and no more messages are expected from it (`_has_left`).
+        - The site is running and sending messages, whose numbers show which messages are
+          missing. If there are no gaps `SETTLE_NS` after the recorder was told to end, the
+          messages that were in transit at that time have arrived.
         - Otherwise, the site has ended or is silent, but has not left. It may have sent
-          messages of which the recorder knows nothing, or the last check of its messages is
-          still pending. The recorder then waits until the site runs again or has left.
+          messages unknown to the recorder, or the last check of its messages may still be
+          pending. The recorder then waits until the site is running again or has left.
 
         Args:
             ending_ns: Time at which the recorder was told to end, on the monotonic clock, in
@@ -638,7 +633,7 @@ class Recording:
             now_ns: Present time on the monotonic clock, in ns.
 
         Returns:
-            True if every site has left, or runs and has no missing message.
+            True if every site has left, or is running with no missing messages.
         """
         may_be_in_transit = now_ns - ending_ns <= SETTLE_NS
         for name, site in self._sites.items():
@@ -653,10 +648,10 @@ class Recording:
         return True
 
     def flush(self) -> None:
-        """Passes all messages in the memory of this process to the operating system.
+        """Passes all messages buffered in this process to the operating system.
 
-        After this call they are in the file even if this process crashes. Without it, a crash
-        would lose the messages since the last call.
+        They are then in the file even if this process crashes. Otherwise, a crash would lose
+        the messages since the last call.
         """
         self._writer.flush()
 
@@ -667,7 +662,7 @@ class Recording:
 
         Args:
             queue: Queue of the received messages.
-            rest: True to first write the messages that still wait in the queue.
+            rest: True to first write the messages that are still in the queue.
         """
         if rest:
             self._drain(queue, None)
@@ -675,15 +670,15 @@ class Recording:
         self._writer.finish(self.render_accounts(queue))
 
     def render_accounts(self, queue: InboundQueue) -> dict[str, str]:
-        """Formats the numbers of received and missing messages as text to be stored in the log.
+        """Formats the numbers of received and missing messages for storage in the log.
 
-        A reader of the log can see from these numbers whether the log is complete.
+        They show a reader of the log whether it is complete.
 
         Args:
-            queue: Queue of the received messages, which counts those for which it had no room.
+            queue: Queue of the received messages, which counts those that it could not hold.
 
         Returns:
-            A line for each topic, and the number of dropped messages for each reason.
+            One line per topic, and the number of dropped messages for each reason.
         """
         # Counts of the events of earlier starts of a site, by key.
         event_accounts = {}
@@ -703,9 +698,8 @@ class Recording:
     def render_summary(self) -> list[str]:
         """Returns lines that tell the user at the end whether the log is complete.
 
-        Returns:
-            A line for each site with the numbers of its records, and a line for each reason why
-            messages were not written.
+        There is one line per site with the numbers of its records, and one line for each reason
+        why messages were not written.
         """
         lines = [self._summarize_site(site) for site in self._sites.values()]
         if self._overflowed:
@@ -744,14 +738,15 @@ class Recording:
         return line
 
     def describe_problem(self) -> str | None:
-        """Returns the first problem of the recording, which becomes the recorder's error text.
+        """Returns the first problem of the recording, which becomes the recorder's error.
 
-        The recorder ends with an error if the log is not complete, so that nobody uses an
-        incomplete log unknowingly. A site is a process that controls one arm.
+        The recorder ends with an error if the log is incomplete, so that nobody uses an
+        incomplete log unknowingly.
 
         Returns:
-            A sentence about a site that disappeared or lacks messages. None if there is no
-            problem.
+            A sentence about a site that disappeared or whose messages are missing, or None if
+            there
+            is no problem.
         """
         for name, site in self._sites.items():
             if site.final_ticks is None:
@@ -772,9 +767,9 @@ _ALL_GAPS = 600
 
 
 class RecorderReport:
-    """Publishes statistics of a recording once a second, such as its size and missing messages.
+    """Publishes statistics of a recording once per second, such as its size and losses.
 
-    They show a person who watches the session whether the log is complete and how large it is.
+    During the session, they show whether the log is complete and how large it is.
 
     Args:
         bus: Network connection of the recorder.
@@ -803,9 +798,9 @@ class RecorderReport:
         self._due_ns = clock.monotonic_ns() + REPORT_EVERY_NS
 
     def note_flush(self, duration_ns: int) -> None:
-        """Notes how long the operating system took to accept the written messages.
+        """Registers the time the operating system took to accept the written messages, in ns.
 
-        A slow disk first shows up in these times. The next statistics state the longest one.
+        A slow disk first shows up in these times. The next statistics contain the longest one.
 
         Args:
             duration_ns: The time, in ns.
@@ -813,11 +808,7 @@ class RecorderReport:
         self._flush_max_ns = max(self._flush_max_ns, duration_ns)
 
     def poll(self) -> None:
-        """Publishes the statistics of the recording if they are due, once a second.
-
-        The statistics state, for example, the size of the log and the numbers of missing
-        messages.
-        """
+        """Publishes the statistics of the recording if due, which is once per second."""
         now_ns = self._clock.monotonic_ns()
         if now_ns < self._due_ns:
             return
@@ -828,10 +819,10 @@ class RecorderReport:
         self.publish()
 
     def publish(self) -> None:
-        """Publishes the statistics of the recording now, and also writes them into the log.
+        """Publishes the statistics of the recording now, and also writes them to the log.
 
-        People see losses during the session, and readers of the log see them afterwards. The
-        longest duration of a flush is reset for the next statistics.
+        They show losses during the session, and to readers of the log afterwards. The longest
+        duration of a flush is reset for the next statistics.
         """
         payload = encode(self._make_stats())
         self._flush_max_ns = 0
