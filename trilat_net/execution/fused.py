@@ -183,7 +183,7 @@ class FusedRun(CompiledRun):
 
 
 def _read_changes(log: Log) -> list[tuple[int, int, CoreChange]]:
-    """Returns the changes of all sites in order of time, in the form of `RunInputs`."""
+    """Returns the changes of all sites in order of time, in the format of `RunInputs`."""
     timed_changes = []
     for i, name in enumerate(log.scenario.names):
         rate_hz = log[name].rate_hz
@@ -195,14 +195,14 @@ def _read_changes(log: Log) -> list[tuple[int, int, CoreChange]]:
 
 
 def _read_arrivals(log: Log, ticks: int) -> tuple[IntArray, IntArray, int]:
-    """Returns the arrivals of a log in the form of `ReplayedInputs`.
+    """Returns the arrivals from a log, in the format of `ReplayedInputs`.
 
     For each site and peer, the samples are sorted by the tick in which they are delivered. An
-    index states for each tick which sample of this list is the first to be delivered in it.
+    index gives, for each tick, the first sample in this list that is delivered in it.
 
     Args:
         log: The log.
-        ticks: Largest number of ticks of a site.
+        ticks: Largest number of ticks of any site.
 
     Returns:
         The index (`first`), the ticks of the samples (`samples`), and the largest time from the

@@ -34,7 +34,7 @@ from .verification import VerifyResult, verify_log
 from .virtual_comparison import compare_with_virtual
 
 _MAX_GAPS_NAMED = 60
-"""Largest number of gaps that a finding lists."""
+"""Maximum number of gaps that a finding lists."""
 
 
 @dataclass(frozen=True, repr=False)
@@ -157,7 +157,7 @@ class LogCheckReport(CheckReport):
 
 
 def _to_range(gap: tuple[str, int, int]) -> dict[str, Any]:
-    """Returns a range of ticks as plain values."""
+    """Converts a range of ticks to plain values."""
     site, first, last = gap
     return {"site": site, "first": first, "last": last}
 
@@ -165,13 +165,13 @@ def _to_range(gap: tuple[str, int, int]) -> dict[str, Any]:
 def _check_log(
     log: Log, result: VerifyResult, *, virtual: bool, progress: Progress | None
 ) -> Iterator[Finding]:
-    """Yields the finding of each check that applies to a log.
+    """Yields one finding for each check that applies to a log.
 
-    A finding says what was checked, what the result is, and whether the log passes.
+    A finding states what was checked, the result, and whether the log passes.
 
     Args:
         log: The log.
-        result: Result of executing the log again.
+        result: Result of re-executing the log.
         virtual: If True, the log is also compared with virtual time.
         progress: Function that reports the progress of this comparison.
     """
@@ -223,20 +223,20 @@ def _check_virtual_time(
 ) -> Iterator[Finding]:
     """Yields the findings of the comparison of a log with two simulations of its scenario.
 
-    The simulations run in virtual time, without real clocks and without a network. They differ
-    in how a sample, the state that one site sends to another, arrives:
+    The simulations run in virtual time, without real clocks or a network. They differ in how
+    samples arrive:
 
     - "virtual time fed with the log's arrivals": each sample arrives when it did in the log.
-      All records must be equal, up to the first gap of the log.
+      All records must be equal, up to the first gap in the log.
     - "plain virtual time": each sample arrives at once. The records must be equal up to the
-      first sample that the real network delivered too late or lost. This simulation is left out
-      if the run differs from it by its nature, for example because an arm was external. This is
+      first sample that the real network lost or delivered too late. This simulation is omitted
+      if the run necessarily differs from it, for example because an arm was external. This is
       not a fault of the log, so the finding passes.
 
     Args:
         log: The log.
-        result: Result of executing the log again.
-        progress: Function that reports the progress of the comparison. None if progress is not
+        result: Result of re-executing the log.
+        progress: Function that reports the progress of the comparison. If None, progress is not
             reported.
     """
     comparison = compare_with_virtual(log, progress)
@@ -270,12 +270,11 @@ def _check_virtual_time(
 def _check_coverage(log: Log, result: VerifyResult) -> Finding:
     """Returns the finding about records that are missing from the log.
 
-    The log fails if too small a fraction of the ticks (control periods) of a site (arm
-    controller) could be compared.
+    The log fails if too small a fraction of the ticks of any site could be compared.
 
     Args:
         log: The log.
-        result: Result of executing the log again.
+        result: Result of re-executing the log.
     """
     coverage = result.coverage
     if coverage.expected:
@@ -303,17 +302,16 @@ def _check_coverage(log: Log, result: VerifyResult) -> Finding:
 
 
 def _check_execution(result: VerifyResult, recorded: str) -> Finding:
-    """Returns the finding that says whether executing the log again gave the same records.
+    """Returns the finding on whether re-executing the log gave the same records.
 
-    A record is the stored result of one tick, a period of the control loop of a site. The text
-    of the finding begins with the number of identical records. Every circumstance that limits
+    The text of the finding begins with the number of identical records. Everything that limits
     the comparison is appended: missing records, ticks that a site did not execute because it
-    had left the session, sites that were not executed again, records that could not be judged,
-    and differences.
+    had left the session, sites that were not re-executed, records that could not be judged, and
+    differences.
 
     Args:
-        result: Result of executing the log again.
-        recorded: Subject and verb of a sentence on sites whose records were copied, such as
+        result: Result of re-executing the log.
+        recorded: Subject and verb of a sentence about sites whose records were copied, such as
             "m1 stands". Empty if all sites were executed.
     """
     withheld = ""
@@ -354,20 +352,20 @@ def _check_execution(result: VerifyResult, recorded: str) -> Finding:
 
 
 def _add_memory_advice(finding: Finding, log: Log, result: VerifyResult) -> Finding:
-    """Adds advice about user-defined control laws with hidden state to a finding.
+    """Adds advice to a finding about user-defined control laws that may have hidden state.
 
-    A law may store something outside of the records (results of control periods), such as an
-    attribute of its object. If an entire run is executed again, it repeats this hidden state,
-    so that all records agree. Only a site (arm controller) that is restored from its records
-    lacks the hidden state. The advised command tests this.
+    A law may store something outside the records, such as an attribute of its object. If an
+    entire run is re-executed, the hidden state is reproduced, so all records agree. Only a site
+    that is restored from its records lacks the hidden state. The recommended command tests
+    this.
 
     Args:
         finding: Finding of a check.
         log: Log of the run.
-        result: Result of executing the log again, without restoring sites from records.
+        result: Result of re-executing the log, without restoring sites from records.
 
     Returns:
-        The finding, with the advice if it says that whole runs of users' laws agree.
+        The finding, with the advice if it states that whole runs of users' laws agree.
     """
     files = list(dict.fromkeys(str(law.file) for law in find_user_laws(log.scenario)))
     have_runs_agreed = finding.check == "executed again" and finding.passed and result.whole_run
@@ -385,19 +383,18 @@ def _add_memory_advice(finding: Finding, log: Log, result: VerifyResult) -> Find
 
 
 def _join_names(names: Sequence[str]) -> str:
-    """Returns the names of sites as a list for a sentence, such as "m1, m2 and s"."""
+    """Joins the names of sites for use in a sentence, such as "m1, m2 and s"."""
     *before, last = names
     return f"{', '.join(before)} and {last}" if before else last
 
 
 def _describe_gaps(gaps: Sequence[tuple[str, int, int]]) -> str:
-    """Returns the ranges of missing control periods (ticks) of each site as text.
+    """Lists the ranges of missing ticks of each site, such as "m1 3-7, 12; s 5".
 
-    An example is "m1 3-7, 12; s 5". At most `_MAX_GAPS_NAMED` ranges are listed. Further ones
-    are counted.
+    At most `_MAX_GAPS_NAMED` ranges are listed. The rest are only counted.
 
     Args:
-        gaps: Site (arm controller), first tick (control period) and last tick of each range.
+        gaps: Site, first tick and last tick of each range.
     """
     texts = []
     remaining = _MAX_GAPS_NAMED

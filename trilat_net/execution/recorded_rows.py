@@ -20,9 +20,9 @@ from ..log import IndexedRecords, Log, SiteLog
 from ..records import NS_PER_S
 
 BLOCK_ROWS = 1 << 14
-"""Largest number of records that are executed again together."""
+"""Maximum number of records that are re-executed together."""
 LEAST_ROWS = 8
-"""Smallest number of records for which the compiled loop is faster than single ticks."""
+"""Minimum number of records for which the compiled loop is faster than single ticks."""
 _FIRST_TARGET = 3
 """First column of the target in the field `hand`, after grip, number and source."""
 _MASK_64 = (1 << 64) - 1
@@ -80,10 +80,9 @@ def _find_samples(
     counts: IntArray, entries: IntArray, peers: IntArray, rows: IntArray, arrivals: IntArray,
     is_complete: NDArray[np.bool_],
 ) -> None:  # fmt: skip
-    """Determines the ticks for which the log contains the content of all arrived samples.
+    """Determines the ticks for which the log contains the content of all samples received.
 
-    A sample is the state that another site (arm controller), a peer, sent. The record of a tick
-    (control period) lists only the senders of the samples and the ticks in which they were
+    The record of a tick only lists the senders of the samples and the ticks in which they were
     sent.
 
     Args:
@@ -91,9 +90,10 @@ def _find_samples(
         entries: Peer, tick and latency of all N arrivals, shape (N, 3).
         peers: Index of each peer in `rows`.
         rows: Rows of samples, see `SampleTable`.
-        arrivals: Receives peer, tick and row of each arrival, shape (N, 3). The row is -1 if
-            the log does not contain the sample.
-        is_complete: Set to False for records with such arrivals, or with too many of them.
+        arrivals: Output array for peer, tick and row of each arrival, shape (N, 3). The row is
+            -1 if the log does not contain the sample.
+        is_complete: Output array. Set to False for records with such arrivals, or with too many
+            arrivals.
     """
     n = 0
     for k in range(counts.shape[0]):
@@ -133,7 +133,7 @@ class PlainRows:
         samples: SampleTable,
         resume_every: int = 0,
     ) -> None:
-        """Stores the records of a site. Received messages are looked up on first use."""
+        """Stores the records of a site. Received samples are looked up on first use."""
         self._site_log = site_log
         self._indexed = indexed
         self._samples = samples
@@ -174,10 +174,9 @@ class PlainRows:
         return max(0, stop - row)
 
     def _is_first_of_run(self, row: int) -> bool:
-        """True if a record is complete although it does not follow the record before it.
+        """Returns True if a record is complete but does not follow the previous record.
 
-        Compiled code can execute a series of recorded control periods that starts at such a
-        record.
+        Compiled code can execute a series of recorded ticks that begins with such a record.
         """
         return bool(self._is_complete[row])
 
@@ -185,8 +184,8 @@ class PlainRows:
     def _stops(self) -> IntArray:
         """Indices of all records before which compiled code must stop, in ascending order.
 
-        Such a record lacks an input of its control period, or does not follow the record before
-        it. Slower code then continues.
+        Such a record lacks an input of its tick, or does not follow the previous record. Slower
+        code then takes over.
         """
         follows = np.zeros(len(self._site_log), np.bool_)
         ticks = self._site_log.tick
@@ -195,7 +194,7 @@ class PlainRows:
 
     @cached_property
     def _is_complete(self) -> NDArray[np.bool_]:
-        """For each record, whether all inputs of its tick are in the log, shape (K,)."""
+        """For each record, True if all inputs of its tick are in the log, shape (K,)."""
         ticks = self._site_log.tick
         nominal_times_ns = ticks * NS_PER_S // self._site_log.rate_hz
         # The compiled loop applies no changes of settings, and computes the nominal times.
@@ -222,8 +221,9 @@ class PlainRows:
     def _memory(self) -> tuple[IntArray, IntArray]:
         """Internal states of the control law and its site in all records (their field `mem`).
 
-        The first array has the index of the first number of each record in the second array,
-        and the total length, shape (K + 1,). The second array has the bits of the numbers.
+        The first array contains the index of each record's first element in the second array,
+        followed by the total length, shape (K + 1,). The second array contains the bit patterns
+        of the elements.
         """
         counts, bits = self._indexed.memory_words
         return _sum_before(counts), bits
@@ -273,7 +273,7 @@ class PlainRows:
 
 
 def _sum_before(counts: IntArray) -> IntArray:
-    """Returns where each of K lists begins if all lists are stored one after another.
+    """Returns where each of K lists begins if all lists are concatenated.
 
     For the lengths [2, 0, 3], the result is [0, 2, 2, 5]. The last entry is the total length.
     """
@@ -281,7 +281,7 @@ def _sum_before(counts: IntArray) -> IntArray:
 
 
 def _read_hands(block: IndexedRecords) -> Array:
-    """Returns the actions of a live operator, a person or program that moved the arm.
+    """Returns the actions of a live operator (a person or program that moved the arm).
 
     For m target coordinates, the shape is (K, 1 + 2 m): firmness of the grip, target, and the
     position that the target would reach after one second.

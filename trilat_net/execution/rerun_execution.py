@@ -51,19 +51,19 @@ from .verification import (
 from .virtual_network import Deliveries
 
 RerunOverrides = Mapping[str, Any] | Sequence[str]
-"""Changed settings, either by key or as texts "KEY=VALUE"."""
+"""Changed settings: a mapping from key to value, or strings of the form "KEY=VALUE"."""
 
 _TEXT_KEYS = ("name", "title", "about", "assumed", "expect")
-"""Keys of a scenario that describe it and have no effect on a run."""
+"""Keys that describe a scenario and have no effect on a run."""
 
 
 class _ChangedValue(NamedTuple):
-    """One setting, such as a gain, that differs between a recorded run and its repetition.
+    """One setting, such as a gain, that differs between a recorded run and its rerun.
 
     Attributes:
-        key: Dotted path of the value in the resolved scenario, for example of a gain.
+        key: Dotted path of the setting in the resolved scenario.
         before: Value with which the log was recorded.
-        after: Value that the rerun uses.
+        after: Value used in the rerun.
     """
 
     key: str
@@ -184,12 +184,13 @@ class RerunRequest:
 
 
 def _refuse_external_sites(original: Scenario, replaced: Sequence[str]) -> None:
-    """Rejects the repetition of a site whose arm is a real robot or a user's program.
+    """Raises ScenarioError if the arm of a site to be re-executed is external.
 
-    The log does not show how such an arm would have reacted to other torques.
+    The log does not show how a real robot or a user's program would have reacted to different
+    torques.
 
     Raises:
-        ScenarioError: A site that is to be executed again has such an arm.
+        ScenarioError: A site that is to be re-executed has such an arm.
     """
     for name in original.external:
         if name not in replaced:
@@ -206,9 +207,7 @@ def _refuse_external_sites(original: Scenario, replaced: Sequence[str]) -> None:
 def _check_key(key: str, replaced: Sequence[str], recorded: Sequence[str]) -> None:
     """Rejects a changed setting that cannot have an effect in a rerun.
 
-    A rerun executes some sites (arm controllers) of a log again, and copies the records
-    (results of control periods) of the others. For example, a setting of a site whose records
-    are copied has no effect.
+    For example, a setting of a site whose records are copied has no effect.
 
     Args:
         key: Dotted path of the setting, such as "sites.m1.control.Kd".
@@ -244,10 +243,10 @@ def _check_key(key: str, replaced: Sequence[str], recorded: Sequence[str]) -> No
 def _check_recorded_limits(
     original: Scenario, requested: Scenario, recorded: Sequence[str]
 ) -> None:
-    """Rejects changes of a rerun that the recorded arrivals of samples do not cover.
+    """Rejects changes to a rerun that are not covered by the recorded arrivals of samples.
 
-    Such changes are other sites (arm controllers), a longer duration, and other tick rates if
-    some sites are not executed.
+    These are different sites, a longer duration, and different tick rates if some sites are not
+    executed.
 
     Args:
         original: Scenario of the log.
@@ -281,16 +280,14 @@ def _join_scenarios(
 ) -> Scenario:
     """Returns the requested scenario, but with the original settings of the recorded sites.
 
-    A rerun executes some sites (arm controllers) of a log again with the requested settings.
-    The recorded sites are not executed and keep their settings. These include the links over
-    which they receive, and the planned changes of these links and of their dominance factors
-    (how strongly a site follows each other site).
+    The executed sites use the requested settings. The recorded sites keep their own settings,
+    which include the links over which they receive, and the planned changes of these links and
+    of their dominance factors.
 
     Args:
         original: Scenario of the log.
         requested: Scenario with the changes.
-        recorded: Names of the sites that are not executed, and keep their records (results of
-            control periods).
+        recorded: Names of the sites that are not executed, and keep their records.
     """
 
     def choose(site: str) -> Scenario:
@@ -313,7 +310,7 @@ def _join_scenarios(
 
 
 def _find_changes(original: Scenario, other: Scenario) -> list[_ChangedValue]:
-    """Returns the settings that differ between two scenarios, with both values of each."""
+    """Returns the settings that differ between two scenarios, with both of their values."""
     before = dict(flatten_table(msgspec.to_builtins(original)))
     after = dict(flatten_table(msgspec.to_builtins(other)))
     return [
@@ -327,9 +324,9 @@ def _describe_changes(request: RerunRequest) -> Iterator[tuple[str, str, str]]:
     """Yields the parts of a description for every change.
 
     The keys of changed values have the form group.owner.key, for example "sites.m1.control.Kd",
-    "links.m1->s.delay_ms" or "dominance.s.m1". Keys without an owner, such as "duration_s",
-    concern the whole scenario. If another link model or control law replaces that of the log,
-    several values of the same owner differ. They are described together, once.
+    "links.m1->s.delay_ms" or "dominance.s.m1". Keys with no owner, such as "duration_s", apply
+    to the whole scenario. If a link model or control law is replaced, several values of the
+    same owner differ. They are described once, together.
 
     Yields:
         The subject ("link" or the name of a key), its owner (a link or site, or empty for the
@@ -362,12 +359,12 @@ def _describe_replacement(
     Args:
         request: The request.
         group: First part of the changed key, for example "links".
-        owner: Second part of the key: a link or a site (arm controller).
+        owner: Second part of the key: a link or a site.
         key: Rest of the key.
 
     Returns:
-        Subject, owner and text, see `_describe_changes`. None if the change concerns a single
-        value.
+        Subject, owner and text, see `_describe_changes`. None if only a single value is
+        changed.
     """
     original = request.original
     changed = request.scenario
@@ -389,7 +386,7 @@ def _describe_replacement(
 
 
 def _shorten(value: object) -> str:
-    """Returns a value as a string. A list of tables is represented by its length only."""
+    """Formats a value as a string. For a list of tables, only its length is stated."""
     if isinstance(value, list) and value and isinstance(value[0], dict):
         return f"{len(value)} {'entry' if len(value) == 1 else 'entries'}"
     return describe_value(value)
@@ -424,26 +421,25 @@ class RerunTick(NamedTuple):
 
 
 class _RerunSite:
-    """Executes one site (arm controller) of a log again, tick (control period) by tick.
+    """Re-executes one site of a log, tick by tick.
 
-    The state of the site is certain if it follows from the ticks before. It becomes uncertain
-    after a gap in the log. Then records are copied until two consecutive records determine the
+    The state of the site is certain if it follows from the previous ticks. It becomes uncertain
+    after a gap in the log. Records are then copied until two consecutive records determine the
     state again.
 
     Args:
         log: The log.
         request: Executed sites and changed settings of the rerun.
         name: Name of the site.
-        deliveries: The ticks in which samples of other sites arrive at this one.
-        samples: Samples of all sites, by site and tick. A sample is the state that a site
-            publishes in one tick. The samples of executed sites appear in it while they are
-            computed.
+        deliveries: The ticks in which samples from other sites arrive at this one.
+        samples: Samples of all sites, keyed by site and tick. The samples of executed sites are
+            added as they are computed.
 
     Attributes:
         name: Name of the site.
         k: Number of the next tick.
         output: Record of the last tick.
-        deliveries: The ticks in which samples of other sites arrive at this one.
+        deliveries: The ticks in which samples from other sites arrive at this one.
         first: First difference from the records of the log. None if no record differs so far.
         lacking: Number of samples that arrived, but whose content is missing from the log.
         diverged: True after the arm of the site has left its limits.
@@ -459,11 +455,7 @@ class _RerunSite:
         deliveries: Deliveries,
         samples: Mapping[str, Mapping[int, ReceivedMotion]],
     ) -> None:
-        """Creates a site in its initial state, and collects its recorded inputs from the log.
-
-        A site is the controller of one arm. A rerun repeats a recorded run with something
-        changed.
-        """
+        """Creates a site in its initial state, and collects its inputs from the log."""
         site_log = log[name]
         scenario = request.scenario
         setup = scenario.setup(name)
@@ -551,9 +543,9 @@ class _RerunSite:
         return tick
 
     def _skip_gap(self) -> None:
-        """Continues at the next record of an incomplete log, without the unknown ticks before.
+        """Continues at the next record of an incomplete log, skipping the ticks before it.
 
-        If there is no further record, the site (arm controller) is done.
+        If there are no more records, the site is done.
         """
         index = bisect.bisect_right(self._recorded_ticks, self.k)
         self.k = self._last_tick + 1
@@ -562,10 +554,10 @@ class _RerunSite:
         self._certain = False
 
     def _execute(self, row: int | None) -> RerunTick:
-        """Executes the next tick (control period), and compares it with the record of the log.
+        """Executes the next tick, and compares it with the record in the log.
 
-        The inputs of the tick are the samples that arrive according to `deliveries`, and the
-        changes and the operator's actions in the log.
+        The inputs of the tick are the samples that arrive according to `deliveries`, together
+        with the changes and the operator's actions in the log.
 
         Args:
             row: Index of the record. None if the log does not contain a record of the tick.
@@ -624,7 +616,7 @@ class _RerunSite:
     def _keep_record(self, row: int) -> RerunTick:
         """Copies the record of the next tick from the log, because it cannot be executed.
 
-        The state of the site (arm controller) is not known afterwards.
+        The state of the site is unknown afterwards.
 
         Args:
             row: Index of the record in the log.
@@ -669,9 +661,9 @@ class RerunExecution:
     """
 
     def __init__(self, log: Log, request: RerunRequest) -> None:
-        """Creates the sites that are executed again, and connects them with each other.
+        """Creates the sites that are re-executed, and connects them to each other.
 
-        A site (arm controller) then receives what the others compute, not what was recorded.
+        They receive what the other sites compute now, not what was recorded.
         """
         self._log = log
         self._request = request
@@ -693,14 +685,12 @@ class RerunExecution:
         }
 
     def _find_deliveries(self, name: str) -> Deliveries:
-        """Determines in which tick of a site each sample of the other sites arrives.
+        """Determines in which tick of a site each sample from the other sites arrives.
 
-        A sample is the state that a site (arm controller) sends in one tick, a period of its
-        control loop. There are three cases:
+        There are three cases:
 
-        - No setting was changed: the samples arrive as the records (results of control periods)
-          of the site list them.
-        - Settings were changed: arrivals in ticks without a record are assumed.
+        - No setting was changed: the samples arrive as listed in the records of the site.
+        - Settings were changed: arrivals in ticks without a record are estimated.
         - Tick rates were changed: in addition, all arrivals are converted to the new rates.
 
         Raises:
@@ -771,9 +761,9 @@ class RerunExecution:
                 progress(executed, total)
 
     def _keep_sample(self, site: _RerunSite) -> None:
-        """Stores the newest state of an executed site, which its peers will receive.
+        """Stores the newest sample of an executed site, which its peers will receive.
 
-        States that are too old to arrive are removed.
+        Samples that are too old to arrive are removed.
         """
         output = site.output
         recent = self._recent[site.name]
@@ -782,13 +772,12 @@ class RerunExecution:
             del recent[next(iter(recent))]
 
     def _find_ready(self, pending: Sequence[tuple[int, int, int]]) -> int:
-        """Chooses the site that executes its next tick, by its index in a list.
+        """Chooses the site that executes its next tick.
 
-        A tick (control period) can be executed once all samples that arrive in it are known.
-        The earliest such tick is chosen. If no tick is ready, because each site (arm
-        controller) waits for a sample of another site, the earliest tick is chosen
-        nevertheless, because the execution must continue. The missing samples then count as not
-        contained in the log.
+        A tick can be executed once all samples that arrive in it are known. The earliest such
+        tick is chosen. If no tick is ready because every site is waiting for a sample from
+        another site, the earliest tick is chosen anyway, since the execution must continue. The
+        missing samples are then treated as not contained in the log.
 
         Args:
             pending: Next tick of each executed site that has not finished, as (time in ns,
@@ -804,14 +793,14 @@ class RerunExecution:
         return 0  # the earliest
 
     def _is_ready(self, receiver: str, k: int) -> bool:
-        """True if a site does not have to wait for samples that arrive in its next tick.
+        """Returns True if all samples that arrive in a site's next tick are known.
 
-        A sample is the state that a sender publishes in one tick (control period). It is ready
-        if the sender has executed this tick, or has finished and never will. The samples of a
-        sender that is not executed in this rerun are in the log, so they are always ready.
+        A sample is ready if the sender has executed the tick that produces it, or has finished
+        and never will. The samples of a sender that is not executed are in the log, so they are
+        always ready.
 
         Args:
-            receiver: Name of the site (arm controller).
+            receiver: Name of the site.
             k: Number of its next tick.
         """
         sender_names = self._log[receiver].peers

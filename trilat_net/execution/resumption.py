@@ -25,17 +25,16 @@ from ..net import RESTING_MODES, State
 from ..records import NS_PER_S, Arrival, TickRecord
 
 _LOOK_BACK = 100
-"""Number of records before a gap that are searched for the newest arrived sample."""
+"""Number of records before a gap that are searched for the newest sample received."""
 
 Change = TypeVar("Change")
 
 ArrivalEntry = Sequence[int]
-"""Arrival in the form of a record's `rx`: index of the peer, tick of its sample, latency in us.
-"""
+"""Arrival in the format of a record's `rx`: peer index, tick of the sample, latency in us."""
 
 
 ReceivedMotion = State | Arrival
-"""Sample of a peer: a record of the log, or a newly computed arrival."""
+"""Sample from a peer: a record in the log, or a newly computed arrival."""
 
 
 def make_arrival(
@@ -150,10 +149,7 @@ class RecordedInputs(Generic[Change]):
         links: Sequence[LinkSetup],
         states: Sequence[State] | None = None,
     ) -> None:
-        """Collects what a site received in a recorded run, before its first control period.
-
-        These are the samples (states that other sites sent) and the changes of settings.
-        """
+        """Collects what a site received in a recorded run: samples and changes of settings."""
         self._site_log = site_log
         self._states = site_log.states if states is None else states
         self._links = links
@@ -303,12 +299,11 @@ class RecordedInputs(Generic[Change]):
         site.restore_state(before_last, last)
 
     def _find_in_use(self, peer: int, used_tick: int, coordinates: int) -> Arrival | None:
-        """Returns the sample of a peer that the site used in its last tick before a gap.
+        """Returns the sample from a peer that the site used in its last tick before a gap.
 
-        A sample is the state that a peer, another site (arm controller), sent in one of its
-        ticks (control periods). If the log does not contain it, a sample of zeros takes its
-        place. This happens only for a site that holds a position of its own and therefore does
-        not use the sample, see `can_resume`. The sample is remembered in `lacking`.
+        If the log does not contain the sample, it is replaced by a sample of zeros and listed
+        in `lacking`. This happens only for a site that holds a position of its own and
+        therefore does not use the sample, see `can_resume`.
 
         Args:
             peer: Index of the peer.
@@ -316,7 +311,7 @@ class RecordedInputs(Generic[Change]):
             coordinates: Number of coordinates of the sample.
 
         Returns:
-            The sample. None before the first sample.
+            The sample, or None before the first sample.
         """
         sample = self.samples[peer].get(used_tick)
         if sample is None:
@@ -355,11 +350,10 @@ class RecordedInputs(Generic[Change]):
     def _find_waiting(
         self, row: int, peer: int, used_tick: int, rate_hz: int
     ) -> tuple[set[int], set[int]]:
-        """Finds received states that were still delayed by a link at the time of a record.
+        """Finds received samples that were still delayed by a link at the time of a record.
 
-        A sample, the state that a peer (another site) sends, waits at the receiver until the
-        delay of the link has passed. If records are missing from the log, it is not certain
-        which samples had arrived.
+        A sample waits at the receiver until the delay of the link has passed. If records are
+        missing from the log, it is uncertain which samples had arrived.
 
         Args:
             row: Index of the record, among the records of the receiver.
@@ -370,8 +364,10 @@ class RecordedInputs(Generic[Change]):
 
         Returns:
             Ticks of the samples that certainly arrived, because an earlier record lists them,
-            and ticks of samples that probably arrived. The second kind is in no record, and is
-            older than the given record or than the first sample that a later record lists.
+            and
+            ticks of samples that probably arrived. The latter are in no record, and are older
+            than
+            the given record or than the first sample listed in a later record.
         """
         states = self._states
         t_ns = states[row].t_ns
@@ -402,13 +398,9 @@ class RecordedInputs(Generic[Change]):
         return certain_ticks, probable_ticks
 
     def _find_newest_listed(self, row: int, peer: int) -> int:
-        """Returns the newest state of a peer that the latest records of a site list.
+        """Returns the tick of the newest sample from a peer in the latest records of a site.
 
-        The site has received this state. A peer is another site (arm controller).
-
-        Returns:
-            Tick of the sample. -1 if these records (results of control periods) list no sample
-            of the peer.
+        -1 if these records list no sample from the peer.
         """
         newest = -1
         for state in self._states[max(0, row - _LOOK_BACK) : row]:
@@ -419,11 +411,11 @@ class RecordedInputs(Generic[Change]):
 
     @cached_property
     def _listings(self) -> "list[_PeerListing]":
-        """Index of the records that list samples from each peer (site that sends samples).
+        """Index of the records that list samples from each peer.
 
-        The record of a tick (control period) lists the samples (sent states) that arrived in
-        this tick. The index answers two questions quickly: in which record is a sample listed
-        first, and which sample does the next record after a gap list.
+        The record of a tick lists the samples that arrived in this tick. The index makes it
+        fast to find the first record that lists a given sample, and the sample listed by the
+        next record after a gap.
         """
         listings = [_PeerListing(first_rows={}, rows=[], first_ticks=[]) for _ in self.samples]
         for row, state in enumerate(self._states):
@@ -442,14 +434,12 @@ class RecordedInputs(Generic[Change]):
 
 
 class _PeerListing(NamedTuple):
-    """Index of the records of a site that list received states of one peer.
-
-    A peer is another site (arm controller).
+    """Index of the records of a site that list samples received from one peer.
 
     Attributes:
-        first_rows: For the tick (control period) of each sample, the row of the first record
-            that lists it.
-        rows: Rows of all records that list a sample of the peer, in ascending order.
+        first_rows: Mapping from the tick of each sample to the row of the first record that
+            lists it.
+        rows: Rows of all records that list a sample from the peer, in ascending order.
         first_ticks: For each of these rows, the tick of the first sample that the record lists.
     """
 

@@ -20,7 +20,7 @@ from .fused import FusedRun
 from .virtual import SimulatedLog
 
 _BLOCK_TICKS = 4096
-"""Number of ticks of the fastest site after which the records are copied."""
+"""Interval at which the records are copied, in ticks of the fastest site."""
 
 
 def simulate_columns(scenario: Scenario) -> Log:
@@ -65,13 +65,14 @@ def simulate_columns(scenario: Scenario) -> Log:
 
 
 def _is_described_by_columns(scenario: Scenario) -> bool:
-    """Returns True if arrays from the simulation describe a run completely, without a log.
+    """Returns True if the arrays computed by the simulation describe a run completely.
 
-    Only a written log contains changes of settings, the actions of live operators, the motions
-    of objects in an environment, and the modes of a site that reacts to missing samples.
+    Some information exists only in a written log: changes of settings, the actions of live
+    operators, the motion of objects in an environment, and the modes of a site that reacts to
+    missing samples.
 
     Args:
-        scenario: Description of the experiment.
+        scenario: The scenario.
     """
     if scenario.timeline or any(link.outages_s for link in scenario.links.values()):
         return False

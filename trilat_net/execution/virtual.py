@@ -110,7 +110,7 @@ class SiteChannels:
     """
 
     def __init__(self, scenario: Scenario, session: str, site: str, boot: int) -> None:
-        """Prepares the numbering of a site's messages. No message has been written yet."""
+        """Prepares the numbering of a site's messages. No message is written yet."""
         settings = scenario.sites[site]
         self.peers = scenario.peers(site)
         self.keys = {channel: topics.key(session, site, channel) for channel in SITE_CHANNELS}
@@ -152,7 +152,7 @@ class SiteChannels:
         return entries
 
     def _make_mode_entry(self, output: TickRecord, law_failure: Exception | None) -> SiteEntry:
-        """Returns the event of a change of the site's mode, for example after a fault."""
+        """Returns the event for a change of the site's mode, for example after a fault."""
         text = describe_mode(self._site, output, glides=self._glides, law_failure=law_failure)
         kind = "diverged" if output.mode is Mode.DIVERGED else "mode"
         return self.make_new_event_entry(kind, text, output.t_ns)
@@ -160,13 +160,12 @@ class SiteChannels:
     def _exclude_skipped_ticks(self, tick: int, cmd: Sequence[str]) -> None:
         """Excludes the ticks that a site skipped from the counts of missing messages.
 
-        A site (arm controller) skips ticks if its control loop has fallen behind. It publishes
-        nothing for these ticks. The next record (result of a control period) states their
-        number among its commands.
+        A site skips ticks if its control loop has fallen behind, and publishes nothing for
+        these ticks. Their number is stated among the commands in the next record.
 
         Args:
             tick: Tick of the record.
-            cmd: Texts of the commands in the record.
+            cmd: Text of each command in the record.
         """
         skipped = count_skipped_ticks(cmd)
         if not skipped:
@@ -335,13 +334,13 @@ class SiteTick(NamedTuple):
 
 
 ChangeSchedule = Mapping[str, Mapping[int, Sequence[CoreChange]]]
-"""Changes, by site and by the tick at which they take effect."""
+"""Changes, keyed by site and by the tick at which they take effect."""
 PlantSchedule = Mapping[str, Mapping[int, PlantState]]
-"""Measured state of each external arm, by site and tick."""
+"""Measured states of external arms, keyed by site and tick."""
 HandTracks = Mapping[str, Callable[[Site, int], Sequence[float]]]
 """For each site with a live operator, a function that returns the operator's action in a tick.
 
-Its arguments are the site and the number of the site's next tick.
+The function receives the site and the number of the site's next tick.
 """
 
 
@@ -372,9 +371,8 @@ def check_virtual(scenario: Scenario) -> None:
 def _find_skips(commands: Mapping[int, Sequence[CoreChange]]) -> dict[int, int]:
     """Finds the ticks that a site skipped because its control loop was too late.
 
-    A site is a process that runs one arm, and a tick is a period of its control loop. The
-    record (result of a control period) of the next executed tick states the number of skipped
-    ticks, in the form of a change.
+    The number of skipped ticks is stated in the record of the next executed tick, in the form
+    of a change.
 
     Args:
         commands: For each tick, the changes that the site applied before it.
@@ -473,9 +471,8 @@ def _find_ready(
 ) -> int:
     """Selects the site that executes the next tick of a simulation.
 
-    A site, the simulated process of one arm, can execute its next tick (period of the control
-    loop) as soon as the samples (sent states) that it needs are in the simulated network. Of
-    the sites that are ready, the site with the earliest tick is selected.
+    A site can execute its next tick as soon as the samples that it needs are in the simulated
+    network. Of the sites that are ready, the one with the earliest tick is selected.
 
     Args:
         pending: Next tick of each site, as (time in ns, index of the site, tick), in order of
@@ -493,7 +490,7 @@ def _find_ready(
 
 
 class _VirtualChannels(SiteChannels):
-    """Channels of one site of a virtual run, written while the run is executed."""
+    """Channels of one site in a virtual run, written while the run is executed."""
 
     def __init__(self, scenario: Scenario, site: Site, writer: LogWriter) -> None:
         boot = compute_virtual_boot(scenario.sha256, site.name)

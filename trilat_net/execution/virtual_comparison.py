@@ -39,9 +39,8 @@ class _RecordComparison(NamedTuple):
     """Result of comparing the records of a log with another execution of the same run.
 
     Attributes:
-        records: Number of records that were compared. A record is the stored result of one
-            tick (control period).
-        identical: Number of records in which all computed fields have the same bits.
+        records: Number of records that were compared.
+        identical: Number of records in which all computed fields are bit-identical.
         first: Difference in the earliest tick. None if all records are identical.
     """
 
@@ -66,11 +65,10 @@ class _RecordComparison(NamedTuple):
 
 
 class _LateSample(NamedTuple):
-    """Sample that had not arrived at its receiver when it should have come into use.
+    """Sample that had not arrived at its receiver when it was due.
 
-    A sample is the state that a site (arm controller) publishes in one tick (control period).
-    It is due after the delay that the scenario states for the link. Samples that are lost
-    according to the scenario are never due, and do not count.
+    A sample is due after the delay that the scenario prescribes for the link. Samples that are
+    lost according to the scenario are never due, and do not count.
 
     Attributes:
         site: Name of the receiver.
@@ -88,7 +86,7 @@ class _LateSample(NamedTuple):
     arrived_tick: int | None
 
     def __str__(self) -> str:
-        """Returns a sentence about the late message, for the report to the user."""
+        """Describes the late sample in one sentence, for the report to the user."""
         outcome = "never came"
         if self.arrived_tick is not None:
             outcome = f"came at tick {self.arrived_tick}"
@@ -103,10 +101,10 @@ def _compare_records(
 
     Args:
         log: Log whose records are compared.
-        executed: Results of the other execution in any order, each with the name of the site
-            (arm controller). Ticks (control periods) that the log does not contain are skipped.
-        arrivals: If True, the same samples must have arrived in each tick as well. Their
-            checksums are compared.
+        executed: Results of the other execution in any order, each with the name of the site.
+            Ticks that the log does not contain are skipped.
+        arrivals: If True, the same samples must have arrived in each tick too. Their checksums
+            are compared.
     """
     by_tick = {name: log[name].by_tick for name in log.sites}
     records = 0
@@ -157,8 +155,7 @@ def find_absent_samples(log: Log) -> list[_LateSample]:
 def _find_absent_at_site(log: Log, name: str) -> list[_LateSample]:
     """Finds the samples that had not arrived at one site when they were due.
 
-    A sample is the state that another site (peer) sent in one tick. It is due after the delay
-    that the scenario prescribes for the link.
+    A sample is due after the delay that the scenario prescribes for the link.
 
     Args:
         log: Log of a live session.
@@ -223,12 +220,11 @@ def _find_absent_at_site(log: Log, name: str) -> list[_LateSample]:
 
 
 def _uses_older(site_log: SiteLog, sender: str, tick: int, due_tick: int) -> bool:
-    """True if a site still used an older sample of its peer when a given sample was due.
+    """Returns True if a site was still using an older sample when a given sample was due.
 
     Args:
         site_log: Records of the receiver.
-        sender: Name of the site (arm controller) that sent the sample, its state in one tick
-            (control period).
+        sender: Name of the site that sent the sample.
         tick: Tick in which the sample was sent.
         due_tick: Tick of the receiver in which the sample was due. If it has no record, the
             next record is examined.
@@ -240,19 +236,18 @@ def _uses_older(site_log: SiteLog, sender: str, tick: int, due_tick: int) -> boo
 class _VirtualComparison(NamedTuple):
     """Comparison of the log of a live session with simulations of the same experiment.
 
-    The comparison shows whether the real network changed the result beyond the delays and
-    losses that the scenario (description of the experiment) contains. A sample is the state
-    that a site, the process that runs one arm, sends to the other sites.
+    It shows whether the real network changed the result beyond the delays and losses prescribed
+    by the scenario.
 
     Attributes:
         fed: Comparison with a simulation in which each sample arrives when it arrived in the
-            session. All records (results of control periods) must be equal.
+            session. All records must be equal.
         plain: Comparison with a simulation of a perfect network, in which samples arrive at
             once. The records must be equal up to the first late or lost sample. If an arm is
             external, no records are compared, because its motion is known only for the recorded
             run.
-        absent: Samples that arrived too late or never, by the tick (control period) in which
-            they were due.
+        absent: Samples that arrived too late or never, in order of the tick in which they were
+            due.
     """
 
     fed: _RecordComparison
@@ -342,9 +337,9 @@ def compare_with_virtual(log: Log, progress: Progress | None = None) -> _Virtual
 
 
 def _read_arrivals(log: Log, name: str) -> Mapping[int, Sequence[ArrivalEntry]]:
-    """Returns the messages that arrived at a site, by the control period (tick) that used them.
+    """Returns a mapping from tick to the samples that arrived at a site for that tick.
 
-    Arrivals in gaps of the log are assumed, unless too many records are missing.
+    Arrivals in gaps in the log are estimated, unless too many records are missing.
     """
     site_log = log[name]
     rates_hz = [log.scenario.sites[peer].rate_hz for peer in site_log.peers]

@@ -318,15 +318,15 @@ class Deliveries(NamedTuple):
 
 
 def _find_first_arrivals(deliveries: Deliveries, peer: int) -> dict[int, tuple[int, int]]:
-    """Returns when each state (sample) that a peer sent arrived for the first time.
+    """Returns when each sample from a peer arrived for the first time.
 
     Args:
         deliveries: Arrivals at the receiver.
         peer: Index of the sender among the receiver's peers.
 
     Returns:
-        For the tick (control period) of each sample, the tick of its first arrival and its
-        latency in microseconds.
+        A mapping from the tick of each sample to the tick of its first arrival and its latency
+        in microseconds.
     """
     first_arrivals: dict[int, tuple[int, int]] = {}
     for k in sorted(deliveries.entries):
@@ -344,9 +344,9 @@ def _assume_arrivals(
     peer_hz: int,
     end: int,
 ) -> Iterator[tuple[int, list[int]]]:
-    """Yields assumed arrivals of messages from one peer that no record lists.
+    """Yields assumed arrivals of samples from one peer that no record lists.
 
-    Records are missing from the log, so that the true arrivals are not known.
+    Because records are missing from the log, the true arrivals are unknown.
 
     Args:
         recorded: Arrivals that the records list.
@@ -357,7 +357,7 @@ def _assume_arrivals(
         end: Last tick of the sender.
 
     Yields:
-        The tick of the arrival, and its entry in the form of a record's `rx`.
+        The tick of the arrival, and its entry in the format of a record's `rx`.
     """
     first_arrivals = _find_first_arrivals(recorded, peer)
     listed = sorted(first_arrivals)
@@ -402,5 +402,5 @@ def _assume_arrivals(
 
 
 def _round_up_to_tick(t_ns: int, rate_hz: int) -> int:
-    """Returns the first tick at or after a time, in exact integer arithmetic."""
+    """Returns the first tick at or after a time in ns, in exact integer arithmetic."""
     return -(-t_ns * rate_hz // NS_PER_S)

@@ -67,22 +67,21 @@ class LogAndRerun(NamedTuple):
 
 
 class _SiteEffect(NamedTuple):
-    """Effect of changed settings on one arm: how a repeated run differs from the log.
+    """Effect of changed settings on one arm: how a rerun differs from the log.
 
-    The figures describe a site (arm controller). They are computed from the ticks (control
-    periods) for which both the log and the repetition (rerun) have a record, and are None if
-    there is no such tick.
+    The figures are computed from the ticks for which both the log and the rerun have a record,
+    and are None if there is no such tick.
 
     Attributes:
         site: Name of the site.
-        executed: Number of executed ticks. A tick is one period of the control loop.
+        executed: Number of executed ticks.
         compared: Number of executed ticks for whose time the log contains a record.
-        identical: Number of compared ticks in which all computed fields have the same bits as
-            in the log. If settings were changed, the checksum of the arrivals is not compared.
+        identical: Number of compared ticks in which all computed fields are bit-identical to
+            the log. If settings were changed, the checksum of the arrivals is not compared.
         stands: Number of ticks whose record was copied from the log, because the log does not
             contain enough data to execute them.
         assumed: Number of executed ticks without a record in the log. The samples that arrived
-            in these ticks were assumed.
+            in these ticks were estimated.
         lacking: Number of samples that arrived, but whose content is missing from the log.
         first: First difference from the log. None if there is no difference, or if tick rates
             were changed.
@@ -117,11 +116,10 @@ class _SiteEffect(NamedTuple):
 
 
 class _LinkEffect(NamedTuple):
-    """Difference that a rerun makes to one link: how old the samples are when they are used.
+    """Effect of a rerun on one link: how old the samples are when they are used.
 
-    A link is the directed connection from one site (arm controller) to another. Ages are
-    computed from the ticks (control periods) in which the receiver uses a sample both in the
-    log and in the rerun.
+    Ages are computed from the ticks in which the receiver uses a sample both in the log and in
+    the rerun.
 
     Attributes:
         link: Name of the link, for example "m1->s".
@@ -144,10 +142,10 @@ class _LinkEffect(NamedTuple):
 
 
 class _CommonRecords(NamedTuple):
-    """Records of a site (arm controller) in a log and in its rerun, paired by their times.
+    """Records of a site in a log and in its rerun, paired by time.
 
-    A rerun may have another tick rate than the log. Only records (results of control periods)
-    with equal times can be compared.
+    The tick rate of a rerun may differ from that of the log. Only records with equal times can
+    be compared.
 
     Attributes:
         before: Records of the log.
@@ -183,10 +181,10 @@ def _compare_site_rerun(
     name: str,
     ticks: Sequence[RerunTick],
 ) -> tuple[_SiteEffect, list[_LinkEffect]]:
-    """Computes how a repeated run differs at one arm, and on the links to this arm.
+    """Computes how a rerun differs at one arm, and on the links to this arm.
 
     Args:
-        log: The log that was executed again.
+        log: The log that was re-executed.
         request: Executed sites and changed settings of the rerun.
         execution: The rerun, after its last tick.
         name: Name of the executed site.
@@ -236,16 +234,15 @@ def _compare_site_rerun(
 def _pair_records(
     log: Log, request: RerunRequest, name: str, executed: Sequence[RerunTick]
 ) -> _CommonRecords:
-    """Pairs the records of a site in a log with those of its rerun, to compare them.
+    """Pairs the records of a site in a log with those of its rerun, for comparison.
 
-    A rerun executes the log again, possibly with another tick rate. Records with the same time
-    form a pair.
+    Records with the same time form a pair. The tick rates may differ.
 
     Args:
         log: The log.
-        request: Sites (arm controllers) and settings of the rerun.
+        request: Sites and settings of the rerun.
         name: Name of the site.
-        executed: Executed ticks (control periods) of the site.
+        executed: Executed ticks of the site.
     """
     log_records = log[name]
     rerun_records = SiteLog(
@@ -264,10 +261,10 @@ def _pair_records(
 
 
 def _compute_rms(values: Array) -> float:
-    """Returns the largest root mean square of any column of an array.
+    """Returns the root mean square of the column for which it is largest.
 
     Args:
-        values: Values, shape (K, n), with a column for each joint.
+        values: Values, shape (K, n), with one column per joint.
     """
     largest = _find_largest(values)
     if not 0.0 < largest < np.inf:
@@ -278,19 +275,19 @@ def _compute_rms(values: Array) -> float:
 
 
 def _find_largest(values: Array) -> float:
-    """Returns the largest absolute value."""
+    """Returns the largest absolute value in an array."""
     return float(np.abs(values).max())
 
 
 def _compare_links(
     log: Log, request: RerunRequest, records: _CommonRecords
 ) -> list[_LinkEffect]:
-    """Returns the differences of the delays on the network links to an arm in the repeated run.
+    """Compares the delays on the links to an arm between the log and its rerun.
 
     Args:
         log: The log.
         request: Sites and settings of the rerun.
-        records: Paired records (results of control periods) of the receiver.
+        records: Paired records of the receiver.
     """
     effects = []
     for peer in records.before.peers:
@@ -528,7 +525,7 @@ def _parse_epoch(log: Log) -> int:
     """Returns the Unix time of the start of a log's session, in ns.
 
     Raises:
-        LogError: The text that the log states is not a time.
+        LogError: The time stated in the log is invalid.
     """
     text = log.session.get("epoch_unix_ns", "0")
     if not text.isdecimal() or int(text) > MAX_TIME_NS:
@@ -537,14 +534,14 @@ def _parse_epoch(log: Log) -> int:
 
 
 def _collect_rerun_metadata(log: Log, request: RerunRequest) -> dict[str, str]:
-    """Returns the metadata with which the log of a rerun states its origin.
+    """Returns the metadata that states the origin of a rerun in its log.
 
     Args:
-        log: The log that was executed again.
-        request: Executed sites (arm controllers) and changed settings of the rerun.
+        log: The log that was re-executed.
+        request: Executed sites and changed settings of the rerun.
 
     Returns:
-        Texts by key: the source log, the executed sites and the changes.
+        A mapping from key to string: the source log, the executed sites and the changes.
     """
     digests = {}
     for source in log.sources:
@@ -562,11 +559,10 @@ def _collect_rerun_metadata(log: Log, request: RerunRequest) -> dict[str, str]:
 
 
 def _copy_recorded(log: Log, name: str, channels: SiteChannels) -> Iterator[SiteEntry]:
-    """Yields the messages of a site that a rerun copies from the source log, by time.
+    """Yields the messages of a site that a rerun copies from the source log, in order of time.
 
-    A rerun executes some sites (arm controllers) of a log again. The log of the rerun also
-    contains the records (results of control periods), statistics and events of the sites that
-    were not executed.
+    The log of the rerun also contains the records, statistics and events of sites that were not
+    executed.
     """
     site_log = log[name]
     site_events = [event for event in log.events if event.member == name]
@@ -597,8 +593,8 @@ def _make_executed_entries(
 def _to_plain_value(value: Any) -> Any:
     """Converts a value to types that JSON can represent.
 
-    A named tuple becomes a dictionary. Infinite numbers and NaN become None, because JSON has
-    no such numbers.
+    A named tuple becomes a dictionary. Infinite values and NaN become None, since JSON cannot
+    represent them.
     """
     if hasattr(value, "_asdict"):
         return {key: _to_plain_value(item) for key, item in value._asdict().items()}
@@ -606,7 +602,7 @@ def _to_plain_value(value: Any) -> Any:
 
 
 def _describe_limits(result: Rerun) -> Iterator[str]:
-    """Yields sentences for the user about the limits of a repeated run.
+    """Yields sentences for the user about the limitations of a rerun.
 
     Args:
         result: The log and its rerun.
@@ -643,22 +639,19 @@ def _describe_limits(result: Rerun) -> Iterator[str]:
 
 
 def _describe_site_limits(effect: _SiteEffect, absent_ticks: int) -> Iterator[str]:
-    """Yields sentences about missing data of the log that limit the rerun of one site.
+    """Yields sentences about missing data in the log that limit the rerun of one site.
 
-    A site is a process that runs one arm, a tick is a period of its control loop, and its
-    record in the log is the stored result. There is a sentence for each of these facts:
+    There is one sentence for each of the following that applies:
 
     - Ticks could not be executed because the log contains too little. The recorded results of
       these ticks were copied.
-    - Ticks have no record. They were executed with assumed arrivals of samples.
+    - Ticks have no record. They were executed with estimated arrivals of samples.
     - The site had left the live session for some ticks, which are executed nevertheless.
-    - Samples (states of other sites) arrived, but the log does not contain them. The ticks were
-      executed without these samples.
+    - Samples arrived that the log does not contain. The ticks were executed without them.
     - No tick could be executed.
 
     Args:
-        effect: Difference that the rerun makes to the site, with the numbers of these ticks and
-            samples.
+        effect: Effect of the rerun on the site, with the numbers of these ticks and samples.
         absent_ticks: Number of ticks that the site did not execute in the live session, because
             it had left.
     """
@@ -689,10 +682,10 @@ def _describe_site_limits(effect: _SiteEffect, absent_ticks: int) -> Iterator[st
 def _describe_later_changes(result: Rerun) -> Iterator[str]:
     """Yields sentences about settings of the rerun that were changed again during the run.
 
-    A link, or the dominance factors of a site (how strongly it follows each of its peers), can
-    change at certain times: by the timeline of the scenario, or by commands that the log
-    contains. The rerun repeats these changes. A setting that the user of the rerun changed
-    therefore applies only up to the first of them.
+    A link, or the dominance factors of a site, can change at certain times: through the
+    timeline of the scenario, or through commands stored in the log. The rerun repeats these
+    changes. A setting changed by the user of the rerun therefore applies only until the first
+    of them.
 
     Args:
         result: The log and its rerun.

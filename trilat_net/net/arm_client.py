@@ -44,26 +44,27 @@ from .wire import decode, encode, split_states
 from .zenoh_config import OPERATOR
 
 FRESH_NS = 100_000_000
-"""Largest age of a usable record, in ns. If the record is older, the site is late or gone."""
+"""Maximum age of a usable record, in ns. If the newest record is older, the site is late or
+gone.
+"""
 AHEAD_NS = 1_000_000_000
-"""Largest time by which a record may be ahead of its expected time, in ns.
+"""Maximum time by which a record may be ahead of its expected time, in ns.
 
-The expected time of a record is the time of the previous one plus the time between their
+The expected time of a record is the time of the previous record plus the time between their
 arrivals.
 """
 _BRAKE_NS = 100_000_000
-"""Time from a fault, or from the release of the dead-man switch, until the brakes hold, in ns.
-"""
+"""Time from a fault, or the release of the dead-man switch, until the brakes hold, in ns."""
 _HEARTBEAT_S = SILENCE_NS / 4e9
-"""Period with which an operator's last message is repeated, in s."""
+"""Interval at which an operator's last message is repeated, in s."""
 _ACTIONS = {
     TorqueKind.LIVE_TIP: "move",
     TorqueKind.LIVE_JOINT: "turn",
     TorqueKind.LIVE_FORCE: "push",
 }
-"""Name of the method with which an operator of each kind moves an arm."""
+"""Mapping from each kind of operator to the name of the method that moves the arm."""
 _DERIVATIVE_STEP_S = 1e-6
-"""Step of the numerical derivative of the arm's pose, in s."""
+"""Step size of the numerical derivative of the arm's pose, in s."""
 
 
 R = TypeVar("R", bound=DirectMessage)
@@ -72,20 +73,19 @@ R = TypeVar("R", bound=DirectMessage)
 class _SiteSender:
     """Sends numbered messages to one channel of a site.
 
-    A site is a process that runs one arm and its control loop. The messages of a sender are
-    numbered, so that the site detects lost, repeated and reordered messages.
+    The numbers allow the site to detect lost, repeated and reordered messages.
 
     Args:
-        bus: Network connection that reaches the site.
+        bus: Network connection through which the site can be reached.
         clock: Clock of this process.
         session: Name of the session.
         site: Name of the site.
-        channel: Channel of the messages, the last part of their key.
+        channel: Channel of the messages (the last part of their key).
         boot: Random number that identifies this start of the sending program.
 
     Attributes:
         boot: Random number that identifies this start of the sending program.
-        number: Number of the newest message, from 0. It is -1 before the first message.
+        number: Number of the newest message, from 0. -1 before the first message.
     """
 
     def __init__(
@@ -97,7 +97,7 @@ class _SiteSender:
         channel: str,
         boot: int,
     ) -> None:
-        """Opens a channel for messages to a site (arm controller). No message is sent yet."""
+        """Opens a channel for messages to a site. No message is sent yet."""
         self.boot = boot
         self.number = -1
         self._clock = clock
@@ -196,7 +196,7 @@ class SiteClient:
         session: str,
         site: str,
     ) -> None:
-        """Subscribes to the records, the events and the presence of a site (arm controller)."""
+        """Subscribes to the records, the events and the presence of a site."""
         self._bus = bus
         self._clock = clock
         self._site = site
@@ -248,12 +248,12 @@ class SiteClient:
         return self._is_over
 
     def _is_next_record(self, record: State, received_ns: int) -> bool:
-        """Returns True if a record may follow the newest known one.
+        """Returns True if a record is a valid successor of the newest known one.
 
-        It must come from the same process of the site and be newer. Its time must not be more
-        than `AHEAD_NS` later than the time of the newest record (result of a control period)
-        plus the time since that record arrived. A forged record with a time far in the future
-        would otherwise make the client ignore all correct records.
+        It must come from the same process of the site and be newer. Its time must not exceed
+        the time of the newest record, plus the time since that record arrived, by more than
+        `AHEAD_NS`. Otherwise, a forged record with a time far in the future would make the
+        client ignore all correct records.
 
         Args:
             record: The record.
@@ -272,10 +272,10 @@ class SiteClient:
         return is_newer and is_plausible
 
     def _read_messages(self) -> None:
-        """Receives all waiting messages, and updates the newest record and the end of the run.
+        """Processes all pending messages, and updates the newest record and the end of the run.
 
-        The run of the site (arm controller) has ended if the site has published its end, or if
-        its liveliness token, which exists as long as its process is connected, has disappeared.
+        The run of the site has ended if the site has published its end, or if its liveliness
+        token has disappeared, which happens when its process loses its connection.
         """
         while (message := self._records.poll()) is not None:
             block, received_ns = message
@@ -303,25 +303,22 @@ class SiteClient:
 
 
 class _OutsideClient(SiteClient):
-    """Connection of a program that also sends messages to one channel of a site.
+    """Connects a program that also sends messages to one channel of a site.
 
-    `ArmClient` and `SwitchClient` define the channel. The object is a context manager that
-    closes the network connection.
-
-    A site is a process that runs one arm and its control loop. The channel is one stream of
-    messages to the site, for example that of the measurements of its arm.
+    The channel, for example that of the measurements of an arm, is defined by `ArmClient` and
+    `SwitchClient`. Use the client as a context manager to close the network connection.
 
     Args:
-        bus: Network connection that reaches the site.
+        bus: Network connection through which the site can be reached.
         clock: Clock of this process.
         session: Name of the session.
         site: Name of the site.
     """
 
     channel = ""
-    """The last part of the key under which the program publishes."""
+    """Last part of the key under which the program publishes."""
     member = ""
-    """The member whose keys the program uses; "" stands for the site."""
+    """Member whose keys the program uses, or an empty string for the site."""
 
     def __init__(
         self,
@@ -330,7 +327,7 @@ class _OutsideClient(SiteClient):
         session: str,
         site: str,
     ) -> None:
-        """Subscribes to the messages of a site (arm controller), and opens a channel to it."""
+        """Subscribes to the messages of a site, and opens a channel to it."""
         super().__init__(bus, clock, session, site)
         self._sender = _SiteSender(
             bus=bus,
@@ -385,7 +382,7 @@ class SwitchClient(_OutsideClient):
 
     channel = topics.ENABLE
     member = OPERATOR
-    """Member whose keys the program uses. Empty stands for the site."""
+    """Member whose keys the program uses, or an empty string for the site."""
 
     def send(self, *, held: bool) -> None:
         """Reports to the site whether the dead-man switch is held.
@@ -412,7 +409,7 @@ class ArmClient(_OutsideClient):
     """
 
     channel = topics.MEASURED
-    """Channel of the messages, the last part of their key."""
+    """Channel of the messages (the last part of their key)."""
 
     def send(
         self,
@@ -511,7 +508,7 @@ class Hand(SiteClient):
         *,
         repeats: bool = True,
     ) -> None:
-        """Connects to a site (arm controller). The arm moves only after a further call."""
+        """Connects to a site. The arm does not move until a method such as `move` is called."""
         super().__init__(bus, clock, session, site)
         self._operator = operator
         self._compute_pose = compute_pose
@@ -529,8 +526,8 @@ class Hand(SiteClient):
     def __exit__(self, *_: object) -> None:
         """Releases the arm, and waits until its record shows that nobody holds it any more.
 
-        The wait takes at most twice the time in which the grip fades, even if no record (result
-        of a control period) arrives. The bus stays open, because the caller opened it.
+        The wait takes at most twice the time in which the grip fades, even if no record
+        arrives. The bus stays open, because it was opened by the caller.
         """
         try:
             self.release()
@@ -674,15 +671,14 @@ class Hand(SiteClient):
         return tuple(scale * component for component in pull)
 
     def _compute_pose_rate(self, record: State) -> list[float]:
-        """Returns the velocity of the end effector, or of the angles that the operator turns.
+        """Returns the velocity of the end effector (m/s) or of the turned joint angles (rad/s).
 
-        It is computed as a central difference, because only a function for the pose is known:
-        the pose is evaluated a little later and a little earlier along the measured joint
-        velocities, and the difference is divided by the time between the two.
+        Because only a function for the pose is known, the velocity is computed as a central
+        difference: the pose is evaluated slightly later and slightly earlier along the measured
+        joint velocities, and the difference is divided by the time between the two.
 
         Args:
-            record: Record (result of a control period) of the site (arm controller), with
-                angles and velocities of the joints.
+            record: Record of the site, with angles and velocities of the joints.
 
         Returns:
             The rate of each coordinate of the pose, m/s or rad/s.
@@ -695,7 +691,7 @@ class Hand(SiteClient):
         return [(later - earlier) / (2.0 * step_s) for later, earlier in pairs]
 
     def _wait_for_record(self) -> State:
-        """Returns the newest record of the site (arm controller), and waits for the first one.
+        """Returns the newest record of the site, waiting for the first one if necessary.
 
         Raises:
             UsageError: The run has ended before the first record.
@@ -707,14 +703,15 @@ class Hand(SiteClient):
         return record
 
     def _send(self, action: str, numbers: Sequence[float]) -> int:
-        """Sends a target or force to the arm controller, and returns the message's number.
+        """Sends a target or force to the site, and returns the number of the message.
 
         Args:
             action: Name of the method that the program called: "move", "turn" or "push".
             numbers: Coordinates of the target or the force.
 
         Raises:
-            UsageError: The scenario's operator has another kind, or a number is not finite.
+            UsageError: The scenario's operator is of another kind, or a coordinate is not
+                finite.
         """
         permitted_action = _ACTIONS[self._operator.kind]
         if action != permitted_action:
@@ -731,10 +728,10 @@ class Hand(SiteClient):
             return self._sender.number
 
     def _repeat_messages(self) -> None:
-        """Repeats the last message while the program holds the arm, in a thread of its own.
+        """Repeats the last message while the program holds the arm, in a separate thread.
 
-        Without the repeated messages, the site would assume that a program without a new target
-        has died, and would release the arm. The thread ends when the object is closed.
+        Otherwise, the site would assume that a program that sends no new target has died, and
+        would release the arm. The thread ends when the object is closed.
         """
         while not self._ended.wait(_HEARTBEAT_S):
             with self._lock:

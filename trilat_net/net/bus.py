@@ -22,7 +22,7 @@ from functools import lru_cache
 from typing import Generic, Protocol, TypeVar
 
 RING_CAPACITY = 16_384
-"""Number of messages that a queue holds: those of one peer in sixteen seconds at 1 kHz."""
+"""Number of messages that a queue can hold: those of one peer in sixteen seconds at 1 kHz."""
 
 T = TypeVar("T")
 Polled = TypeVar("Polled", covariant=True)
@@ -43,9 +43,9 @@ class PolledRing(Protocol[Polled]):
 
 
 Inbox = PolledRing[tuple[str, bytes]]
-"""Queue of messages: the key and the payload of each message."""
+"""Queue of messages, each given by its key and payload."""
 PresenceInbox = PolledRing[tuple[str, bool]]
-"""Queue of changes of presence: the key of a token, and True if the token has appeared."""
+"""Queue of presence changes: the key of a token, and True if the token has appeared."""
 StampedInbox = PolledRing[tuple[Polled, int]]
 """Queue of decoded messages, each with its time of arrival in ns."""
 
@@ -194,8 +194,8 @@ class Bus(Protocol):
 def _compile_expression(expression: str) -> re.Pattern[str]:
     """Converts a key with wildcards to a regular expression, see `matches_key`.
 
-    The regular expression matches keys with a leading slash, so that every part of a key has
-    the same form: a slash and some characters.
+    The regular expression matches keys with a leading slash, which gives every part of a key
+    the same form: a slash followed by characters.
     """
     one_part = "/[^/]+"
     pattern = ""

@@ -39,7 +39,7 @@ if TYPE_CHECKING:
 _FIRST_PORT = 10_240
 """Lowest default port. The default ports are divided into blocks, one block per session."""
 _BLOCKS = 340
-"""Number of blocks. The CRC-32 of the session's name selects one."""
+"""Number of blocks. The block of a session is selected by the CRC-32 of its name."""
 _BLOCK = 64
 """Number of ports in a block."""
 
@@ -124,19 +124,19 @@ def find_free_endpoints(count: int) -> list[str]:
 
 
 def _bind_ports(stack: ExitStack, ports: Sequence[int], *, shared: bool) -> list[str]:
-    """Reserves ports of this machine for sites (arm controllers) that will listen at them.
+    """Reserves ports of this machine for sites that will listen on them.
 
-    A port is reserved by a socket that is bound to it but does not listen. The operating system
-    then assigns the port to no program that asks for any free port.
+    A port is reserved by binding a socket to it without listening. The operating system then
+    does not assign the port to programs that ask for any free port.
 
     Args:
-        stack: Closes the sockets, and thereby ends the reservation.
+        stack: Closes the sockets, which ends the reservation.
         ports: Numbers of the ports. 0 stands for any free port.
-        shared: True if the site can listen at its port while the port is still reserved. False
+        shared: True if the site can listen on its port while the port is still reserved. False
             to reserve the port exclusively.
 
     Returns:
-        The endpoints of the reserved ports, in the order of the ports.
+        The endpoints of the reserved ports, in the same order.
 
     Raises:
         OSError: A port is in use.
@@ -151,9 +151,9 @@ def _bind_ports(stack: ExitStack, ports: Sequence[int], *, shared: bool) -> list
 
 
 ENDS_SOON = timedelta(days=7)
-"""The user is warned if the validity of the keys ends within this time."""
+"""The user is warned if the keys expire within this time."""
 _DATE = "%Y-%m-%d %H:%M:%S UTC"
-"""Format of the end of validity in messages to the user."""
+"""Format of the expiry date in messages to the user."""
 RETRY_NS = 200_000_000
 """Time between two attempts to reach a router, in ns."""
 
@@ -480,13 +480,13 @@ class Connection:
 
 
 def _check_encrypted_endpoint(address: str) -> None:
-    """Refuses an endpoint that is not encrypted, or that states its own encryption settings.
+    """Raises UsageError if an endpoint is unencrypted, or sets its own encryption settings.
 
-    The settings of the encryption come from the keys. Settings of the network interface
-    (`iface`, `bind`, `dscp`, `so_...`) are permitted.
+    The encryption settings must come from the keys. Settings of the network interface (`iface`,
+    `bind`, `dscp`, `so_...`) are allowed.
 
     Raises:
-        UsageError: The endpoint is refused.
+        UsageError: The endpoint is rejected.
     """
     if not address.startswith(ENCRYPTED):
         raise UsageError(
@@ -501,10 +501,10 @@ def _check_encrypted_endpoint(address: str) -> None:
 
 
 def _refuse_settings_of_keys(settings: Mapping[str, Any]) -> None:
-    """Refuses a user's Zenoh settings that would contradict the encryption keys of a session.
+    """Raises UsageError if the user's Zenoh settings contradict a session's encryption keys.
 
     Args:
-        settings: Settings of the file.
+        settings: Settings from the file.
 
     Raises:
         UsageError: The file contains such a setting.
@@ -523,16 +523,16 @@ def _refuse_settings_of_keys(settings: Mapping[str, Any]) -> None:
 
 
 def _check_open_endpoints(connection: Connection, *, insecure: bool) -> None:
-    """Refuses to listen without keys at an endpoint that other machines can reach.
+    """Raises UsageError if a process without keys listens for other machines.
 
-    It is permitted if the user's own Zenoh settings require certificates of both ends.
+    This is allowed if the user's own Zenoh settings require certificates at both ends.
 
     Args:
         connection: The connection.
-        insecure: True to permit such endpoints.
+        insecure: True to allow such endpoints.
 
     Raises:
-        UsageError: An endpoint is refused.
+        UsageError: An endpoint is rejected.
     """
     link_settings = connection.settings.get("transport", {}).get("link", {})
     has_mutual_tls = link_settings.get("tls", {}).get("enable_mtls") is True
@@ -548,7 +548,7 @@ def _check_open_endpoints(connection: Connection, *, insecure: bool) -> None:
 
 
 ENCRYPTED = ("tls/", "quic/")
-"""Beginnings of the endpoints whose transport is encrypted."""
+"""Prefixes of the endpoints whose transport is encrypted."""
 
 
 def is_loopback(address: str) -> bool:
@@ -578,12 +578,12 @@ def _join_options(
     listen_else: Sequence[str],
     connect_else: Sequence[str] | None,
 ) -> Connection:
-    """Derives the network connection of a process from its options and its Zenoh file.
+    """Builds the network connection of a process from its options and the user's Zenoh file.
 
     `listen_else` and `connect_else` are the defaults, see `Connection.of_member`.
 
     Raises:
-        UsageError: Both the command line and the file name endpoints at which to listen.
+        UsageError: Both the command line and the file name endpoints on which to listen.
     """
     file_listen = file.endpoints("listen", mode)
     if listen is not None and file_listen is not None:
@@ -607,12 +607,13 @@ def _merge_endpoints(
     mode: ZenohMode,
     fallback_endpoints: Sequence[str] | None,
 ) -> Sequence[Endpoint] | None:
-    """Returns the endpoints to which a process connects, from the command line and a file.
+    """Returns the endpoints to which a process connects, from the command line and the file.
 
-    The endpoints of the command line come first, then further ones of the user's Zenoh file.
+    Endpoints from the command line come first, followed by additional ones from the user's
+    Zenoh file.
 
     Args:
-        named_endpoints: Endpoints of the option. None if the option is absent.
+        named_endpoints: Endpoints given with the option. None if the option is absent.
         file: The user's Zenoh file.
         mode: Mode of the process.
         fallback_endpoints: Endpoints to use if neither the option nor the file names any.

@@ -18,7 +18,7 @@ from .membership import liveliness_token
 from .session_members import SessionMembers
 
 SiteNamesOf = Callable[[str], tuple[str, ...]]
-"""Function that returns the names of the sites in the text of a scenario, in their order.
+"""Function that returns the names of the sites from the text of a scenario, in scenario order.
 
 It raises `ScenarioError` if the text is not a scenario.
 """
@@ -113,21 +113,20 @@ def _query_sites(
 ) -> tuple[str, ...] | None:
     """Queries the members of a session for the names of its sites.
 
-    A site is a process that runs one arm. Its reply contains the scenario, the description of
-    the experiment, which names all sites of the session.
+    A site replies with its scenario, which names all sites of the session.
 
     Args:
-        bus: Network connection that reaches the first site.
+        bus: Network connection through which the first site can be reached.
         clock: Clock of the caller.
         session: Name of the session.
-        parse_site_names: Function that returns the names of the sites in the text of a
+        parse_site_names: Function that returns the names of the sites from the text of a
             scenario. It raises `ScenarioError` if the text is not a scenario.
-        stopped: Function that returns True to give up.
+        stopped: Function that returns True to cancel the search.
         timeout_s: Longest wait for a reply, in s. If None, the wait lasts until `stopped`
             returns True.
 
     Returns:
-        The names, from the first reply that contains a scenario. None if `stopped` returned
+        The names, from the first reply that contains a scenario, or None if `stopped` returned
         True.
 
     Raises:

@@ -15,7 +15,7 @@ from ..errors import UsageError
 from .zenoh_config import Endpoint
 
 _ENDPOINT = re.compile(r"[a-z]+(?:/|://)(\[[^\]]*\]|[^/?#]*):\d+(?:[/?#].*)?")
-"""Pattern of a Zenoh endpoint or a web address with a host and a port."""
+"""Pattern that matches a Zenoh endpoint or a web address with a host and a port."""
 
 
 class UnknownHost(UsageError):  # noqa: N818 - it names an outcome
@@ -71,7 +71,7 @@ def check_hosts(endpoints: Iterable[Endpoint]) -> None:
 def _is_address(host: str) -> bool:
     """Returns True if a host is a numeric address, for example 127.0.0.1 or fe80::1%eth0.
 
-    A numeric address needs no request to a name service, which could take seconds.
+    Numeric addresses do not require a name service lookup, which could take seconds.
     """
     try:
         ipaddress.ip_address(host.partition("%")[0])
@@ -81,11 +81,11 @@ def _is_address(host: str) -> bool:
 
 
 def _resolve(host: str, endpoint: str) -> None:
-    """Checks that a host name in a network address can be resolved, before it is used.
+    """Raises UnknownHost if the host name of an endpoint cannot be resolved.
 
     Args:
         host: The host name.
-        endpoint: Endpoint that contains it, for the error message.
+        endpoint: Endpoint that contains the host name, for the error message.
 
     Raises:
         UnknownHost: The host name cannot be resolved.

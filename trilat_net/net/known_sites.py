@@ -36,18 +36,18 @@ QUERY_PERIOD_NS = 50_000_000
 POLL_NS = 1_000_000
 """Time between two polls for replies, in ns."""
 PATIENCE_NS = 1_500_000_000
-"""Time after which the command continues with the search for the session, in ns."""
+"""Time after which the command falls back to searching for the session, in ns."""
 _AT_ONCE = {"scouting": {"delay": 0}}
-"""Settings of Zenoh that avoid its delay before the first message."""
+"""Zenoh settings that avoid a delay before the first message."""
 _NEW_FILE = os.O_WRONLY | os.O_CREAT | os.O_EXCL
-"""Flags that create a file, and fail if the file exists already."""
+"""Flags for creating a file, which fail if the file already exists."""
 
 
 class _KnownSite(msgspec.Struct, frozen=True):
     """Content of the file in which a running site stores how it can be reached.
 
-    A site is a process that runs one arm and its control loop. With this file, other programs
-    on the same machine find the site without searching the network.
+    With this file, other programs on the same machine find the site without searching the
+    network.
 
     Attributes:
         session: Name of the session.
@@ -58,7 +58,7 @@ class _KnownSite(msgspec.Struct, frozen=True):
         keyed: True if the site encrypts its messages with keys.
         places: Endpoints at which the site can be reached, and those of the members that it
             connects to.
-        stop: The message that stops the arm, encoded.
+        stop: The encoded message that stops the arm.
         pid: Number of the site's process in the operating system.
         machine: Identity of the machine's clock. It changes when the machine is restarted.
     """
@@ -75,10 +75,11 @@ class _KnownSite(msgspec.Struct, frozen=True):
 
 
 def _find_folder() -> Path:
-    """Returns the folder in which the sites of this user that run on this machine have a file.
+    """Returns the folder that contains one file for each site this user runs on this machine.
 
-    Other commands find a running session by these files. The folder is
-    ~/.local/state/trilat-net/running, unless XDG_STATE_HOME names another place.
+    Other commands use these files to find a running session. The folder is
+    ~/.local/state/trilat-net/running, or the corresponding folder below XDG_STATE_HOME if that
+    variable is set.
     """
     state = os.environ.get("XDG_STATE_HOME") or Path.home() / ".local" / "state"
     return Path(state) / "trilat-net" / "running"
@@ -166,8 +167,8 @@ def find_known_sites(session: str) -> list[_KnownSite]:
 def _is_alive(pid: int) -> bool:
     """Returns True if a process with this number exists.
 
-    The file of a site (arm controller) without a process is left over from a crash. On systems
-    other than POSIX, the process is assumed to exist, because the check could end it.
+    The file of a site whose process does not exist is left over from a crash. On non-POSIX
+    systems, the process is assumed to exist, because the check could terminate it.
     """
     with suppress(PermissionError):
         try:
@@ -179,10 +180,10 @@ def _is_alive(pid: int) -> bool:
 
 
 def _list_endpoints(known_sites: Sequence[_KnownSite]) -> list[Endpoint]:
-    """Returns the network addresses at which some sites can be reached, each once.
+    """Returns the endpoints at which the given sites can be reached, without duplicates.
 
     Args:
-        known_sites: The sites (arm controllers), as `find_known_sites` returns them.
+        known_sites: The sites, as returned by `find_known_sites`.
     """
     endpoints: list[Endpoint] = []
     for known in known_sites:
@@ -273,12 +274,12 @@ def stop_at_once(arguments: Sequence[str]) -> int | list[str]:
 
 
 def _parse_arguments(arguments: Sequence[str]) -> tuple[dict[str, str], list[str], bool]:
-    """Parses the command line after `trilat stop`, without the full command-line library.
+    """Parses the command line after `trilat stop` without the full command-line library.
 
-    The library is not used because it takes time to load.
+    Loading the library would take too long.
 
     Returns:
-        The values of --session and --keys, empty if they are absent; all other arguments; and
+        The values of --session and --keys, which are empty if absent; all other arguments; and
         True if the other arguments contain no option.
     """
     options = {"--session": "", "--keys": ""}
@@ -296,20 +297,20 @@ def _parse_arguments(arguments: Sequence[str]) -> tuple[dict[str, str], list[str
 
 
 def _print(text: object) -> None:
-    """Prints a text immediately, with a replacement for characters that cannot be printed.
+    """Prints a message immediately, replacing characters that cannot be printed.
 
-    Texts from the network could otherwise send control sequences to the terminal.
+    Text from the network could otherwise send control sequences to the terminal.
     """
     letters = (letter if letter.isprintable() else "\ufffd" for letter in str(text))
     print("".join(letters), flush=True)
 
 
 def _order_stop(known_sites: Sequence[_KnownSite], sites: Sequence[str], keys: str) -> bool:
-    """Sends the order to stop to sites until each has replied, and prints the replies.
+    """Sends the stop command to sites until each has replied, and prints the replies.
 
-    If two sessions with the same name run on this machine, the sites of both are stopped. A
-    query is complete when as many replies have arrived as there are sites with the queried
-    name.
+    If two sessions with the same name are running on this machine, the sites of both are
+    stopped. A query is complete when as many replies have arrived as there are sites with the
+    queried name.
 
     Args:
         known_sites: The known sites of the session.
@@ -317,7 +318,7 @@ def _order_stop(known_sites: Sequence[_KnownSite], sites: Sequence[str], keys: s
         keys: Folder of the user's keys. Empty if there are none.
 
     Returns:
-        True if all sites have replied that they stop.
+        True if all sites have confirmed that they stop.
     """
     settings: Any = _AT_ONCE
     if keys:

@@ -259,7 +259,7 @@ class Membership:
         sites: Sequence[str],
         late: LateSites,
     ) -> None:
-        """Subscribes to the presence of a session's processes, none of which is known yet."""
+        """Subscribes to the presence of a session's members. None of them is known yet."""
         self.others: dict[str, Info] = {}
         self.alive: set[str] = set()
         self.gone: set[str] = set()
@@ -395,8 +395,8 @@ class Membership:
         """Updates the lists after the token of a member has appeared or disappeared.
 
         Args:
-            member: Name of the member (process of a session).
-            boot: Number of the member's start, as text, as in the key of the token.
+            member: Name of the member.
+            boot: Boot of the member, as the string contained in the key of the token.
             is_alive: True if the token has appeared.
         """
         is_recorder = member == topics.RECORDER
@@ -464,10 +464,10 @@ class Membership:
             self.others[info.member] = info
 
     def _may_join(self, info: Info) -> bool:
-        """Returns True if this member may join the session that runs according to `info`.
+        """Returns True if this member may join the running session described by `info`.
 
-        A recorder needs the boots of the session's members. A site must be allowed to join
-        late, and must not run in the session already.
+        A recorder only needs to know the boots of the session's members. A site must be allowed
+        to join late, and must not already be running in the session.
         """
         is_local_recorder = not self._sites
         if is_local_recorder:
@@ -477,7 +477,7 @@ class Membership:
     def _describe_difference(self, info: Info) -> str:
         """Returns a phrase about the settings in which the scenario of another member differs.
 
-        It begins with a semicolon. It is empty if no settings can be named.
+        The phrase begins with a semicolon, and is empty if no settings can be named.
 
         Args:
             info: Identity of the other member, with its scenario.
@@ -489,12 +489,11 @@ class Membership:
         return f"; {phrase}" if phrase else ""
 
     def _refuse(self, info: Info) -> None:
-        """Refuses a member whose scenario differs, or gives up if that member is the leader.
+        """Rejects a member whose scenario differs, or gives up if that member is the leader.
 
-        The scenario of the leader, the first site (arm controller), is that of the session. If
-        this member (process of a session) is the leader, it publishes once that the other
-        member is refused. If the other member is the leader, this member gives up. If neither
-        member is the leader, nothing happens.
+        The scenario of the leader (the first site) is that of the session. If this member is
+        the leader, it publishes once that the other member is rejected. If the other member is
+        the leader, this member gives up. If neither is the leader, nothing happens.
 
         Args:
             info: Identity of the other member.

@@ -24,26 +24,26 @@ from msgspec import Meta
 from ..records import MAX_JOINTS, MAX_LAW_MEMORY, Layout, Mode, TickRecord
 
 VERSION = 4
-"""Version of the schema of sent messages. Messages of other versions are not accepted."""
+"""Schema version of sent messages. Messages with other versions are not accepted."""
 READABLE = (1, 2, 3, 4)
-"""Versions of the schema that can be read from files: all versions that were released."""
+"""Schema versions that can be read from files: all versions that were released."""
 SENT_TIME_SINCE = 2
-"""First version of the schema whose records contain the time at which they were sent."""
+"""First schema version whose records contain the time at which they were sent."""
 
 U64 = Annotated[int, Meta(ge=0)]
-"""A number from 0 to 2^64 - 1, such as the boot of a process."""
+"""An integer from 0 to 2^64 - 1, such as the boot of a process."""
 TickNumber = Annotated[int, Meta(ge=0, lt=2**40)]
-"""Number of a tick, or another count of the same size."""
+"""Number of a tick, or another count of the same magnitude."""
 Instant = Annotated[int, Meta(ge=-(2**59), lt=2**59)]
 """A reading of a clock in ns, within eighteen years of 0.
 
-The limit ensures that sums and differences of a few readings are still integers that a message
-can contain.
+The limit ensures that sums and differences of a few readings still fit into an integer that a
+message can contain.
 """
 Stamp = Annotated[list[Instant], Meta(min_length=3, max_length=3)]
-"""Three numbers about the arrival of a sample, see `State.rx` and `State.echo`."""
+"""Three integers that describe the arrival of a sample, see `State.rx` and `State.echo`."""
 MOST_PEERS = 32
-"""Largest number of sites in a scenario."""
+"""Maximum number of sites in a scenario."""
 
 
 class ModeMeaning(NamedTuple):
@@ -78,17 +78,17 @@ MODES = {
     "stopped": ModeMeaning(Mode.STOPPED, "is stopped", "stopped", rests=True, halted=True),
     "diverged": ModeMeaning(Mode.DIVERGED, "diverges", "diverged", follows=True),
 }
-"""Meanings of the modes, by their names in records and messages."""
+"""Mapping from the name of each mode in records and messages to its meaning."""
 MODE_WORDS = {meaning.mode: word for word, meaning in MODES.items()}
 """Name of each mode in records and messages."""
 HALTED_MODES = tuple(word for word, meaning in MODES.items() if meaning.halted)
-"""Names of the modes from which a site resumes only on request."""
+"""Names of the modes that a site leaves only on request."""
 RESTING_MODES = tuple(word for word, meaning in MODES.items() if meaning.rests)
 """Names of the modes in which an arm comes to rest."""
 
 
 def _unit(unit: str, text: str, **limits: Any) -> Meta:
-    """Returns the annotation of a field with its unit, its description and its limits."""
+    """Annotates a field with its unit, its description and its limits."""
     return Meta(description=text, extra_json_schema={"x-unit": unit}, **limits)
 
 

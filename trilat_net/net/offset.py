@@ -50,18 +50,18 @@ _Array = NDArray[np.float64]
 WINDOWS_KEPT = 60
 """Number of windows whose limits are stored."""
 DRIFT_LIMIT = 500_000.0
-"""Largest drift between two clocks, in ns/s."""
+"""Maximum drift between two clocks, in ns/s."""
 WANDER = 1_000.0
-"""Largest deviation of the drift from its mean over the stored windows, in ns/s."""
+"""Maximum deviation of the drift from its mean over the stored windows, in ns/s."""
 _NOISE_NS = 3_000.0
-"""Distance from the tightest limit at which the weight of a limit falls to a quarter, in ns."""
+"""Distance from the tightest limit at which the weight of a limit drops to a quarter, in ns."""
 _PRIOR_DRIFT = 100_000.0
-"""Standard deviation of the drift that is expected before any measurement, in ns/s.
+"""Standard deviation of the drift expected before any measurement, in ns/s.
 
-It matters only while the windows span less than a second.
+It only matters while the windows span less than a second.
 """
 _WEIGHTING_ROUNDS = 3
-"""Number of rounds of the reweighted least squares. Three are enough in practice."""
+"""Number of iterations of the reweighted least squares. Three are enough in practice."""
 
 
 class OffsetLimit(NamedTuple):
@@ -236,13 +236,13 @@ class OffsetEstimator:
 
 
 class _AdmissibleLines:
-    """All straight lines of the offset over time below every ceiling and above every floor.
+    """All straight lines for the offset over time below every ceiling and above every floor.
 
-    The ceilings and floors are the limits of the offset that follow from the time stamps. The
-    set of lines is described by its steepest and its flattest line.
+    The ceilings and floors are the limits on the offset derived from the time stamps. The set
+    of lines is described by its steepest and its flattest line.
 
     Times are in s relative to the present, and offsets in ns relative to the latest ceiling.
-    These small numbers keep the precision that floating-point numbers would lose for 64-bit
+    These small values keep the precision that floating-point arithmetic would lose on 64-bit
     times.
 
     Args:
@@ -258,10 +258,10 @@ class _AdmissibleLines:
     def __init__(
         self, ceilings: deque[OffsetLimit], floors: deque[OffsetLimit], now_ns: int
     ) -> None:
-        """Computes the steepest and the flattest line that the limits of a clock offset permit.
+        """Computes the steepest and the flattest line that the limits on a clock offset allow.
 
-        A line describes how the offset may change over time. Its slope is the drift of the
-        clock.
+        A line describes a possible course of the offset over time. Its slope is the drift of
+        the clock.
         """
         self._now_ns = now_ns
         self._base_ns = ceilings[-1].offset_ns
@@ -287,14 +287,15 @@ class _AdmissibleLines:
         self.exist = bool(simultaneous_gap >= 0.0 and self.flattest <= self.steepest)
 
     def _read_columns(self, limits: deque[OffsetLimit]) -> tuple[_Array, _Array]:
-        """Converts limits of the offset to arrays of small numbers, for precise arithmetic.
+        """Converts limits on the offset to arrays of small numbers, for precise arithmetic.
 
         Args:
             limits: Ceilings or floors.
 
         Returns:
-            The time of each limit in s relative to the present, never above 0; and its offset
-            in ns relative to the latest ceiling.
+            The time of each limit in s relative to the present, which is never positive, and
+            its
+            offset in ns relative to the latest ceiling.
         """
         times_ns = [min(0, limit.local_ns - self._now_ns) for limit in limits]
         offsets_ns = [limit.offset_ns - self._base_ns for limit in limits]
@@ -344,7 +345,7 @@ class _AdmissibleLines:
         )
 
     def _estimate_slope(self) -> float:
-        """Estimates the drift by weighted least squares, as one slope for ceilings and floors.
+        """Estimates the drift in ns/s by weighted least squares, with one slope for all limits.
 
         The ceilings and the floors have different levels but the same slope,
 
@@ -354,10 +355,10 @@ class _AdmissibleLines:
         its time, t_mean is the weighted mean time of its group, and prior is the standard
         deviation of the drift before any measurement.
 
-        A limit from a slow message contains little information. Therefore its weight falls with
-        its distance from the tightest limit of the group. This distance depends on the slope.
-        Therefore the weights are computed again in each round (iteratively reweighted least
-        squares). In the first round all weights are equal.
+        A limit from a slow message contains little information, so its weight decreases with
+        its distance from the tightest limit of the group. Because this distance depends on the
+        slope, the weights are recomputed in each round (iteratively reweighted least squares).
+        In the first round, all weights are equal.
 
         Returns:
             The drift, in ns/s.
@@ -386,13 +387,13 @@ class _AdmissibleLines:
 
 
 SLEW_NS = 1_000_000_000
-"""Time in which the smoothed offset reaches a new estimate, in ns."""
+"""Time within which the smoothed offset reaches a new estimate, in ns."""
 
 
 class _SlewSegment:
     """Smoothed offset of another clock from one estimate to the next, as two straight lines.
 
-    The first line leads from the previous value of the offset to the estimate, within SLEW_NS.
+    The first line leads from the previous value of the offset to the estimate within SLEW_NS.
     The second line follows the estimate and its drift.
 
     Args:
@@ -407,9 +408,9 @@ class _SlewSegment:
     """
 
     def __init__(self, start_ns: int, offset_ns: int, estimate: OffsetEstimate) -> None:
-        """Computes how the clock offset in use gradually approaches an estimate.
+        """Computes how the smoothed offset gradually approaches an estimate.
 
-        It also computes the largest error of the offset during the approach.
+        The largest error during the transition is computed too.
         """
         self.start_ns = start_ns
         self.estimate = estimate
@@ -522,7 +523,7 @@ class SlewedOffset:
         return self._select_segment(local_ns).error_bound_ns(local_ns)
 
     def _select_segment(self, local_ns: int) -> _SlewSegment:
-        """Returns the segment of the smoothed offset that holds at a local time.
+        """Returns the segment of the smoothed offset that applies at a local time.
 
         There are two segments: the approach to the latest estimate, and the previous segment
         for earlier times.

@@ -23,7 +23,7 @@ from .requests import Backfill, BackfillRequest, Pong
 from .wire import decode, encode
 
 QUERIES_KEPT = 128
-"""Number of the latest copies of a query whose replies are accepted."""
+"""Number of most recent copies of a query whose replies are accepted."""
 QUERY_PERIOD_NS = 200_000_000
 """Time between two queries for identities, in ns."""
 
@@ -79,22 +79,22 @@ class RepeatedQuery:
 
 
 PINGS = 20
-"""Number of round trips after which the clock of a member counts as known."""
+"""Number of round trips after which the clock of a member is considered known."""
 PINGS_PER_WINDOW = 5
-"""Number of round trips in a window. Of each window, only the most precise limits are used."""
+"""Number of round trips in a window. Only the most precise limits of each window are used."""
 PING_PACE_NS = 10_000_000
-"""Time between two pings until all clocks are known, in ns."""
+"""Interval between pings until all clocks are known, in ns."""
 PING_REST_NS = 250_000_000
-"""Time between two pings when all clocks are known, to keep the estimates up to date, in ns."""
+"""Interval between pings that keep the estimates up to date once clocks are known, in ns."""
 GLANCE_NS = 100_000
-"""Time between two polls while a reply is expected, in ns.
+"""Interval between polls while a reply is expected, in ns.
 
-It is short because the arrival of a reply is measured when it is polled.
+It is short because the arrival time of a reply is taken when the reply is polled.
 """
 _ROUND_TRIPS_KEPT = 10_000
-"""Number of the latest round trips that are kept for statistics."""
+"""Number of most recent round trips that are kept for statistics."""
 _LATE_REPLY_NS = 20_000_000
-"""Margin for the time in which a reply is expected, in ns. Two round trips are added to it."""
+"""Margin of the time within which a reply is expected, in ns. Two round trips are added."""
 
 
 def answer_pings(
@@ -232,8 +232,8 @@ class RoundTrips:
     def _close_window(self, now_ns: int) -> None:
         """Estimates the offset from the tightest limits of the window, and starts a new one.
 
-        Limits from different times are extrapolated to the present with the last estimate of
-        the drift, and then compared.
+        Limits from different times are extrapolated to the present with the last drift
+        estimate, and then compared.
 
         Args:
             now_ns: Present time on the local clock, in ns.
@@ -284,7 +284,7 @@ class Pinger:
         session: str,
         required: int = PINGS,
     ) -> None:
-        """Prepares to measure round trips to other processes, but sends no ping yet."""
+        """Prepares to measure round trips to other processes. No ping is sent yet."""
         self.trips: dict[int, RoundTrips] = {}
         self._clock = clock
         self._required = required

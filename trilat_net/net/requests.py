@@ -24,9 +24,9 @@ from ..errors import count_nouns
 from .messages import U64, VERSION, Angles, Instant, Speeds, TickNumber, Torques
 
 BACKFILL_MESSAGES = 64
-"""Largest number of messages in one `Backfill`."""
+"""Maximum number of messages in one `Backfill`."""
 BACKFILL_BYTES = 40_000
-"""Largest total size of the messages in one `Backfill`, unless one message alone is larger."""
+"""Maximum total size of the messages in one `Backfill`, unless one message alone is larger."""
 
 
 class DirectMessage(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -61,7 +61,7 @@ class Pong(DirectMessage, frozen=True, kw_only=True):
 
 
 OrderName = Literal["", "stop", "enable", "reset"]
-"""Orders that a site accepts from users. The empty text stands for no order."""
+"""Commands that a site accepts from users. An empty string stands for no command."""
 
 
 class ChangeRequest(DirectMessage, frozen=True, kw_only=True):

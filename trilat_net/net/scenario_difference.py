@@ -18,11 +18,11 @@ from ..errors import ScenarioError, count_nouns
 from ..toml_text import parse_toml
 
 LISTED_SETTINGS = 3
-"""Number of settings whose values are stated. The others are counted."""
+"""Maximum number of settings whose values are stated. The rest are only counted."""
 _VALUE_LENGTH = 40
-"""Longest text of a value, in characters."""
+"""Maximum length of a value, in characters."""
 _NAME_LENGTH = 80
-"""Longest name of a setting, in characters."""
+"""Maximum length of the name of a setting, in characters."""
 _ABSENT = "absent"
 _DESCRIPTIONS = ("title", "about", "assumed")
 """Settings that have no effect. They are named last."""
@@ -66,13 +66,13 @@ def describe_scenario_difference(
 
 
 def _read_settings(text: str) -> dict[str, str] | None:
-    """Returns the settings of a scenario by their dotted names, with their values as JSON.
+    """Returns the settings of a scenario: a mapping from dotted name to value as JSON.
 
     Args:
         text: The scenario, in TOML.
 
     Returns:
-        The settings. None if the text is not TOML, or is nested too deeply.
+        None if the text is not TOML, or is nested too deeply.
     """
     try:
         return dict(_list_settings(parse_toml(text)))
@@ -81,7 +81,7 @@ def _read_settings(text: str) -> dict[str, str] | None:
 
 
 def _list_settings(table: dict[str, Any], prefix: str = "") -> Iterator[tuple[str, str]]:
-    """Yields the dotted name and the value of each setting of a table and of its subtables."""
+    """Yields the dotted name and the value of each setting in a table and its subtables."""
     for key, value in table.items():
         name = prefix + _bound_key(key)
         if isinstance(value, dict):
@@ -91,10 +91,10 @@ def _list_settings(table: dict[str, Any], prefix: str = "") -> Iterator[tuple[st
 
 
 def _bound_key(key: str) -> str:
-    """Returns a key, or a short text that stands for a long key and for no other key.
+    """Returns a key, or a short unique string in place of a long key.
 
-    The name of a table is part of the names of all its settings. With a long name, these would
-    need far more memory than the scenario.
+    The name of a table is part of the names of all its settings. If it is long, these would
+    need far more memory than the scenario itself.
     """
     if len(key) <= _NAME_LENGTH:
         return key
@@ -103,7 +103,7 @@ def _bound_key(key: str) -> str:
 
 
 def _shorten(text: str, length: int = _VALUE_LENGTH) -> str:
-    """Returns a text without control characters, cut to a number of characters."""
+    """Removes control characters from a string, and cuts it to a maximum length."""
     printable = "".join(c if c.isprintable() else "?" for c in text)
     if len(printable) <= length:
         return printable

@@ -47,11 +47,11 @@ from .messages import Event, Info
 from .pinging import Pinger, answer_pings
 
 EPOCH_AHEAD_NS = 500_000_000
-"""Time from the proposal of an epoch to the epoch, in ns. Two round trips are added to it."""
+"""Time from the proposal of an epoch to the epoch, in ns. Two round trips are added."""
 DECIDE_NS = 150_000_000
-"""Time before the epoch by which all members must agree, in ns. A round trip is added to it."""
+"""Time before the epoch by which all members must have agreed, in ns. A round trip is added."""
 LATE_GATHER_NS = 1_500_000_000
-"""Time that a member waits to learn further sites of a running session, in ns."""
+"""Time that a member waits for further sites of a running session to appear, in ns."""
 
 
 class SessionJoin:
@@ -86,7 +86,7 @@ class SessionJoin:
         sites: Sequence[str],
         late: LateSites = LateSites(),  # noqa: B008
     ) -> None:
-        """Announces this process to the other processes of a session, and looks for them."""
+        """Announces this process to the members of a session, and starts to look for them."""
         self._clock = clock
         self._session = session
         self._publisher = publisher
@@ -153,7 +153,7 @@ class SessionJoin:
 
     @property
     def _info(self) -> Info:
-        """Identity of this member, as others receive it: its boot, scenario and clock."""
+        """Identity of this member as seen by others, with its boot, scenario and clock."""
         return self._publisher.info
 
     def poll(self) -> Epoch | None:
@@ -202,23 +202,23 @@ class SessionJoin:
         return epoch
 
     def _join_late(self, running: Sequence[Info], now_ns: int) -> Epoch | None:
-        """Takes the next step to join a session that is running already.
+        """Takes the next step to join a session that is already running.
 
-        These steps must be completed one after another:
+        The following steps must be completed in order:
 
         1. All sites of the session that are present are known, or `LATE_GATHER_NS` have passed.
         2. A site (not a recorder) knows the clocks of all running sites on other machines.
-        3. One running site is selected, whose epoch (time of tick 0) is used. Its clock is
-           known, so that the epoch can be converted to the local clock.
+        3. One running site is selected as the source of the epoch (the time of tick 0). Its
+           clock is known, so that the epoch can be converted to the local clock.
         4. A site requests admission, and all running sites grant it. A recorder needs no
-           admission and may record at once.
+           admission and may start recording at once.
 
         Args:
             running: Identities of the running sites.
             now_ns: Present time on the local clock, in ns.
 
         Returns:
-            The epoch of the session once this member may take part. None until then.
+            The epoch of the session once this member may take part, and None until then.
         """
         if self._found_running_ns is None:
             self._found_running_ns = now_ns
@@ -251,10 +251,10 @@ class SessionJoin:
         return self._request_admission(local_epoch, running, now_ns)
 
     def _awaits_sites(self, running: Sequence[Info]) -> bool:
-        """Returns True if further sites of the running session are expected to reply.
+        """Returns True if more sites of the running session are expected to reply.
 
-        The running sites (arm controllers) state the members (processes of a session) of the
-        session. Those that have disappeared or were started again are not expected to reply.
+        The running sites list the members of the session. Members that have disappeared or were
+        restarted are not expected to reply.
 
         Args:
             running: Identities of the running sites that have replied.
@@ -270,13 +270,14 @@ class SessionJoin:
         return known_sites < expected_sites  # a proper subset
 
     def _select_epoch_source(self, running: Sequence[Info]) -> Info | None:
-        """Selects the running site (arm controller) from which this member takes the epoch.
+        """Selects the running site from which this member takes the epoch.
 
-        A site on this machine is best, because its epoch needs no conversion between clocks.
-        The next best is the first site of the scenario, whose schedule the others follow.
+        A site on this machine is the best choice, because its epoch needs no conversion between
+        clocks. The next best is the first site of the scenario, whose schedule the others
+        follow.
 
         Returns:
-            The identity of the site. None if the clock of no running site is known yet.
+            The identity of the site, or None if the clock of no running site is known yet.
         """
         local_clock = self._info.clock
         indices = {name: index for index, name in enumerate(self._sites)}
@@ -298,8 +299,9 @@ class SessionJoin:
     ) -> Epoch | None:
         """Requests admission to the running session, and checks if all running sites grant it.
 
-        The request is the event `coming` with a first tick about half a second ahead. If a site
-        has not replied shortly before that tick, another request with a later tick follows.
+        The request is the event `coming`, with a first tick about half a second ahead. If a
+        site has not replied shortly before that tick, the request is repeated with a later
+        tick.
 
         Args:
             epoch: The epoch of the session on the clock of this site.
@@ -307,7 +309,8 @@ class SessionJoin:
             now_ns: Present time on the local clock, in ns.
 
         Returns:
-            The epoch and the first tick once all running sites have admitted this site. None
+            The epoch and the first tick once all running sites have admitted this site, and
+            None
             until then.
         """
         info = self._info
@@ -347,16 +350,17 @@ class SessionJoin:
         """Returns the start time and the members of a running session that this site joins.
 
         Args:
-            coming: Request of this site (event `coming`) that all running sites (arm
-                controllers) have granted. It states the first tick (control period) of this
-                site.
+            coming: Request of this site (event `coming`) that all running sites have granted.
+                It states the first tick of this site.
             epoch: Start of the session on the clock of this site.
             running: Identities of the running sites.
 
         Returns:
-            The given epoch, to which these are added: the boot of each member, which identifies
-            the start of its process; the time of tick 0 on the clock of each running site and
-            of this site, in ns; the first tick of this site; and its request.
+            The given epoch, extended by the boot of each member (which identifies the start of
+            its
+            process), the time of tick 0 on the clocks of the running sites and of this site in
+            ns,
+            the first tick of this site, and its request.
         """
         info = self._info
         # Later entries replace earlier ones: the members at the start of the session, those
@@ -372,14 +376,12 @@ class SessionJoin:
     def _list_other_clocks(
         self, boots: Mapping[str, int], clocks: Mapping[str, str]
     ) -> set[int]:
-        """Lists the sites on other machines, whose clock offsets must be measured.
+        """Returns the boots of sites on other machines, whose clock offsets are needed.
 
         Args:
-            boots: Number that identifies the start of each member's process, by name.
-            clocks: Identity of each member's clock, by name.
-
-        Returns:
-            The boots of these sites (arm controllers).
+            boots: Mapping from the name of each member to the number that identifies the start
+                of its process.
+            clocks: Mapping from the name of each member to the identity of its clock.
         """
         return {
             boot
@@ -390,22 +392,22 @@ class SessionJoin:
     def _read_events(self) -> Epoch | None:
         """Receives the events of all members, and acts on those about the start.
 
-        The members agree on the epoch, the common time of tick 0, in three steps:
+        The members agree on the epoch (the common time of tick 0) in three steps:
 
         1. `epoch`: The leader proposes an epoch. The event states the number of the proposal
            (`attempt`), and the boots of all members. A boot is a random number that identifies
            one start of a process.
-        2. `ready`: Each member agrees. It states the epoch on its own clock.
+        2. `ready`: Each member agrees, and states the epoch on its own clock.
         3. `start`: The leader confirms the proposal, and states the epochs of all members.
 
         The events `ready` and `start` repeat the number and the boots of their proposal. They
-        are ignored if this member has agreed to another proposal.
+        are ignored if this member has agreed to a different proposal.
 
-        Other events, by which a site is admitted to a session that is running already, are
-        passed to `_receive_admission`.
+        Events about the admission of a site to a running session are passed to
+        `_receive_admission`.
 
         Returns:
-            The epoch once the leader has confirmed the proposal that this member agreed to.
+            The epoch once the leader has confirmed the proposal that this member agreed to, and
             None until then.
         """
         for event in read_messages(self._events, Event):
@@ -434,18 +436,18 @@ class SessionJoin:
         return None
 
     def _receive_admission(self, event: Event) -> None:
-        """Stores whether a running site admits this site, refuses it, or admits another site.
+        """Stores whether a running site admits this site, rejects it, or admits another site.
 
-        A site (arm controller) that wants to join the running session publishes the request
-        `coming`. Each running site replies with the event `admit` or `refused`. The event
-        states which site it is about, the boot of that site (the number that identifies the
-        start of its process), and the number of the request, because a request may be repeated.
+        A site that wants to join the running session publishes the request `coming`. Each
+        running site replies with the event `admit` or `refused`. The event states which site it
+        is about, the boot of that site (the number that identifies the start of its process),
+        and the number of the request, because a request may be repeated.
 
-        Other sites may be admitted while this site waits. Their boots are always noted, because
-        they become members of the session.
+        Other sites may be admitted while this site is waiting. Their boots are always stored,
+        because they become members of the session.
 
         Args:
-            event: An event of a running site. Events of other kinds are ignored.
+            event: An event from a running site. Events of other kinds are ignored.
         """
         joining_site = event.about
         if event.kind == "admit" and joining_site in event.boots:
@@ -469,12 +471,12 @@ class SessionJoin:
 
         The proposal lists the members of the session with their boots, the numbers that
         identify the starts of their processes. This member is included if its name and its boot
-        are listed. If another boot is listed under its name, another process acts as the same
-        member.
+        are listed. If another boot is listed under its name, another process is acting as the
+        same member.
 
-        Proposals of sites other than the leader are ignored. A recorder does not know the
-        leader. It learns the scenario from the identities of the sites, and ignores proposals
-        until one of the listed sites has sent it.
+        Proposals from sites other than the leader are ignored. A recorder does not know the
+        leader, because it obtains the scenario from the identities of the sites. It ignores
+        proposals until it has received the scenario from one of the listed sites.
 
         The member agrees (`_reply_ready`) as soon as it has measured the clocks of the others.
 
@@ -511,8 +513,8 @@ class SessionJoin:
     def _must_wait_for_other_leader(self, event: Event) -> bool:
         """Returns True if this member has agreed to a proposal that may still be confirmed.
 
-        If the leader was started twice, or was restarted, proposals of two processes arrive.
-        A member that has agreed to one of them must not agree to the other, until the epoch of
+        If the leader was started twice, or was restarted, proposals from two processes arrive.
+        A member that has agreed to one of them must not agree to the other until the epoch of
         the first has passed or its process has disappeared.
 
         Args:
@@ -528,9 +530,9 @@ class SessionJoin:
     def _reply_ready(self) -> None:
         """Agrees to the leader's proposal of an epoch once this member has measured all clocks.
 
-        Without a waiting proposal, or while the offset of a clock is still unknown, nothing
-        happens, and the caller tries again later. The reply, the event `ready`, states the
-        proposed epoch on the clock of this member (process of a session).
+        If there is no pending proposal, or the offset of a clock is still unknown, nothing
+        happens, and the caller tries again later. The reply (the event `ready`) states the
+        proposed epoch on the clock of this member.
         """
         proposal = self._waiting_proposal
         if proposal is None:
@@ -561,15 +563,15 @@ class SessionJoin:
     def _lead(self) -> Epoch | None:
         """Takes the next step of the leader: proposes an epoch, or confirms or withdraws it.
 
-        An epoch is proposed once all members are present and their clocks are known. It is
+        An epoch is proposed once all members are present and their clocks are known, and
         confirmed once all members have agreed. It is withdrawn if a member is too late, has
         disappeared, or has joined in the meantime. The next call then proposes another one.
 
         The decision must be made early enough for the confirmation to reach all members before
-        the epoch: earlier than the epoch by `DECIDE_NS` plus the slowest round trip.
+        the epoch, at least `DECIDE_NS` plus the slowest round trip in advance.
 
         Returns:
-            The epoch once it is confirmed. None until then.
+            The epoch once it is confirmed, and None until then.
         """
         now_ns = self._clock.monotonic_ns()
         membership = self.membership
@@ -604,7 +606,7 @@ class SessionJoin:
         return self._make_epoch(start)
 
     def _announce(self, now_ns: int) -> None:
-        """Proposes a common start time (epoch) to all processes, as the leader of the session.
+        """Proposes a common start time (epoch) to all members, as the leader of the session.
 
         Args:
             now_ns: Present time on the local clock, in ns.
@@ -627,11 +629,10 @@ class SessionJoin:
         )
 
     def _make_epoch(self, start: Event) -> Epoch:
-        """Returns the common start time (epoch) of the session, which its leader has confirmed.
+        """Returns the common start time (epoch) of the session, as confirmed by its leader.
 
         Args:
-            start: The leader's event `start`, which states the members (processes of a session)
-                and their epochs.
+            start: The leader's event `start`, which states the members and their epochs.
         """
         assert self._agreed_proposal is not None
         return Epoch(

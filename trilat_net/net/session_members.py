@@ -38,7 +38,7 @@ POLL_NS = 5_000_000
 REPLY_TIMEOUT_S = 3.0
 """Longest wait for a reply, in s."""
 _NAME_CHECK_S = 0.7
-"""Time for which a playback looks for sites of a session with the same name, in s.
+"""Time for which a playback searches for sites of a session with the same name, in s.
 
 Sites try to connect every half second.
 """
@@ -224,7 +224,7 @@ class SessionMembers:
             request: The request.
 
         Returns:
-            The payload of the reply. None if no reply arrives within `REPLY_TIMEOUT_S`.
+            The payload of the reply, or None if no reply arrives within `REPLY_TIMEOUT_S`.
         """
         replies = self._bus.query(key, encode(request))
         deadline_ns = self._clock.monotonic_ns() + int(REPLY_TIMEOUT_S * 1e9)

@@ -21,9 +21,9 @@ from .requests import BackfillRequest
 from .wire import encode
 
 REFRESH_NS = 500_000_000
-"""Time for which an encoded identity is used again, in ns.
+"""Time for which an encoded identity is reused, in ns.
 
-An identity contains a whole scenario, so that its encoding takes long.
+Encoding takes long, because an identity contains a complete scenario.
 """
 
 

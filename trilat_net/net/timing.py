@@ -46,11 +46,11 @@ from .offset import (
 from .topics import ticks_per_stats
 
 SLEW_LIMIT = 200_000.0
-"""Largest deviation of the rate of a schedule from the rate of its clock, in ns/s (200 ppm)."""
+"""Maximum deviation of the rate of a schedule from that of its clock, in ns/s (200 ppm)."""
 _CORRECTION_TIME_S = 2.0
 """Time constant with which a schedule corrects its error, in s.
 
-It is long compared with the noise of an offset estimate, so that the noise is averaged.
+It is long enough to average out the noise of an offset estimate.
 """
 
 
@@ -113,9 +113,9 @@ WINDOW_NS = 1_000_000_000
 """Length of a window of time stamps, from which an offset is estimated, in ns."""
 FIRST_WINDOW_NS = 100_000_000
 FIRST_WINDOWS = 5
-"""The first windows are shorter, so that better offsets soon replace those of the pings."""
+"""Number of shorter windows at the start, which quickly improve on the offsets from pings."""
 _NO_DELAY_NS = 1 << 62
-"""Initial value of a smallest delay, larger than any delay that can be measured."""
+"""Initial value for the search of a minimum delay, larger than any measurable delay, in ns."""
 
 
 class SentStamps:
@@ -237,10 +237,10 @@ class LinkTimingMonitor:
         self._open_window()
 
     def _open_window(self) -> None:
-        """Begins a new interval of time, in which the smallest delay per direction is sought.
+        """Begins a new time window, in which the minimum delay per direction is determined.
 
-        Only the smallest delay is kept, because it gives the tightest limit of the offset
-        between the clocks.
+        Only the minimum is kept, because it gives the tightest limit on the offset between the
+        clocks.
         """
         self._smallest_outward_ns = _NO_DELAY_NS
         self._smallest_return_ns = _NO_DELAY_NS
@@ -405,18 +405,18 @@ class LinkTimingMonitor:
 
 
 FAULT_EVERY_NS = 1_000_000_000
-"""Shortest time between two events about clock faults of one peer, in ns."""
+"""Minimum time between two events about clock faults of the same peer, in ns."""
 _UNHEARD_NS = 200_000_000
-"""Time without a new acknowledgement after which a peer counts as not receiving this site.
+"""Time with no new acknowledgement after which a peer counts as not receiving this site.
 
-The condition applies only while samples of the peer itself arrive.
+The condition applies only while samples from the peer itself arrive.
 """
 _FIRST_BOUND_NS = 2_000_000
-"""Margin that is added to the clock error that a joining site states, in ns."""
+"""Margin added to the clock error reported by a joining site, in ns."""
 
 
 ClockNotice = dict[str, Any]
-"""Fields of an event about a peer's clock, or about a peer that does not receive this site."""
+"""Fields of an event about a peer's clock, or about a peer that is not receiving this site."""
 
 
 def find_turn_ns(index: int, sites: int, rate_hz: int) -> int:
@@ -461,7 +461,7 @@ class SiteTiming:
         leader: str,
         turn_ns: int = 0,
     ) -> None:
-        """Starts the schedule of control periods with first estimates of the other clocks."""
+        """Starts the schedule of ticks, with initial estimates of the other clocks."""
         self.schedule = TickSchedule(epoch_ns, rate_hz)
         self.turn_ns = turn_ns
         self._epoch_ns = epoch_ns
@@ -614,10 +614,10 @@ class SiteTiming:
         return notices
 
     def _update_next_estimate(self, k: int, now_ns: int, due_ns: int) -> list[ClockNotice]:
-        """Estimates the clock offset of at most one peer. The peers are taken in turn.
+        """Estimates the clock offset of at most one peer, taking the peers in turn.
 
-        One estimate takes a considerable part of a period. Several of them in one call would
-        make the next tick late.
+        One estimate takes a considerable part of a tick. Several of them in one call would
+        delay the next tick.
 
         Args:
             k: Next tick.
@@ -639,12 +639,12 @@ class SiteTiming:
         """Returns the events about a peer's clock faults and about its acknowledgements.
 
         Clock faults are reported at most once per `FAULT_EVERY_NS`. If the peer no longer
-        confirms the samples of this site (arm controller), this is reported once, and its end
-        is reported as well.
+        acknowledges the samples of this site, this is reported once when it begins and once
+        when it ends.
 
         Args:
             index: Index of the peer.
-            k: Next tick (control period).
+            k: Next tick.
             now_ns: Present time on the site's clock, in ns.
         """
         monitor = self.monitors[index]
@@ -691,11 +691,11 @@ class SiteTiming:
 def _describe_estimate(monitor: LinkTimingMonitor, k: int, local_ns: int) -> ClockNotice:
     """Returns the event that states the offset and the drift of a peer's clock.
 
-    Users and the log thus learn how accurate the measured delays are.
+    It shows users and readers of the log how accurate the measured delays are.
 
     Args:
-        monitor: Timing of the link from the peer (other site).
-        k: First tick (control period) to which the offset applies.
+        monitor: Timing of the link from the peer.
+        k: First tick to which the offset applies.
         local_ns: Time of that tick on the local clock, in ns.
     """
     offset = monitor.offset
@@ -720,10 +720,10 @@ def _describe_estimate(monitor: LinkTimingMonitor, k: int, local_ns: int) -> Clo
 
 
 def _describe_fault(monitor: LinkTimingMonitor) -> ClockNotice:
-    """Returns the event that a peer's clock, or the local clock, has stepped.
+    """Returns the event that reports that a peer's clock, or the local clock, has stepped.
 
-    The evidence is a sample (sent state) that seems to have arrived before it was sent, or a
-    window of time stamps that contradicts earlier windows.
+    The evidence is a sample that seems to have arrived before it was sent, or a window of time
+    stamps that contradicts earlier windows.
     """
     name = monitor.peer.name
 
@@ -747,12 +747,12 @@ def _describe_fault(monitor: LinkTimingMonitor) -> ClockNotice:
 def _describe_acknowledgement(monitor: LinkTimingMonitor, k: int) -> ClockNotice:
     """Returns the event that a peer no longer receives this site, or receives it again.
 
-    Samples of the peer arrive in both cases. The event tells users that the connection is
-    interrupted in the other direction only, from this site (arm controller) to the peer.
+    Samples from the peer arrive in both cases. The event tells users that the connection is
+    interrupted only in the other direction, from this site to the peer.
 
     Args:
         monitor: Timing of the link from the peer.
-        k: Present tick (control period), which the event states in its field `ticks`.
+        k: Current tick, which the event states in its field `ticks`.
     """
     name = monitor.peer.name
     if monitor.is_unacknowledged:
@@ -769,7 +769,7 @@ def _describe_acknowledgement(monitor: LinkTimingMonitor, k: int) -> ClockNotice
 
 
 _LINK_COUNTS = ("accepted", "late", "duplicate", "refused", "lost", "superseded", "copies")
-"""Counts of a link that the kernel keeps, and that `LinkStats` contains for each peer."""
+"""Counters of a link kept by the kernel, which `LinkStats` contains for each peer."""
 
 
 class LoopStats:

@@ -41,13 +41,13 @@ from .messages import (
 from .requests import BACKFILL_BYTES, ArmMeasurement, Backfill, DirectMessage, HandMessage
 
 MAX_BYTES = 65_536
-"""Largest payload of a message, in bytes. `Info` and `Backfill` may be larger."""
+"""Maximum payload of a message, in bytes. `Info` and `Backfill` may be larger."""
 MAX_INFO_BYTES = 64 * 1024 * 1024
-"""Largest payload of an `Info`, in bytes. It contains a scenario with its recorded delays."""
+"""Maximum payload of an `Info`, in bytes. It contains a scenario with its recorded delays."""
 _MAX_PAST_BYTES = 2 * MAX_BYTES
-"""Largest payload of a `Backfill`, in bytes."""
+"""Maximum payload of a `Backfill`, in bytes."""
 SAMPLE_BYTES = 2_048
-"""Largest size of a `PeerSample` without the numbers of its vectors, in bytes."""
+"""Maximum size of a `PeerSample`, excluding the elements of its vectors, in bytes."""
 _NUMBER_BYTES = 9
 """Size of an encoded floating-point number, in bytes."""
 
@@ -68,19 +68,18 @@ _SIZE_LIMITS: dict[type[msgspec.Struct], int] = {
     Info: MAX_INFO_BYTES,
     Backfill: _MAX_PAST_BYTES,
 }
-"""Largest payloads of the messages that may be larger than `MAX_BYTES`."""
+"""Maximum payloads of the messages that may exceed `MAX_BYTES`."""
 _isfinite = math.isfinite
 _encode = msgspec.msgpack.Encoder().encode
 
 
 @cache
 def _list_vector_lengths(kind: type[msgspec.Struct], layout: Layout) -> dict[str, int]:
-    """Returns the vectors of a message type by name, with their lengths for a site.
+    """Returns a mapping from each vector field of a message type to its length for a site.
 
     Args:
         kind: The message type.
-        layout: Numbers of joints, peers and parameters of the site (arm controller) that sends
-            the message.
+        layout: Numbers of joints, peers and parameters of the site that sends the message.
     """
     if kind is State:
         # Vectors that the layout does not mention must be absent.
@@ -451,13 +450,13 @@ def make_sample_reader(layout: Layout) -> Callable[[bytes], PeerSample | WireErr
 
 
 def _check_lengths(vectors: tuple[list[float], ...], lengths: dict[str, int]) -> None:
-    """Checks that the vectors of a received message have the lengths of the scenario.
+    """Raises WireError if a vector of a received message does not have the expected length.
 
-    A message with other lengths comes from a program that runs another scenario.
+    Such a message comes from a program that runs a different scenario.
 
     Args:
         vectors: The vectors of a message.
-        lengths: Required lengths, by the name of the vector.
+        lengths: Mapping from the name of each vector to its required length.
 
     Raises:
         WireError: A vector has another length. If it contains joint angles, the reason states
@@ -477,7 +476,7 @@ def _check_lengths(vectors: tuple[list[float], ...], lengths: dict[str, int]) ->
 def _check_finite(
     message: Any, vectors: tuple[list[float], ...], names: Collection[str]
 ) -> None:
-    """Raises the error for the first vector that contains a number that is not finite.
+    """Raises WireError for the first vector that contains a value that is not finite.
 
     Args:
         message: The message.
@@ -485,7 +484,7 @@ def _check_finite(
         names: Names of the vectors.
 
     Raises:
-        WireError: A number is not finite.
+        WireError: A value is not finite.
     """
     for name, vector in zip(names, vectors, strict=True):
         if not all(map(_isfinite, vector)):

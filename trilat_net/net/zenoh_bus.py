@@ -40,16 +40,16 @@ from .bus import (
 from .zenoh_config import Endpoint, ZenohFile, ZenohMode, make_zenoh_config
 
 _QUERY_TIMEOUT_S = 3.0
-"""Time after which Zenoh discards a query without replies, in s."""
+"""Time after which Zenoh discards a query that has received no replies, in s."""
 _SHARED_POOL = (
     "(rx:(worker_threads:4),tx:(handover:rx),acc:(handover:rx),"
     "net:(handover:rx),app:(handover:rx))"
 )
 """Zenoh's runtime setting that makes its five thread pools share the threads of one pool."""
 MAX_DEPTH = 100
-"""Largest permitted nesting of a user's Zenoh file.
+"""Maximum nesting depth of a user's Zenoh file.
 
-Zenoh's recursive parser would overflow its stack if the nesting were too deep.
+Deeper nesting would overflow the stack of Zenoh's recursive parser.
 """
 
 
@@ -78,13 +78,13 @@ class RouterSilent(SessionError):  # noqa: N818 - it names an outcome
 
 
 class _ZenohRing(Generic[T]):
-    """Queue of objects that Zenoh has received, such as messages, replies or tokens.
+    """Queue of objects received by Zenoh, such as messages, replies or tokens.
 
-    An object is converted when it is polled, and not when it arrives.
+    Objects are converted when they are polled, not when they arrive.
 
     Args:
-        channel: Channel of Zenoh into which the objects arrive.
-        read: Function that converts an object into an entry. If it returns None, the object is
+        channel: Zenoh channel in which the objects arrive.
+        read: Function that converts an object to an entry. If it returns None, the object is
             skipped.
     """
 
@@ -114,11 +114,11 @@ def _make_sample_handler(receive: Callable[[Any], None]) -> Any:
     """Returns a Zenoh handler that calls a function with every message, in threads of Zenoh.
 
     The handler also makes these calls cheaper. CPython keeps a data structure for each thread
-    that runs Python code. Zenoh's threads are not created by Python: for them, CPython creates
+    that runs Python code. Because Zenoh's threads are not created by Python, CPython creates
     the structure at the beginning of each call and deletes it at the end, which costs more than
-    the call itself. CPython counts how often a thread has entered and left the interpreter, and
-    deletes the structure when the counts are equal. The handler enters once more in each
-    thread, and never leaves again, so that the structure is kept.
+    the call itself. The structure is deleted when the thread has left the interpreter as often
+    as it has entered it. The handler therefore enters the interpreter one extra time in each
+    thread and never leaves it, which keeps the structure.
 
     Args:
         receive: Function that receives each message.
@@ -141,14 +141,14 @@ def _make_sample_handler(receive: Callable[[Any], None]) -> Any:
 
 
 def _read_sample(sample: Any) -> tuple[str, bytes]:
-    """Returns the key under which a message was published, and its bytes."""
+    """Returns the key and the payload of a published message."""
     return str(sample.key_expr), sample.payload.to_bytes()
 
 
 class _ZenohQuery(NamedTuple):
-    """A request of another process that waits for a reply, received through Zenoh.
+    """A query from another process, received through Zenoh, that is waiting for a reply.
 
-    It implements `Query` of the interface `bus`. The key is the address of the reply.
+    Implements the interface `Query` from `bus`. The key is the address of the reply.
     """
 
     query: zenoh.Query
@@ -275,20 +275,20 @@ class ZenohBus:
         return put
 
     def _subscribe(self, key: str, handler: Any) -> Any:
-        """Subscribes to messages through Zenoh, except those that this connection publishes.
+        """Subscribes to messages through Zenoh, excluding those published by this connection.
 
         Args:
             key: Key of the messages; it may contain wildcards.
-            handler: Handler of Zenoh that receives the messages.
+            handler: Zenoh handler that receives the messages.
         """
         return self._session.declare_subscriber(key, handler, allowed_origin=Locality.REMOTE)
 
     def _serve(self, key: str, handler: Any) -> Any:
-        """Begins to receive queries through Zenoh, except those of this connection itself.
+        """Starts receiving queries through Zenoh, excluding those sent by this connection.
 
         Args:
             key: Key of the queries.
-            handler: Handler of Zenoh that receives the queries.
+            handler: Zenoh handler that receives the queries.
         """
         return self._session.declare_queryable(key, handler, allowed_origin=Locality.REMOTE)
 
@@ -467,17 +467,17 @@ def read_zenoh_file(path: Path) -> ZenohFile:
 
 
 def _parse_json5(source: str, text: str) -> object:
-    """Parses a JSON5 text with the parser of Zenoh.
+    """Parses JSON5 with the parser built into Zenoh.
 
-    Zenoh can only parse whole configurations. The text is therefore parsed as part of the key
-    `metadata` of a configuration, which may have any value.
+    Zenoh can only parse complete configurations. The text is therefore embedded in a
+    configuration under the key `metadata`, which may have any value.
 
     Args:
         source: Name of the file, for error messages.
         text: Content of the file.
 
     Returns:
-        The object, which is a dict if the text is a configuration.
+        The parsed object, which is a dict if the text is a configuration.
 
     Raises:
         UsageError: The text is not JSON5, is nested too deeply, or contains several objects.
@@ -511,7 +511,7 @@ def _parse_json5(source: str, text: str) -> object:
 
 
 def _find_refusal(settings: Mapping[str, Any]) -> str:
-    """Returns the reason why Zenoh refuses a configuration, or "" if Zenoh accepts it.
+    """Returns Zenoh's reason for rejecting a configuration, or an empty string if it is valid.
 
     Args:
         settings: The configuration, or a part of it.
@@ -524,7 +524,7 @@ def _find_refusal(settings: Mapping[str, Any]) -> str:
 
 
 def _first_line(error: zenoh.ZError) -> str:
-    """Returns the first line of a Zenoh error, as the reason in a message to the user.
+    """Returns the first line of a Zenoh error, for use as the reason in a message to the user.
 
     The position in Zenoh's source code is removed, and a very long line is cut after 400
     characters.
@@ -533,5 +533,5 @@ def _first_line(error: zenoh.ZError) -> str:
 
 
 def _endpoint_texts(endpoints: Sequence[Endpoint]) -> str:
-    """Returns endpoints as one text for messages: "tcp/127.0.0.1:7447, tcp/10.0.0.2:7447"."""
+    """Joins endpoints into one string for messages: "tcp/127.0.0.1:7447, tcp/10.0.0.2:7447"."""
     return ", ".join(map(str, endpoints))

@@ -70,9 +70,9 @@ TYPE_HASHES = {
 }
 """SHA-256 of each type's definition (REP 2016). It is the same from ROS 2 Iron to Lyrical."""
 DISTROS = ("humble", "jazzy", "kilted", "lyrical")
-"""Distributions of ROS 2 with which messages can be exchanged."""
+"""ROS 2 distributions with which messages can be exchanged."""
 _NO_HASH = "TypeHashNotSupported"
-"""Text that ROS 2 Humble writes in place of the hash of a message type."""
+"""String that ROS 2 Humble writes in place of the hash of a message type."""
 P = ParamSpec("P")
 _ATTACHMENT = struct.Struct("<qqB16s")
 """Layout of an attachment: number, time of sending, length of the identifier, and identifier.
@@ -165,10 +165,10 @@ def find_type_hash(kind: str, distro: str) -> str:
 
 
 def _name_dds_type(kind: str) -> str:
-    """Returns the name of a ROS message type in the notation of DDS.
+    """Returns the name of a ROS message type in DDS notation.
 
     Over Zenoh, ROS uses this notation in the keys of messages, and in the tokens that announce
-    publishers and subscriptions. For "std_msgs/msg/String" it is
+    publishers and subscriptions. For example, "std_msgs/msg/String" becomes
     "std_msgs::msg::dds_::String_".
 
     Args:
@@ -258,16 +258,16 @@ class Ros2Member(NamedTuple):
         """Returns the part of liveliness tokens that names the node, "%/NAMESPACE/NAME".
 
         The first % stands for the root enclave, to which security rules may be attached. A node
-        without a namespace has a % in place of the namespace.
+        with no namespace has a % in place of the namespace.
         """
         namespace = _mangle("/" + self.namespace) if self.namespace else "%"
         return f"%/{namespace}/{self.name}"
 
 
 def _mangle(name: str) -> str:
-    """Returns a name as ROS 2 writes it in a token: "/arm/joints" as "%arm%joints".
+    """Returns a name as written in ROS 2 tokens: "/arm/joints" becomes "%arm%joints".
 
-    A token is itself a path whose parts are divided by slashes.
+    This is necessary because a token is itself a path whose parts are separated by slashes.
     """
     return name.replace("/", "%")
 
@@ -284,20 +284,22 @@ def make_gid(token: str) -> bytes:
 _SETTINGS = {"timestamping": {"enabled": {"client": True}}}
 """Zenoh settings of the session.
 
-Messages need time stamps, by which late subscribers of a latched topic find the last messages.
+Messages need time stamps, which late subscribers of a latched topic use to find the most recent
+messages.
 """
 SENSOR = QualityOfService(reliable=False, depth=5)
 """Quality of service of all subscriptions of this program.
 
 It requests unreliable delivery, which every publisher can provide. ROS would not connect a
-subscription that requests reliable delivery with an unreliable publisher.
+subscription that requests reliable delivery to an unreliable publisher.
 """
 
 
 _MAX_REASONS = 64
 """Number of reasons that are counted separately.
 
-It is limited because reasons contain texts from other programs, which may differ every time.
+The number is limited because reasons contain text from other programs, which may differ every
+time.
 """
 
 
@@ -379,7 +381,7 @@ class TopicPublisher:
         *,
         latched: bool,
     ) -> None:
-        """Stores a publisher of a ROS 2 topic, whose messages are numbered from 1."""
+        """Stores a publisher for a ROS 2 topic, whose messages are numbered from 1."""
         self._declared = declared
         self._gid = gid
         self._clock = clock
@@ -553,9 +555,9 @@ class Ros2Graph:
     def _report_mismatches(self, topic: str, kind: str) -> None:
         """Reports the publishers of a topic whose messages cannot be received here.
 
-        Every publisher of ROS has a liveliness token, a Zenoh key that states its domain, topic
+        Every ROS publisher has a liveliness token, a Zenoh key that states its domain, topic
         and message type. The tokens of all publishers of the topic are observed, including
-        those that exist already.
+        those that already exist.
 
         Args:
             topic: Name of the topic.
@@ -599,12 +601,12 @@ class Ros2Graph:
     def _declare_subscriber(
         self, key: str, topic: str, receive: Callable[[zenoh.Sample, Attachment], None]
     ) -> None:
-        """Creates a Zenoh subscriber that refuses messages without an attachment.
+        """Creates a Zenoh subscriber that rejects messages without an attachment.
 
         Args:
             key: Zenoh key, which may contain wildcards.
-            topic: Name of the topic, for the reasons of refusals.
-            receive: Function that receives each other message.
+            topic: Name of the topic, for the reasons given when messages are rejected.
+            receive: Function that receives all other messages.
         """
 
         def receive_sample(sample: zenoh.Sample) -> None:
@@ -658,8 +660,8 @@ class Ros2Graph:
     ) -> tuple[str, bytes]:
         """Announces a publisher, subscription or service to ROS programs.
 
-        It is announced by a liveliness token, a Zenoh key that exists as long as this program
-        is connected.
+        The announcement is a liveliness token, a Zenoh key that exists while this program is
+        connected.
 
         Args:
             end: Kind of the endpoint.
@@ -668,7 +670,7 @@ class Ros2Graph:
             qos: Quality of service.
 
         Returns:
-            The Zenoh key of the endpoint, and 16 bytes that identify it.
+            The Zenoh key of the endpoint, and the 16 bytes that identify it.
         """
         self._endpoints += 1
         type_hash = find_type_hash(kind, self._distro)
