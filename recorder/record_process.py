@@ -46,36 +46,35 @@ NICE = -5
 Sites have a higher priority, because their ticks are due within a millisecond.
 """
 POLL_NS = 10_000_000
-"""Pause between two polls in ns, while the recorder waits for the session or for missing
-messages.
+"""Pause between polls while the recorder waits for the session or for missing messages, in ns.
 """
 _END_S = 10
-"""Time without any missing message after which the recorder ends, once a signal has told it to,
-in s. Sites keep their messages for that long.
+"""Time in s with no recovered message after which the recorder ends, once a signal has told it
+to. Sites keep their messages for that long.
 """
 END_NS = _END_S * 1_000_000_000
 LONGEST_END_NS = 60_000_000_000
-"""Longest time after a signal in which the sites' remaining messages are requested, in ns."""
+"""Maximum time after a signal during which the sites' remaining messages are requested, in ns.
+"""
 FLUSH_NS = 65_000_000
-"""Period with which the messages are written and flushed, in ns.
+"""Interval at which the messages are written and flushed, in ns.
 
-A crash loses at most the messages of this time.
-
-A longer period costs less computing time.
+A crash loses at most the messages of one interval. A longer interval costs less computing time.
 """
 
 
 ReadScenario = Callable[[str, str], tuple[SessionScenario, MakeViews | None]]
-"""Function that reads the text of a resolved scenario, which another process has sent.
+"""Function that parses the text of a resolved scenario, which another process has sent.
 
 Its second argument is the name of the text, for error messages. The text is not trusted. The
-result has the names, rates and sizes of the sites, from which the messages to expect follow.
-It also has a function that creates the messages for viewers of logs, or None if the log
+result contains the names, rates and sizes of the sites, which determine the expected messages.
+It also contains a function that creates the messages for log viewers, or None if the log
 contains no such messages. The recorder does not import the code that interprets scenarios, so
-that its caller provides this function.
+its caller provides this function.
 """
 CollectProvenance = Callable[[], Mapping[str, str]]
-"""Function that returns the facts about this program that a log contains, see `provenance`."""
+"""Function that returns the information about this program stored in a log, see `provenance`.
+"""
 
 
 class Recorder:
@@ -239,12 +238,11 @@ class Recorder:
         return recording
 
     def _find_scenario(self, epoch: Epoch) -> tuple[SessionScenario, MakeViews | None]:
-        """Returns the scenario to record, and the function that makes channels for viewers.
+        """Returns the scenario to record, and the function that creates channels for viewers.
 
-        A member has sent the scenario with its identity. The function is None if no such
-        channels are recorded.
-        A recorder needs no scenario file. Members that were started again after the common
-        start was agreed are ignored. They have another boot, the random number of a start.
+        The scenario is part of a member's identity, so a recorder needs no scenario file. The
+        function is None if no channels for viewers are recorded. Members that were restarted
+        after the common start was agreed have a different boot, and are ignored.
 
         Args:
             epoch: Agreed start of the session, with the boots of its members.
@@ -258,12 +256,10 @@ class Recorder:
         return self._read_scenario(sender.scenario, sender.member)
 
     def _announce_start(self, recording: Recording, epoch: Epoch, path: Path) -> None:
-        """Announces on the network that the recorder runs.
+        """Announces on the network that the recorder is running.
 
-        A recorder that joins late also requests earlier messages.
-
-        The other processes of the session wait for this announcement, from which they know that
-        their messages are recorded.
+        The announcement tells the other processes of the session, which wait for it, that their
+        messages are recorded. A recorder that joins late also requests earlier messages.
 
         Args:
             recording: The recording, which has just been created.
@@ -289,8 +285,8 @@ class Recorder:
     def _receive_presence(self, recording: Recording) -> None:
         """Informs the recording which processes have joined the session's network or left it.
 
-        Zenoh, the network library, reports both. From these reports the recording decides which
-        sites (processes that control an arm) it still has to wait for before it closes the log.
+        Zenoh, the network library, reports both. The recording uses these reports to decide
+        which sites it still has to wait for before closing the log.
         """
         while (change := self._presence.poll()) is not None:
             key, alive = change
@@ -299,7 +295,7 @@ class Recorder:
     def _run(self, recording: Recording, report: RecorderReport) -> None:
         """Writes received messages to the log at regular intervals until the session is over.
 
-        The loop also ends if the recorder itself is asked to end, for example by Ctrl-C.
+        The loop also ends if the recorder itself is told to end, for example by Ctrl-C.
 
         Args:
             recording: The recording, whose log is written.
@@ -332,11 +328,11 @@ class Recorder:
             self._repair_until(recording, now_ns + FLUSH_NS)
 
     def _repair_until(self, recording: Recording, until_ns: int) -> None:
-        """Waits until a given time. Meanwhile missing messages are requested and written.
+        """Waits until a given time while requesting and writing missing messages.
 
-        A site replies with few messages at a time, so as not to delay its control loop. If the
-        next request waited for the next flush, a recorder that was delayed on a busy machine
-        would never catch up.
+        A site sends only a few messages per reply, to avoid delaying its control loop. If each
+        request waited for the next flush, a recorder that was delayed on a busy machine would
+        never catch up.
 
         Args:
             recording: The recording.

@@ -38,17 +38,15 @@ from .site_reception import AWAY_NS, InboundQueue, SiteMessage, SiteReception
 SETTLE_NS = 1_000_000_000
 """Time to wait for messages in transit after a site has ended and disappeared, in ns."""
 RECONNECT_NS = 10_000_000_000
-"""Time to wait for a site that has ended but still has missing records, if its connection is
-interrupted, in ns.
-"""
+"""Time to wait for a disconnected site that has ended but still has missing records, in ns."""
 _HEARD_NS = 500_000_000
-"""A site counts as running if one of its messages arrived within this time, in ns."""
+"""Time since its last message within which a site counts as running, in ns."""
 _UNDER_WAY_NS = 100_000_000
-"""Time for which messages of a site that has disappeared may have been in transit, in ns."""
+"""Time for which messages from a site that has disappeared may have been in transit, in ns."""
 STARTS_KEPT = 4096
-"""Largest number of starts of sites that are remembered before they are recorded."""
+"""Maximum number of starts of sites that are remembered before they are recorded."""
 LAST_NS = 6_000_000_000
-"""Longest time that a site stays after its last tick: 5 s and a margin, in ns."""
+"""Maximum time that a site stays after its last tick: 5 s plus a margin, in ns."""
 
 
 class Recording:
@@ -212,10 +210,10 @@ class Recording:
         return max(repair.progress_ns for repair in self._repairs.values())
 
     def _repair_gaps(self, name: str, repair: GapRepair, now_ns: int) -> None:
-        """Writes messages that a site sent again on request, and requests further missing ones.
+        """Writes messages that a site resent on request, and requests further missing ones.
 
-        Three time scales occur: the monotonic clock, the time since the epoch (the start of the
-        session), and the Unix time, which the log states as the time of arrival.
+        Three time scales are used: the monotonic clock, the time since the epoch (the start of
+        the session), and Unix time, which the log contains as the time of arrival.
 
         Args:
             name: Name of the site.
@@ -241,9 +239,8 @@ class Recording:
     def _publish_stored(self, site: SiteReception, now_ns: int) -> None:
         """Announces that the log has all messages of one site that can still be obtained.
 
-        A site is the process that controls one arm. Its process waits for this event before it
-        ends, because it keeps messages that the recorder may request again. The text says which
-        messages stay missing.
+        The site waits for this event before it ends, because it keeps messages that the
+        recorder may request again. The text of the event says which messages remain missing.
 
         Args:
             site: Reception of the site, which has ended.
@@ -262,10 +259,10 @@ class Recording:
         )
 
     def _drain(self, queue: InboundQueue, until_ns: int | None) -> None:
-        """Writes the messages of the queue, and counts those that cannot be written as dropped.
+        """Writes the messages in the queue, and counts those that cannot be written as dropped.
 
-        The writing thread calls this regularly. A message that cannot be written, for example
-        because it is invalid, must not end the recording.
+        The writing thread calls this method regularly. A message that cannot be written, for
+        example because it is invalid, must not end the recording.
 
         Args:
             queue: Queue of the received messages.
@@ -284,12 +281,12 @@ class Recording:
                 self.dropped[error.reason] += 1
 
     def _admit_starts(self) -> None:
-        """Begins to record the next start of each site that was started again.
+        """Begins to record the next start of each site that was restarted.
 
-        A start is one execution of the site's process. A second start may also be a mistake, so
-        that two processes act as the same site. Therefore the next start is recorded only if
-        the previous one has disappeared or ended, or if another site of the session has
-        admitted the new start. Until then it remains in `_next_boots`.
+        A second start may also be a mistake that makes two processes act as the same site. The
+        next start is therefore recorded only if the previous one has disappeared or ended, or
+        if another site of the session has admitted the new start. Until then, it remains in
+        `_next_boots`.
         """
         for name, boot in list(self._next_boots.items()):
             previous = self._sites[name]
@@ -323,10 +320,10 @@ class Recording:
                 self._gone_sites.discard(name)
 
     def _note_start(self, name: str, payload: bytes) -> None:
-        """Notes that a site was started again, if a message is the event that announces it.
+        """Registers that a site was restarted, if a message is the event that announces it.
 
         From then on, messages of the new start are expected. A message that announces another
-        member, or a scenario in which sites may not return, changes nothing.
+        member, or belongs to a scenario in which sites may not return, has no effect.
 
         Args:
             name: Name of the site under whose key the message arrived.
@@ -345,19 +342,20 @@ class Recording:
             self._admit_starts()
 
     def _note_admission(self, event: object) -> None:
-        """Evaluates an event by which one site reports that another site was started again.
+        """Evaluates an event in which one site reports that another site was restarted.
 
-        There are two such events, and both state the boot, the random number that identifies
-        the new start:
+        There are two such events, and both state the boot (the random number that identifies
+        the new start):
 
         - "admit": The reporting site has admitted the new start to the session. If this start
-          is not recorded yet, it will be recorded now.
-        - `LAST`: The number of ticks (records of control periods) that the reporting site had
-          received before the new start. It is evaluated when the new start is being recorded,
-          because it shows how many messages of the previous start are missing.
+          is not recorded yet, it will be recorded from now on.
+        - `LAST`: The number of ticks whose samples the reporting site had received before the
+          new start. It is evaluated once the new start is being recorded, because it shows how
+          many messages of the previous start are missing.
 
         Args:
-            event: Any decoded message of a site. Messages other than these events are ignored.
+            event: Any decoded message of a site. All messages other than these events are
+                ignored.
         """
         if not isinstance(event, Event) or event.about not in self._sites:
             return
@@ -380,10 +378,10 @@ class Recording:
             self._admit_starts()
 
     def _read(self, key: str, payload: bytes) -> tuple[SiteReception, SiteMessage]:
-        """Decodes a message of a site, the process that controls one arm.
+        """Decodes a message from a site.
 
-        If the process has been restarted and this is its first message, the new start is
-        recorded from now on.
+        If the site has been restarted and this is its first message, the new start is recorded
+        from now on.
 
         Args:
             key: Key under which the message arrived.
@@ -393,7 +391,7 @@ class Recording:
             The site that sent the message, and the message.
 
         Raises:
-            WireError: The message is not valid.
+            WireError: The message is invalid.
         """
         site, channel = self._channels[key]
         try:
@@ -406,9 +404,9 @@ class Recording:
             return site, site.read(channel, payload)
 
     def _write_site_message(self, key: str, payload: bytes, mono_ns: int) -> None:
-        """Writes an event or statistics of a site, unless they were written before.
+        """Writes an event or statistics from a site, unless they have already been written.
 
-        The log states two times of a message: the sending time, in ns since the epoch (the
+        The log contains two times for a message: the sending time, in ns since the epoch (the
         start of the session), and the arrival time, as Unix time.
 
         Args:
@@ -417,7 +415,7 @@ class Recording:
             mono_ns: Time of the arrival on the monotonic clock, in ns.
 
         Raises:
-            WireError: The message is not valid.
+            WireError: The message is invalid.
         """
         arrived_since_epoch_ns = mono_ns - self.epoch.mono_ns
         if key not in self._channels:
@@ -442,10 +440,10 @@ class Recording:
         self._writer.add(key, payload, sent_ns, log_time_ns, message.sequence, message.content)
 
     def _write_block(self, key: str, block: bytes, mono_ns: int) -> None:
-        """Writes the records of a block, the results of several control periods of a site.
+        """Writes the records of a block, which contains the results of several ticks of a site.
 
-        The first payload that is not a valid record ends the block, because its sender is
-        faulty.
+        The rest of the block is skipped after the first payload that is not a valid record,
+        because its sender is faulty.
 
         Args:
             key: Key under which the block arrived.
@@ -464,12 +462,12 @@ class Recording:
             add(key, payload, record.sent_ns, log_time_ns, record.tick, record)
 
     def _write_recorder_message(self, key: str, payload: bytes, mono_ns: int) -> None:
-        """Writes an event or statistics of this recorder, after a check that they are its own.
+        """Writes an event or statistics of this recorder, after checking that they are its own.
 
-        The recorder puts its own messages into the queue of received messages. But other
-        processes can publish under the same keys, for example a second recorder. Their messages
-        are refused: a message must state the boot, the random number that identifies this start
-        of the recorder.
+        The recorder puts its own messages into the queue of received messages. Other processes,
+        for example a second recorder, can publish under the same keys. Their messages are
+        rejected: a message must state the boot (the random number that identifies this start of
+        the recorder).
 
         Args:
             key: Key of the message: the key of recorders' events or of their statistics.
@@ -477,7 +475,7 @@ class Recording:
             mono_ns: Time of the arrival on the monotonic clock, in ns.
 
         Raises:
-            WireError: The message is from another recorder, or is not valid.
+            WireError: The message is from another recorder, or is invalid.
         """
         account = self._recorder_accounts[key]
         since_epoch_ns = mono_ns - self.epoch.mono_ns
@@ -535,15 +533,15 @@ class Recording:
             self._gone_sites.add(token.member)
 
     def _update_gone_since_ns(self, site: str, now_ns: int) -> int | None:
-        """Notes when a site was first found gone, and returns when the wait for it begins.
+        """Registers when a site was first found gone, and returns when the wait for it begins.
 
-        The caller uses the result to decide how long it still waits for the site.
+        The caller uses the result to decide how much longer to wait for the site.
 
-        When a connection is established again, the network may report the return of a site
-        first, and its earlier disappearance afterwards. The report "gone" is then wrong, which
-        only the messages of the site reveal: a message that arrives more than `_UNDER_WAY_NS`
-        after the report cannot have been in transit. In this case, the wait restarts with each
-        message. As long as messages arrive, the site is thus never given up.
+        After a reconnection, the network may report the return of a site first, and its earlier
+        disappearance afterwards. The report that the site is gone is then wrong, which only the
+        messages from the site reveal: a message that arrives more than `_UNDER_WAY_NS` after
+        the report cannot have been in transit. In this case, the wait restarts with each
+        message, so the site is never given up as long as messages arrive.
 
         Args:
             site: Name of the site.
@@ -578,17 +576,14 @@ class Recording:
         return all(have_left)
 
     def _has_left(self, site: str, now_ns: int) -> bool:
-        """Returns True if the recorder need not wait for any more messages of a site.
+        """Returns True if the recorder no longer has to wait for messages from a site.
 
         This is the case if all messages of the site are stored, or if the site has been absent
-        from the network for so long that it is regarded as gone for good.
+        from the network for so long that it is considered gone for good.
 
         Args:
-            site: Name of the site, the process that runs one arm.
+            site: Name of the site.
             now_ns: Present time on the monotonic clock, in ns.
-
-        Returns:
-            True if all messages are stored, or the site is gone for good.
         """
         if site in self._stored_sites:
             return True
@@ -710,7 +705,7 @@ class Recording:
         return lines
 
     def _summarize_site(self, site: SiteReception) -> str:
-        """Returns a line for the user about the records of a site, at the end of the recording.
+        """Summarises the records of a site in one line for the user, when recording ends.
 
         Example: "recorder: s: 12000 of 12000 records, 0 missing, 3 duplicate, largest gap 2".
 
@@ -759,11 +754,11 @@ class Recording:
 
 
 REPORT_EVERY_NS = 1_000_000_000
-"""Period of the statistics, in ns."""
+"""Interval between statistics, in ns."""
 _MAX_GAPS_REPORTED = 20
-"""Largest number of gaps of a channel that the statistics list."""
+"""Maximum number of gaps per channel that the statistics list."""
 _ALL_GAPS = 600
-"""Largest number of gaps of all channels together that the statistics list."""
+"""Maximum number of gaps that the statistics list for all channels together."""
 
 
 class RecorderReport:
@@ -830,9 +825,9 @@ class RecorderReport:
         self._publish(payload)
 
     def _make_stats(self) -> RecorderStats:
-        """Returns the present statistics of the recording for people who watch the session.
+        """Returns the current statistics of the recording, to be shown during the session.
 
-        They contain, for each channel, the numbers of expected, received and missing messages,
+        For each channel, they contain the numbers of expected, received and missing messages,
         and the ranges of the missing ones.
         """
         recording = self._recording

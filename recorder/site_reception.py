@@ -44,32 +44,32 @@ from trilat_net.recorded_change import count_skipped_ticks
 AWAY_NS = 15_000_000_000
 """Time to wait for a site that disappeared without an "end" event, in ns.
 
-Its link may have been cut, and may work again.
+Its link may have been cut and may recover.
 """
 CAPACITY = 60_000
-"""Largest number of messages in the queue. It suffices for minutes of three sites at 1 kHz,
-which send their records in blocks.
+"""Maximum number of messages in the queue, enough for minutes of three sites at 1 kHz, which
+send their records in blocks.
 """
 CAPACITY_BYTES = 96 << 20
-"""Largest size of the queue, in bytes."""
+"""Maximum size of the queue, in bytes."""
 KEY_BYTES = 32 << 20
-"""Largest size of the waiting messages of one key, in bytes. A planar arm at 1 kHz sends half a
-megabyte per second.
+"""Maximum total size of the queued messages of one key, in bytes. A planar arm at 1 kHz sends
+half a megabyte per second.
 """
 _OVERHEAD_BYTES = 200
-"""Memory of a waiting message besides its payload, in bytes."""
+"""Memory used by a queued message in addition to its payload, in bytes."""
 KEYS = 1_000
-"""Largest number of keys that are counted separately. All further keys are counted together."""
+"""Maximum number of keys that are counted separately. All further keys are counted together."""
 _OTHER_KEYS = "others"
 """Name under which the keys beyond `KEYS` are counted."""
 
 
 class _InboundMessage(NamedTuple):
-    """A network message in the recorder's queue, which is not yet decoded or written to a log.
+    """A network message in the recorder's queue that has not been decoded or logged yet.
 
     Attributes:
-        key: Network address ("key") under which the message was published. It names the
-            session, the member and the channel.
+        key: Key under which the message was published. It names the session, the member and the
+            channel.
         payload: Bytes of the message.
         mono_ns: Time of the arrival on the monotonic clock, in ns.
     """
@@ -159,19 +159,19 @@ class InboundQueue:
 
 
 _CHANNEL_NOUNS = {topics.STATE: "records", topics.LINK: "statistics", topics.EVENT: "events"}
-"""Name of the messages of each channel, for texts."""
+"""Noun for the messages of each channel, used in sentences for the user."""
 _LEAD_NS = 2_000_000_000
 _DRIFT = 1e-3
-"""The clock of a site may be ahead of the recorder's clock by `_LEAD_NS`, plus this fraction of
-the time since the start of the session.
+"""Fraction of the time since the start of the session by which a site's clock may be ahead of
+the recorder's clock, in addition to `_LEAD_NS`.
 """
 EVENT_BYTES = 512 << 10
 _EVENT_BYTES_PER_S = 4 << 10
-"""A log accepts `EVENT_BYTES` of events of a site, and `_EVENT_BYTES_PER_S` more per second of
-the scenario, which is about ten events.
+"""Additional bytes of events that a log accepts from a site per second of the scenario, beyond
+`EVENT_BYTES`. This is enough for about ten events.
 """
 _LEAST_EVENT_BYTES = 128
-"""Smallest size of an event, in bytes."""
+"""Minimum size of an event, in bytes."""
 
 
 class SiteMessage(NamedTuple):
@@ -306,10 +306,10 @@ class SiteReception:
         return SiteMessage(number, content.tick, sent_ns, content)
 
     def _read_event(self, payload: bytes) -> SiteMessage:
-        """Decodes and checks an event, and subtracts its size from the permitted bytes.
+        """Decodes and checks an event, and subtracts its size from the allowed bytes.
 
-        An event is a rare message, for example about the end of the run. The total size of a
-        site's events is limited, so that a faulty sender cannot fill the disk.
+        The total size of a site's events is limited, so that a faulty sender cannot fill the
+        disk.
 
         Raises:
             WireError: The payload is not a valid event of this site, or there were too many.
@@ -335,16 +335,16 @@ class SiteReception:
         return SiteMessage(event.n, event.n, event.t_ns, event)
 
     def _check(self, channel: str, sender: str, boot: int, number: int, ticks: int) -> None:
-        """Checks that a message comes from the current start of the site and is plausible now.
+        """Raises WireError if a message is from another sender or start, or implausible.
 
-        A site that was restarted has a new start, and messages of its earlier process must no
+        A site that was restarted has a new start, and messages from its earlier process must no
         longer be accepted. A number that is too large would make the recorder request messages
         that do not exist.
 
         Args:
             channel: Channel of the message.
-            sender: Name of the site that the message states.
-            boot: Number that identifies the sender's start, as the message states it.
+            sender: Name of the site stated in the message.
+            boot: Number that identifies the sender's start, as stated in the message.
             number: Number of the message in its channel.
             ticks: Number of ticks that the site has executed according to the message.
 
@@ -421,8 +421,8 @@ class SiteReception:
     def _possible_ticks(self) -> int:
         """Largest number of ticks that the site can have executed by now.
 
-        The time since its start is stretched by the tolerated drift and lead of its clock. A
-        message with a later tick is refused, because it would make all earlier ticks count as
+        The time since its start is extended by the tolerated drift and lead of its clock. A
+        message with a later tick is rejected, because it would make all earlier ticks count as
         missing.
         """
         latest_ns = self.since_ns * (1.0 + _DRIFT) + _LEAD_NS
@@ -431,8 +431,8 @@ class SiteReception:
     def _reserve_event_bytes(self, event: Event, size: int) -> None:
         """Limits how many bytes of events one site may add to the log.
 
-        Without this limit, a faulty site could fill the disk. The size of each event is
-        subtracted from the bytes that remain.
+        Otherwise, a faulty site could fill the disk. The size of each event is subtracted from
+        the remaining bytes.
 
         Args:
             event: The event.
@@ -537,9 +537,9 @@ class SiteReception:
             gap.note_published(number_message(channel, ticks, self._rate_hz))
 
     def _count_implied(self, content: State | LinkStats | Event) -> None:
-        """Derives from a message which other messages of its sender exist.
+        """Derives from a message which other messages from its sender exist.
 
-        A message that exists and did not arrive is counted as missing. A record states which
+        Messages that exist but have not arrived are counted as missing. A record states which
         ticks were skipped. Statistics show that all records up to their tick exist. The events
         "join" and "end" state the first tick and the number of ticks.
         """
@@ -556,7 +556,7 @@ class SiteReception:
                 self.add_expected(channel, count)
 
     def _exclude_skipped_ticks(self, record: State) -> None:
-        """Notes that no messages exist for control periods (ticks) that the site has skipped.
+        """Registers that no messages exist for ticks that the site has skipped.
 
         A site with an external arm skips ticks that came too late. They must not count as lost
         messages.
@@ -578,12 +578,12 @@ class SiteReception:
                 self.skipped_ticks += next_number - lowest_unpublished
 
     def _begin_start(self, first_tick: int) -> None:
-        """Counts the messages between the previous start of the site and this one.
+        """Accounts for the messages between the previous start of the site and this one.
 
-        A site that was started again continues at a later tick. The messages of the ticks in
+        A site that was restarted continues at a later tick. The messages of the ticks in
         between count as unpublished instead of missing. If the previous start ended properly,
-        it has stated how many ticks it executed, and its messages up to that tick still count
-        as missing. If it was killed, that number is unknown and counts as 0. Reports of other
+        it has reported how many ticks it executed, and its messages up to that tick still count
+        as missing. If it was killed, that number is unknown and taken as 0. Reports from other
         sites may correct this, see `count_previous_start`.
 
         Args:

@@ -33,24 +33,24 @@ except ImportError:  # this platform lacks the module: elapsed time counts
 
 T = TypeVar("T")
 SHARE = 0.75
-"""Fraction of a period that the code may use."""
+"""Fraction of the time between two calls that the code may use."""
 OVERTIME_LIMIT_NS = 500_000_000
 """Overtime above which the code is too slow, in ns."""
 HICCUP_NS = 50_000_000
-"""Largest time that one call adds to the overtime, in ns."""
+"""Maximum time that one call adds to the overtime, in ns."""
 _CHECK_S = 1.0
-"""Time between two checks of whether the code still hangs in the same call, in s."""
+"""Interval between checks of whether the code still hangs in the same call, in s."""
 CHECKS = 3
-"""Number of checks in a row that must see the same call before it is interrupted."""
+"""Number of consecutive checks that must see the same call before it is interrupted."""
 FIRST_CHECKS = 61
-"""Number of checks in a row for the first tick, in which the code may still be compiled."""
+"""Number of consecutive checks for the first tick, when code may still be compiled."""
 
 
 def _read_thread_usage() -> tuple[int, int]:
     """Returns the computing time of this thread, and how often the system interrupted it.
 
-    Two readings show whether a slow call has computed for long itself, or whether the operating
-    system ran other programs in the meantime.
+    Two readings show whether a slow call has really been computing for long, or whether the
+    operating system was running other programs in the meantime.
 
     Returns:
         The computing time in ns, and the number of involuntary context switches. The values are
@@ -145,12 +145,12 @@ class WatchedCode:
     def _count_call(self, tick: int, elapsed_ns: int) -> None:
         """Adds the duration of a call to the statistics, and fails if the code is too slow.
 
-        Each call may take a share of the time between two calls. The excess is summed as
-        overtime, which shorter calls reduce again. Thus single slow calls are tolerated.
+        Each call may take a share of the time between two calls. Any excess is added up as
+        overtime, which shorter calls reduce again, so occasional slow calls are tolerated.
 
         Args:
             tick: Tick of the call.
-            elapsed_ns: Time that the call took, in ns.
+            elapsed_ns: Duration of the call, in ns.
 
         Raises:
             Exception: The code is too slow.
@@ -253,9 +253,9 @@ class CodeWatchdog:
             self._handler_before = None
 
     def _check(self, _number: int, _frame: FrameType | None) -> None:
-        """Handles the timer signal SIGALRM: raises an error in a user's code that hangs.
+        """Handles the timer signal SIGALRM by raising an error in user code that hangs.
 
-        The signal arrives every `_CHECK_S`, also while the code is in an endless loop.
+        The signal arrives every `_CHECK_S`, even while the code is in an endless loop.
         """
         for code in self.codes:
             code.check()

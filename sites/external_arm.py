@@ -31,25 +31,24 @@ from trilat_net.records import Mode
 from .site_loop import STEP_MARGIN_RAD
 
 MEASUREMENTS_KEPT = 64
-"""Number of messages in a queue. Older measurements are useless."""
+"""Number of messages that a queue can hold. Older measurements are useless."""
 HELD_SILENCE_NS = 30_000_000
-"""Silence of the arm after which the site holds its position, in ns."""
+"""Time without a measurement after which the site holds its position, in ns."""
 SILENCE_LIMIT_NS = 200_000_000
-"""Silence of the arm after which the site enters the mode "fault", in ns."""
+"""Time without a measurement after which the site enters the mode "fault", in ns."""
 SWITCH_SILENCE_NS = 100_000_000
-"""Silence of a dead-man switch after which it counts as released, in ns."""
+"""Time without a report after which a dead-man switch counts as released, in ns."""
 STARTS_KEPT = 64
-"""Number of switch programs whose state is stored.
+"""Maximum number of switch programs whose state is stored.
 
 If there are more programs, one that does not hold the switch is removed.
 """
 _START_POSE_TOLERANCE_RAD = 0.01
-"""Largest distance of the arm from its `q0_rad` at the start without a warning, in rad.
-"""
+"""Maximum distance of the arm from its `q0_rad` at the start without a warning, in rad."""
 POLL_NS = 5_000_000
-"""Time between two polls while the site waits for its arm, in ns."""
+"""Interval between polls while the site waits for its arm, in ns."""
 _MAX_POLL_GAP_NS = 20_000_000
-"""Largest silence that one poll can add, in ns.
+"""Maximum silence that one poll can add, in ns.
 
 If the site itself was suspended, it cannot know which messages it would have received.
 """
@@ -152,10 +151,10 @@ class ExternalArm:
         return False
 
     def _describe_silence(self) -> SessionError:
-        """Returns the error of a site that has waited in vain for a measurement of its arm.
+        """Returns the error for a site that has waited in vain for a measurement of its arm.
 
-        The text says how many messages were dropped and why. If none has arrived, it advises
-        how to connect the driver of the arm.
+        The message says how many measurements were dropped and why. If none has arrived, it
+        explains how to connect the arm's driver.
         """
         text = f"{self._site} received no measurement from its arm on {self._address}"
         if self._dropped:
@@ -244,12 +243,12 @@ class ExternalArm:
         return "arm_back" if previous_order == "arm_silent" else ""
 
     def _accept(self, payload: bytes) -> None:
-        """Checks one measurement, and stores it or counts the reason why it is dropped.
+        """Checks one measurement, and either stores it or counts the reason why it is dropped.
 
         A measurement names its site, the boot of the driver (a random number that identifies
-        the start of its process), and a sequence number n, which the driver increases by one.
-        The measurement is dropped if it belongs to another site or driver, is not newer than
-        the stored one, or is implausible because the arm cannot have moved so far.
+        the start of its process), and a sequence number n, which the driver increments. The
+        measurement is dropped if it belongs to another site or driver, is not newer than the
+        stored one, or is implausible because the arm cannot have moved so far.
 
         Args:
             payload: The encoded measurement.
@@ -296,8 +295,8 @@ class ExternalArm:
     def _is_plausible(self, q: Sequence[float], elapsed_s: float) -> bool:
         """Returns True if each joint can have moved to its angle since the last measurement.
 
-        A larger movement would exceed the speed limits of the arm, so the sensor or the driver
-        must be faulty.
+        A larger movement would exceed the speed limits of the arm, which indicates a faulty
+        sensor or driver.
 
         Args:
             q: Joint angles in rad.
@@ -314,15 +313,14 @@ class ExternalArm:
 class _Holder:
     """Newest report of one program on whether its user holds the dead-man switch of an arm.
 
-    An external arm (one outside of this program) moves only while somebody holds this switch,
-    for safety. Several programs may report for one arm.
+    Several programs may report for one arm.
 
     Attributes:
-        n: Number of its newest message.
-        pressed_ns: Time at which its newest report of a held switch arrived, in ns. None if it
-            does not hold the switch.
-        counts: False if another program has released the switch while this program held it.
-            The switch of this program then has to be released and pressed again.
+        n: Number of the program's newest message.
+        pressed_ns: Time at which the program's newest report of a held switch arrived, in ns.
+            None if it does not hold the switch.
+        counts: False if another program has released the switch while this program held it. The
+            switch of this program then has to be released and pressed again.
     """
 
     n: int = -1
@@ -363,7 +361,7 @@ class DeadManSwitch:
         self._was_released = False
 
     def _list_holders(self) -> list[_Holder]:
-        """Lists the programs whose dead-man switch is pressed and counts.
+        """Lists the programs whose dead-man switch is pressed and counts as held.
 
         After any program has released the switch, all programs must release it and press it
         again, so that nobody restarts an arm by accident.
@@ -377,8 +375,8 @@ class DeadManSwitch:
     def _is_silent(self, holder: _Holder) -> bool:
         """Returns True if a program has not reported a pressed switch for `SWITCH_SILENCE_NS`.
 
-        If the program held the switch, the arm then stops. A program that does not press the
-        switch counts as silent.
+        If the program was holding the switch, the arm then stops. A program that does not press
+        the switch counts as silent.
         """
         if holder.pressed_ns is None:
             return True
@@ -432,13 +430,13 @@ class DeadManSwitch:
         return "held" if is_stopped_by_switch else ""
 
     def _release(self, released: Sequence[_Holder]) -> None:
-        """Marks the dead-man switch of the arm as released, so that the arm stops.
+        """Marks the dead-man switch of the arm as released, which stops the arm.
 
-        Programs that still hold the switch must release it and press it again. In this way,
-        nobody can accidentally restart an arm that somebody else has stopped.
+        Programs that still hold the switch must release it and press it again. This prevents
+        anybody from accidentally restarting an arm that somebody else has stopped.
 
         Args:
-            released: The programs that have released it or are silent. If there are none,
+            released: The programs that have released the switch or are silent. If empty,
                 nothing changes.
         """
         if not released:
@@ -450,7 +448,7 @@ class DeadManSwitch:
         self._was_released = True
 
     def _accept(self, payload: bytes, received_ns: int) -> None:
-        """Checks one report of a program, and updates whether that program holds the switch.
+        """Checks one report from a program, and updates whether that program holds the switch.
 
         Several programs may report about the switch of one arm. If one of them releases it, the
         switch is released, and the others must release it and press it again before they count
@@ -498,8 +496,8 @@ class DeadManSwitch:
     def _forget_program(self) -> None:
         """Removes the oldest program from the list of switch holders, to make room for another.
 
-        Every program that reports on the dead-man switch has an entry, and their number is
-        limited. Programs that do not press the switch are removed before those that do.
+        The list has one entry per program that reports on the dead-man switch, and is limited
+        in length. Programs that do not press the switch are removed before those that do.
         """
         idle = [boot for boot, program in self._programs.items() if program.pressed_ns is None]
         oldest = idle[0] if idle else next(iter(self._programs))

@@ -42,11 +42,11 @@ from trilat_net.scenario import HandSite, Scenario
 from trilat_net.signals import Interrupt
 
 POLL_NS = 500_000
-"""Time between two polls for views, in ns."""
+"""Interval between polls for views, in ns."""
 _ANNOUNCE_PERIOD_NS = 100_000_000
-"""Time between two announcements to the site before the first view has arrived, in ns."""
+"""Interval between announcements to the site until the first view arrives, in ns."""
 _VIEWS_KEPT = 64
-"""Number of views that the network queue holds."""
+"""Number of views that the network queue can hold."""
 
 
 class HandProcess(SiteClient):
@@ -117,14 +117,14 @@ class HandProcess(SiteClient):
             self._send(0, None)  # a message without a decision announces this process
 
     def _decide(self, message: HandViewMessage) -> None:
-        """Calls the user's operator class with the newest state, and sends its reply to a site.
+        """Calls the user's operator class with the newest view, and sends its reply.
 
-        The site is the process that controls the arm. The reply states how to move the arm. If
-        the class fails, the arm is released at once, because nothing guides it any more.
+        The reply states how to move the arm. If the class fails, the arm is released at once,
+        because nothing is guiding it any more.
 
         Args:
-            message: The view, the present state of the arm and the others, as received from the
-                site.
+            message: The view received from the site: the current state of the arm and of the
+                others.
 
         Raises:
             RunFailed: The class failed. The arm has been released.
@@ -147,8 +147,8 @@ class HandProcess(SiteClient):
     def _send(self, view_tick: int, goal: list[float] | None) -> None:
         """Sends the decision of the class to the site.
 
-        The message states to which view (state of the arm) the decision refers, so that the
-        site can apply it at the right time.
+        The message names the view on which the decision is based, which allows the site to
+        apply it at the right time.
 
         Args:
             view_tick: Tick of the view.
@@ -162,14 +162,10 @@ class HandProcess(SiteClient):
 def _read_view(message: HandViewMessage) -> HandView:
     """Converts a network message to the object that a user's operator class receives.
 
-    The object has the joint angles and other numbers as NumPy arrays, which user code expects.
+    Joint angles and other vectors become NumPy arrays, as expected by user code.
 
     Args:
-        message: The message, which the site sends so that the user's operator class can decide
-            how to move the arm.
-
-    Returns:
-        The state of the site. Its lists of numbers are arrays.
+        message: The view sent by the site.
     """
 
     def read_fields(source: Any, names: tuple[str, ...]) -> Any:

@@ -32,12 +32,12 @@ from trilat_net.net import Clock, HandMessage, HandViewMessage, Inbox, PeerSeen,
 from trilat_net.scenario import ArmModel, HandPlayer, HandSite, LiveHand
 
 MESSAGES_KEPT = 32
-"""Number of messages in the queue, and largest number of messages that a tick reads.
+"""Number of messages that the queue can hold, and maximum number read in one tick.
 
 If the queue is full, the oldest message is dropped.
 """
 POLL_NS = 5_000_000
-"""Time between two polls while the site waits for the operator's process, in ns."""
+"""Interval between polls while the site waits for the operator's process, in ns."""
 
 
 def _read_messages(
@@ -46,15 +46,16 @@ def _read_messages(
     dropped: Counter[str],
     source: str | None = None,
 ) -> Iterator[HandMessage]:
-    """Yields the messages of an operator that have arrived, and counts those that are dropped.
+    """Yields an operator's messages that have arrived, and counts those that are dropped.
 
-    A limited number is read in each tick of the control loop, so that many messages do not
-    delay it.
+    Only a limited number is read in each tick, so that a flood of messages does not delay the
+    control loop.
 
     Args:
         inbox: Queue of the messages.
         site: Name of the site to which the messages must be addressed.
-        dropped: Number of dropped messages by reason. The counts are increased in place.
+        dropped: Mapping from reason to number of dropped messages. The counts are increased in
+            place.
         source: Only accepted sender. If None, all senders are accepted.
     """
     for _ in range(MESSAGES_KEPT):
@@ -155,17 +156,18 @@ class HandServer:
         return step.vector
 
     def _parse_command(self, message: HandMessage) -> HandCommand | None:
-        """Checks a message of an operator who moves the arm, and converts it to a command.
+        """Checks a message from an operator who moves the arm, and converts it to a command.
 
-        The goal of the operator is either a target position or a force, as the scenario says. A
+        The operator's goal is either a target position or a force, depending on the scenario. A
         message without a grip releases the arm.
 
         Args:
             message: The message.
 
         Returns:
-            The command. None if the message is refused, because it contains a force instead of
-            a target or the reverse, has a wrong number of coordinates, or is out of range.
+            The command, or None if the message is rejected: because it contains a force instead
+                of
+            a target or vice versa, has the wrong number of coordinates, or is out of range.
         """
         if self._hand.mode == "force":
             noun = "force"
@@ -300,22 +302,21 @@ class RemoteHand(HandPlayer):
     def _read_decisions(self) -> Iterator[HandMessage]:
         """Yields the received decisions of a user's operator class on how to move the arm.
 
-        The class runs in a process of its own. Invalid messages, and messages from other
-        processes, are dropped and counted.
+        Invalid messages, and messages from other processes, are dropped and counted.
         """
         return _read_messages(self._inbox, self._site, self._dropped, self._source)
 
     def _decide(self, present_tick: int, message: HandMessage) -> None:
-        """Schedules a decision of the user's class, to take effect at its planned tick.
+        """Schedules a decision of the user's class to take effect at its planned tick.
 
         A decision that arrives after this tick is counted as late, and takes effect at once.
         Decisions about views that were never sent are ignored, as are all decisions after a
         failure.
 
         Args:
-            present_tick: Present tick.
+            present_tick: Current tick.
             message: The decision. Its number n refers to the view of tick n * `period_ticks`.
-                Without a grip it releases the arm.
+                Without a grip, it releases the arm.
         """
         view_tick = message.n * self.hand.period_ticks
         # The process announces itself with a message that contains no decision. It may arrive

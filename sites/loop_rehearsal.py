@@ -36,14 +36,13 @@ class _Rehearsal(LoopStats):
     """Runs the control loop of a single site without a network, to measure how late ticks are.
 
     The loop does the same work as in a session, except that no messages are exchanged. This
-    object takes the place of two objects of the loop: of its statistics, so that the lateness
-    of each tick can be stored, and of the `_LoopSite`, whose methods do nothing here.
+    object stands in for two objects of the loop: for its statistics, to store the lateness of
+    each tick, and for the `_LoopSite`, whose methods do nothing here.
 
-    A tick is one period of the control loop. It is late if it begins after the time at which it
-    was due.
+    A tick is late if it begins after the time at which it was due.
 
     Args:
-        scenario: The scenario, which describes the arms, their links and the run.
+        scenario: The scenario.
         name: Name of the site.
     """
 

@@ -85,10 +85,10 @@ class PeerAdmission:
         self.has_given_up = self._is_peer_away_too_long(t_ns)  # ends the loop
 
     def _is_peer_away_too_long(self, t_ns: int) -> bool:
-        """Returns True if another arm's process left longer ago than the user permits.
+        """Returns True if a peer left longer ago than the user allows, which ends the run.
 
-        The run then ends. The limit is the option `leave_timeout_s`. Without this option, a
-        process may stay away forever.
+        The limit is the option `leave_timeout_s`. Without this option, a peer may stay away
+        forever.
 
         Args:
             t_ns: Present time, ns since the epoch.
@@ -101,14 +101,13 @@ class PeerAdmission:
         return t_ns - first_left_ns > patience_s * NS_PER_S
 
     def _admit_peer(self, event: Event, t_ns: int) -> None:
-        """Prepares this site for a peer (another site) that joins or rejoins the session.
+        """Prepares this site for a peer that joins the session, or rejoins it after a restart.
 
-        A peer rejoins after its process was restarted. From the tick that the event names,
-        samples of the new process are accepted, and samples of its previous process are not
-        accepted any more.
+        From the tick named in the event, samples from the new process are accepted, and samples
+        from its previous process are rejected.
 
         Args:
-            event: Event with which the peer announced its join.
+            event: Event with which the peer announced that it joins.
             t_ns: Present time, in ns since the epoch (the common start of the session).
         """
         parts = self._parts
@@ -128,11 +127,11 @@ class PeerAdmission:
         """Publishes the last tick that was received from a peer before the peer was restarted.
 
         The previous process of the peer may have been killed before it could publish its end.
-        From its last tick, the recorder knows how many records (results of ticks) to expect.
+        Its last tick tells the recorder how many records to expect.
 
         Args:
             index: Index of the peer.
-            coming: Event with which the new process of the peer announced its join.
+            coming: Event with which the new process of the peer announced that it joins.
             t_ns: Present time, in ns since the epoch (the common start of the session).
         """
         tick = self._inbox.find_last_tick_of(index, coming.boot)

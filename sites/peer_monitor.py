@@ -27,7 +27,7 @@ RETURN_NS = 1_000_000_000
 After a reconnection, samples may arrive before the new liveliness token.
 """
 _INBOX_CAPACITY = 256
-"""Largest number of events of a member that wait to be read."""
+"""Maximum number of unread events from one member."""
 
 
 class PeerMonitor:
@@ -133,17 +133,17 @@ class PeerMonitor:
     ) -> None:
         """Updates which processes are present after a token has appeared or disappeared.
 
-        A token shows that one process is connected. The process belongs to a recorder or a
-        site. It need not be the one that is a member of the session, because a process that
-        waits to join, or that was replaced, also has a token.
+        A token shows that one process of a recorder or a site is connected. This is not
+        necessarily the process that is a member of the session, because a process that is
+        waiting to join, or that was replaced, also has a token.
 
         The method updates `recorders` and the sites whose tokens exist. If the process is a
-        member, or any recorder, it also publishes its appearance or loss, and updates
-        `departed`.
+        member, or any recorder, its appearance or loss is also published, and `departed` is
+        updated.
 
         Args:
             member: Name of the member.
-            boot: Number that identifies the start of the member's process, as text.
+            boot: Number that identifies the start of the member's process, as a string.
             publisher: Publishes the events of this site.
             t_ns: Present time, in ns since the epoch (the common start of the session).
             alive: True if the token has appeared.
@@ -192,14 +192,14 @@ class PeerMonitor:
     def _read_peer_events(
         self, inbox: Inbox, publisher: EventPublisher, t_ns: int
     ) -> Iterator[Event]:
-        """Receives the events of another arm's process, and applies events about this process.
+        """Processes the events of a peer, and applies those that are about this process.
 
-        If the other process has admitted another start of this site, this process has been
-        replaced and must end. If it has admitted several starts, the last one counts: the
-        earlier ones died while they joined.
+        If the peer has admitted another start of this site, this process has been replaced and
+        must end. If the peer has admitted several starts, the last one counts: the earlier ones
+        died while joining.
 
         Args:
-            inbox: Queue of the events of the peer.
+            inbox: Queue of the events from the peer.
             publisher: Publishes the events of this site.
             t_ns: Present time, in ns since the epoch (the common start of the session).
 
@@ -238,15 +238,15 @@ class PeerMonitor:
             self.ended_member = self._site
 
     def _decide_on_join(self, publisher: EventPublisher, event: Event, t_ns: int) -> None:
-        """Admits a new process of a site, or refuses it while the previous one still runs.
+        """Admits a new process of a site, or rejects it while the previous one still runs.
 
-        A boot is the number that identifies the start of a process. The previous process still
-        runs if its token exists in the network and it has not published its end.
+        The previous process is still running if its liveliness token exists and it has not
+        published its end.
 
         Args:
             publisher: Publishes the events of this site.
             event: Event with which the new process requests to join. It names the boot of the
-                process and its first tick (`ticks`).
+                process (the number that identifies its start) and its first tick (`ticks`).
             t_ns: Present time, in ns since the epoch (the common start of the session).
         """
         member = event.member
@@ -284,10 +284,9 @@ class PeerMonitor:
         event: Event,
         t_ns: int,
     ) -> None:
-        """Announces whether a restarted process of another arm may join the session again.
+        """Announces whether the restarted process of a peer may rejoin the session.
 
-        The other sites and the recorder learn the decision from this event, and the new process
-        from the other sites. A site is a process that controls one arm.
+        This event informs the new process, the other sites and the recorder of the decision.
 
         Args:
             kind: Kind of the event: "admit" or "refused".
@@ -329,7 +328,7 @@ class PeerMonitor:
 def _set_membership(members: set[T], member: T, is_present: bool) -> None:
     """Adds a member to a set if it is present on the network, and removes it otherwise.
 
-    The network may report the same presence twice. The second report changes nothing.
+    The network may report the same presence twice. The second report has no effect.
     """
     if is_present:
         members.add(member)

@@ -19,7 +19,7 @@ from trilat_net import process
 from trilat_net.errors import count_nouns
 
 _SITES_PER_PROCESSOR = 2
-"""Largest number of loops per processor that receive priority.
+"""Maximum number of loops per processor that receive priority.
 
 If there were more, the network threads and the recorder would receive too little time, and
 connections would be lost.
@@ -80,15 +80,16 @@ def prepare(cpu: int | None, sites: int = 1) -> dict[str, str]:
 
 
 def _set_affinity(cpu: int | None) -> str:
-    """Binds the process to one processor, so that the system does not move it to another one.
+    """Pins the process to one processor, so that the system does not move it to another one.
 
-    Moving a process takes time and empties its cache, which makes control periods late.
+    Moving a process takes time and empties its cache, which delays ticks.
 
     Args:
         cpu: Number of the processor. If None, nothing is changed.
 
     Returns:
-        The processors that the process may use, as a text for the log: "cpu 3" or "cpu 0,1".
+        The processors that the process may use, in the form stored in the log: "cpu 3" or
+        "cpu 0,1".
     """
     if cpu is not None:
         os.sched_setaffinity(0, {cpu})
@@ -98,8 +99,8 @@ def _set_affinity(cpu: int | None) -> str:
 def _call_libc(setting: str, function: str, *arguments: int) -> str:
     """Calls a function of the C library that applies a real-time setting to this process.
 
-    An example is `mlockall`, which keeps the memory of the process in RAM. The function must
-    return 0 on success.
+    For example, `mlockall` keeps the memory of the process in RAM. The function must return 0
+    on success.
 
     Args:
         setting: Description of the setting for the user, such as "locked" for memory.
@@ -110,8 +111,8 @@ def _call_libc(setting: str, function: str, *arguments: int) -> str:
         The argument `setting`, because `prepare` reports for each step what was obtained.
 
     Raises:
-        AttributeError: The platform is not Linux. `prepare` reports this error, which a missing
-            function also raises, as "not on this platform".
+        AttributeError: The platform is not Linux. `prepare` reports this error, which is also
+            raised if the function is missing, as "not on this platform".
         OSError: The call has failed.
     """
     if not sys.platform.startswith("linux"):
@@ -125,10 +126,10 @@ def _call_libc(setting: str, function: str, *arguments: int) -> str:
 
 
 def _stop_collector() -> str:
-    """Turns off Python's garbage collection, because its pauses make control periods late.
+    """Turns off Python's garbage collection, because its pauses delay ticks.
 
     Returns:
-        A text for the log that says what was done.
+        A description of what was done, for the log.
     """
     process.disable_gc()
     return "frozen and off"

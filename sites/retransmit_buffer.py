@@ -30,16 +30,16 @@ from trilat_net.records import Layout
 KEPT_S = 60
 """Time for which messages are stored, in s."""
 RECORDS_KEPT = 120_000
-"""Largest number of stored records: a minute at tick rates up to 2 kHz, less at higher rates.
+"""Maximum number of stored records: one minute at tick rates up to 2 kHz, less at higher rates.
 """
 _RECORD_BYTES = 640
-"""Mean size of a record of a two-joint arm for which the memory is planned, in bytes."""
+"""Mean record size of a two-joint arm, used to dimension the memory, in bytes."""
 _FLOAT_BYTES = 9
 """Size of an encoded floating-point number, in bytes."""
 _STATISTICS_BYTES = 4_096
 """Memory for one message with statistics, in bytes."""
 EVENTS_KEPT = 4_096
-"""Largest number of stored events."""
+"""Maximum number of stored events."""
 _EVENTS_BYTES = 4_000_000
 """Memory for events, in bytes."""
 
@@ -234,7 +234,7 @@ class RetransmitBuffer:
         return True
 
     def _find_messages(self, wanted: BackfillRequest) -> tuple[int, list[bytes], int]:
-        """Finds the stored messages that a recorder has missed and now requests.
+        """Looks up the stored messages that a recorder has missed and now requests.
 
         Args:
             wanted: The request, with the channel and the numbers of the missing messages.

@@ -35,7 +35,7 @@ from .site_news import SiteNews
 from .site_parts import SiteParts
 
 _NO_BOOT = -1
-"""Used in place of the boot (the number of a process start) of a peer that is not present."""
+"""Placeholder for the boot (the number of a process start) of a peer that is not present."""
 
 
 class RunningSite:
@@ -112,14 +112,14 @@ class RunningSite:
         )
 
     def _make_timing(self, pinger: Pinger) -> SiteTiming:
-        """Returns the schedule of the site's ticks, and the timing of its links.
+        """Creates the schedule of the site's ticks, and the timing of its links.
 
-        Sites on one machine have the same clock. They wake up one after another in each period,
-        in the order of the scenario, so that they do not compete for the processors. The names
-        of the sites on this machine are also stored, for the real-time settings.
+        Sites on one machine share its clock. They wake up one after another in each tick, in
+        scenario order, so that they do not compete for the processors. The names of the sites
+        on this machine are also stored, for the real-time settings.
 
         Args:
-            pinger: Offsets of the other members' clocks, as estimated by pings.
+            pinger: Offsets of the other members' clocks, as estimated from pings.
         """
         parts = self._parts
         epoch = self._epoch
@@ -206,8 +206,8 @@ class RunningSite:
         """Publishes the real-time settings and the clock offsets, and prints them for the user.
 
         A site that joins a running session also publishes the event `join`. From here on,
-        measurements of an external arm are accepted only from its present driver. If the arm is
-        not at the start pose of the scenario, a warning is published.
+        measurements of an external arm are accepted only from its current driver. If the arm is
+        not in the start pose of the scenario, a warning is published.
         """
         parts = self._parts
         user_lines = self._clock_texts

@@ -47,7 +47,7 @@ from trilat_net.net import (
 from trilat_net.records import NS_PER_S, Arrival, Mode, TickRecord
 
 _GLIDE_AHEAD_LIMIT_NS = NS_PER_S
-"""Largest time by which a sample may lie in the future under the rule `glide`, in ns.
+"""Maximum time by which a sample may lie in the future under the rule `glide`, in ns.
 
 Under this rule, arms glide back to their peers after an interrupted connection.
 """
@@ -179,20 +179,21 @@ class PeerInbox:
         arrived_ns: int,
         since_epoch_ns: int,
     ) -> Arrival | None:
-        """Checks the state that another arm has sent, and measures its delay.
+        """Checks a sample from another arm, and measures its delay.
 
-        A message is dropped and counted if it cannot be decoded, comes from an unexpected
-        process, or lies too far in the future, so that a faulty sender cannot move this arm.
+        A sample is dropped and counted if it cannot be decoded, comes from an unexpected
+        process, or lies too far in the future. This prevents a faulty sender from moving this
+        arm.
 
         Args:
             index: Index of the peer.
-            sample: The sample, or the error with which its decoding failed.
+            sample: The sample, or the error raised when decoding it.
             arrived_ns: Time of its arrival on the local clock, in ns.
             since_epoch_ns: Present time, in ns since the epoch (the common start of the
                 session).
 
         Returns:
-            The sample as an input of the tick. None if the sample is dropped.
+            The sample as an input of the tick, or None if it is dropped.
         """
         if isinstance(sample, WireError):
             self._dropped[sample.reason] += 1
@@ -246,7 +247,7 @@ class PeerInbox:
 
         Args:
             index: Index of the peer.
-            sample: Sample of the peer. If it is plausible and the newest, it is stored.
+            sample: Sample from the peer. If it is plausible and the newest, it is stored.
         """
         link = self._links[index]
         newest = self._newest[index]
@@ -271,9 +272,10 @@ class PeerInbox:
 
 
 _BLOCKS_PER_S = 100
-"""Number of blocks per second: recorders receive the records of 10 ms in one block."""
+"""Number of blocks per second. Recorders receive the records of 10 ms in one block."""
 _WAKES_PER_S = 200
-"""Peers on one machine receive the samples of 5 ms together, unless they need them sooner."""
+"""Number of wake ticks per second, at which local peers receive the samples of 5 ms together.
+"""
 
 
 class StateBlock:
@@ -365,10 +367,10 @@ class StateBlock:
             self._send_waiting_samples(send)
 
     def _send_waiting_samples(self, send: Callable[[TickRecord], tuple[Any, ...]]) -> None:
-        """Sends the waiting states of this arm (samples) to the other arms.
+        """Sends the pending samples of this arm to the other arms.
 
-        This completes the records of the same control periods, because a record states when its
-        sample was sent. The records move to the next block for the recorders.
+        This completes the records of the same ticks, because a record states when its sample
+        was sent. The records move to the next block for the recorders.
 
         Args:
             send: Function that sends the sample of a record, see `send_samples`.
@@ -399,10 +401,10 @@ class StateBlock:
 
 
 class _LoopSite(Protocol):
-    """The methods that the control loop calls in each period and between periods.
+    """Methods that the control loop calls in each tick and between ticks.
 
-    `RunningSite` has them in a session, and `loop_rehearsal` replaces them for measuring the
-    machine. The loop ignores the results of the type `object`.
+    They are implemented by `RunningSite` in a session, and by `loop_rehearsal` for measuring
+    the machine. The loop ignores results of type `object`.
     """
 
     def should_stop(self) -> bool:
@@ -463,9 +465,9 @@ def _publish_sample(
     io: _LoopSite,
     output: TickRecord,
 ) -> tuple[Any, ...]:
-    """Sends the state of this arm to the other arms after a control period (tick).
+    """Sends the state of this arm to the other arms after a tick.
 
-    This message, the sample, has only the part of the result that their control laws need.
+    This message (the sample) contains only the part of the result that their control laws need.
 
     Args:
         name: Name of this site.
@@ -477,8 +479,8 @@ def _publish_sample(
 
     Returns:
         The time of sending in ns since the epoch (the common start of the session), on the
-        local clock; and the echoes, which confirm the samples of the peers that have arrived,
-        with the times of arrival. The peers compute delays and round trip times from them.
+        local clock, and the echoes, which acknowledge samples received from the peers along
+        with their times of arrival. From them, the peers compute delays and round trip times.
     """
     sent_ns = timing.record_sent(output.tick, clock.monotonic_ns())
     echo = timing.pop_echo()

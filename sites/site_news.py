@@ -30,7 +30,7 @@ from trilat_net.scenario import Change
 from .site_parts import SiteParts
 
 _STATUS_PERIOD_S = 5
-"""Time between two status lines for the user, in s."""
+"""Interval between status lines for the user, in s."""
 
 
 class SiteNews:
@@ -95,10 +95,10 @@ class SiteNews:
             self._raise_alarm(output)
 
     def _raise_alarm(self, output: TickRecord) -> None:
-        """Prints an alarm with a reason and a remedy, if the new mode requires an alarm.
+        """Prints an alarm with a reason and a remedy if the new mode requires one.
 
         Alarms exist only under the rule `glide` for interrupted connections. An arm that holds
-        its position may change its mode many times, and raises at most one alarm a second.
+        its position may change its mode many times, and raises at most one alarm per second.
 
         Args:
             output: Record of the tick in which the mode has changed.
@@ -190,9 +190,9 @@ class SiteNews:
             )
 
     def _publish_waiting(self, output: TickRecord) -> None:
-        """Reports once a second that the arm is too far from its peers to approach them.
+        """Reports once per second that the arm is too far from its peers to approach them.
 
-        This can only happen if the scenario lets an arm glide back to its peers after an
+        This can happen only if the scenario lets an arm glide back to its peers after an
         interrupted connection. The arm then waits until its operator moves it closer.
 
         Args:
@@ -214,8 +214,8 @@ class SiteNews:
     def _describe_status(self, output: TickRecord) -> str:
         """Returns the status line that is printed for the user every few seconds.
 
-        It contains the time, the mode, the largest synchronisation error and torque of a joint,
-        and the numbers of late ticks and dropped messages.
+        It contains the time, the mode, the largest synchronisation error and torque of any
+        joint, and the numbers of late ticks and dropped messages.
         """
         parts = self._parts
         position = np.array([output.shared()[0]])

@@ -37,7 +37,7 @@ from .running_site import RunningSite
 from .site_parts import SiteOptions, SiteParts
 
 POLL_NS = 5_000_000
-"""Longest pause between two polls while the site joins a session, in ns."""
+"""Longest pause between polls while the site joins a session, in ns."""
 
 
 def run_site(
@@ -108,8 +108,8 @@ class _LinePrinter:
     """Prints lines in a separate thread, so that a control loop never waits for the terminal.
 
     A terminal may block a program that prints, for example while its user has paused the
-    output. The printer is used as a context manager. Up to 256 lines wait to be printed, and
-    further lines are lost.
+    output. Use the printer as a context manager. Up to 256 lines wait to be printed, and
+    further lines are dropped.
 
     Args:
         print_line: Function that prints a line.
@@ -144,7 +144,7 @@ class _LinePrinter:
     def _print_lines(self) -> None:
         """Prints the queued lines in the printer's thread, until the queue returns None.
 
-        Errors of the output, for example a closed pipe, do not end the session.
+        Output errors, for example a closed pipe, do not end the session.
         """
         while (text := self._lines.get()) is not None:
             with suppress(OSError):
@@ -184,16 +184,17 @@ def join_and_run(parts: SiteParts) -> int:
 
 
 def _join_session(parts: SiteParts, give_up_ns: int) -> RunningSite | None:
-    """Announces this process to the session, and waits for the others and for a common start.
+    """Announces this process to the session, and waits for the others and the common start.
 
-    All processes agree on the epoch, the start time of the session.
+    All processes agree on the epoch (the start time of the session).
 
     Args:
         parts: Parts of the site, such as its network connection and its arm.
-        give_up_ns: Time at which the site gives up, on the monotonic clock of this process.
+        give_up_ns: Time at which the site gives up, on the monotonic clock of this process, in
+            ns.
 
     Returns:
-        The site, ready to run. None if a signal ended the wait.
+        The site, ready to run, or None if a signal ended the wait.
 
     Raises:
         SessionError: The session did not begin in time, or this site cannot be part of it.
@@ -249,9 +250,9 @@ def _join_session(parts: SiteParts, give_up_ns: int) -> RunningSite | None:
 def _describe_failed_join(parts: SiteParts, joining: SessionJoin) -> SessionError:
     """Returns the error for a site that has waited in vain for its session to begin.
 
-    The text names why a running session has not admitted the site, if that is known, and
-    otherwise the members that are missing. Replies of members that could not be decoded are
-    added, as they often explain why a member seems to be missing.
+    The message states why a running session has not admitted the site, if that is known, and
+    otherwise which members are missing. Replies that could not be decoded are mentioned too,
+    since they often explain why a member seems to be missing.
 
     Args:
         parts: Parts of the site.
