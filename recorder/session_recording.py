@@ -156,7 +156,7 @@ class Recording:
         self.publisher.publish(
             "late",
             f"the recorder joins at t = {since_epoch_ns / 1e9:.3f} s; "
-            f"it requests the earlier messages from {', '.join(present_sites)}",
+            f"it requests earlier messages from {', '.join(present_sites)}",
             t_ns=since_epoch_ns,
         )
         for name in self._gone_sites:

@@ -197,7 +197,7 @@ def _check_log(
         )
     if log.session.get("scenario_sha256") != log.scenario_sha256:
         yield Finding(
-            "scenario", "does not have the hash that the log states: it was changed", False
+            "scenario", "does not have the hash stated in the log: it was changed", False
         )
 
     if not virtual:
@@ -207,12 +207,14 @@ def _check_log(
         yield Finding("virtual time", f"not compared: {reason}", False, judged=False)
     elif recorded:
         yield Finding(
-            "virtual time", f"is another run: {recorded} as recorded, and did not react", True
+            "virtual time",
+            f"is a different run: {recorded} as recorded, and did not react",
+            True,
         )
     elif log.absences:
         sites = " and ".join(log.absences)
         yield Finding(
-            "virtual time", f"is another run: {sites} left, or came while it ran", True
+            "virtual time", f"is a different run: {sites} left or joined during the run", True
         )
     else:
         yield from _check_virtual_time(log, result, progress)
@@ -252,7 +254,7 @@ def _check_virtual_time(
         reason = "a link was measured, not modelled"
     if reason and log.driver != "virtual":
         passed = True
-        yield Finding("plain virtual time", f"is another run: {reason}", passed)
+        yield Finding("plain virtual time", f"is a different run: {reason}", passed)
         return
 
     late_samples = comparison.late

@@ -721,7 +721,7 @@ class Hand(SiteClient):
             )
         coordinates = [float(number) for number in numbers]
         if not all(map(math.isfinite, coordinates)):
-            raise UsageError(f"the numbers of {action} must be finite, not {coordinates}")
+            raise UsageError(f"the coordinates of {action} must be finite, not {coordinates}")
         field = "force" if permitted_action == "push" else "target"
         with self._lock:
             self._message = self._sender.move(self._source, **{field: coordinates})

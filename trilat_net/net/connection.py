@@ -99,7 +99,7 @@ class DefaultEndpoints:
         default = [self.of_site(index) for index in range(site_count)]
         ports = [int(endpoint.rpartition(":")[2]) for endpoint in default]
         # The last port of the block shows that the block is reserved. The ports themselves
-        # cannot show it, because they are shared with the sites that will listen at them.
+        # cannot show it, because they are shared with the sites that will listen on them.
         first_port_of_block = ports[0] - ports[0] % _BLOCK
         last_port_of_block = first_port_of_block + _BLOCK - 1
         with ExitStack() as stack:
@@ -371,7 +371,7 @@ class Connection:
         if listen is not None or file.endpoints("listen", "client"):
             raise UsageError(
                 f"{client_source}: a client of a router does not listen on any endpoint; "
-                "leave out the endpoints to listen at"
+                "leave out the endpoints to listen on"
             )
         if routers and connect is not None:
             raise UsageError(

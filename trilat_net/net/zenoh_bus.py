@@ -204,7 +204,7 @@ def open_zenoh(
             raise RouterSilent(silent.format(_endpoint_texts(connect))) from None
         if "in use" in message or "AddrInUse" in message:
             raise UsageError(
-                f"cannot listen at {_endpoint_texts(listen)}: the port is in use; "
+                f"cannot listen on {_endpoint_texts(listen)}: the port is in use; "
                 "end the program that uses it, or choose another port with "
                 "--listen tcp/127.0.0.1:PORT"
             ) from None
