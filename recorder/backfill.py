@@ -264,8 +264,7 @@ class GapRepair:
 
         Returns:
             A request for at most `_request_size` consecutive messages of one channel, or None
-            if
-            no message is missing and no probe is scheduled.
+            if no message is missing and no probe is scheduled.
         """
         for channel in self._turns:
             account = self.reception.accounts[channel]

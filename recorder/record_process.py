@@ -146,8 +146,7 @@ class Recorder:
         Returns:
             The common start time of the session, and the boot of each member (the number that
             identifies a start of its process). None if the recorder has to stop before the
-            session
-            begins.
+            session begins.
 
         Raises:
             SessionError: The session did not begin in time.

@@ -740,8 +740,7 @@ class Recording:
 
         Returns:
             A sentence about a site that disappeared or whose messages are missing, or None if
-            there
-            is no problem.
+            there is no problem.
         """
         for name, site in self._sites.items():
             if site.final_ticks is None:

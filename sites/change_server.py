@@ -117,8 +117,7 @@ class ChangeServer:
 
         Returns:
             The changes that the site applies in that tick. Empty if none were accepted since
-            the
-            last call.
+            the last call.
         """
         self._update_stopped(next_tick)
 

@@ -415,8 +415,7 @@ class DeadManSwitch:
 
         Returns:
             "released" if the arm must stop, "held" if it may move again, or an empty string if
-            the
-            site does not have to do anything.
+            the site does not have to do anything.
         """
         was_released = self._was_released
         self._was_released = False

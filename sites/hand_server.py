@@ -128,8 +128,8 @@ class HandServer:
             tick: Number of the tick.
 
         Returns:
-            The operator who moves the arm, and the target or force, as a list of floats for
-            the computation of the tick. The format is described in `HandInForce.read`.
+            The operator who moves the arm, and the target or force, as a list of floats for the
+            computation of the tick. The format is described in `HandInForce.read`.
         """
         messages = _read_messages(self._inbox, self._site, self._dropped)
         parsed = [self._parse_command(message) for message in messages]
@@ -166,8 +166,7 @@ class HandServer:
 
         Returns:
             The command, or None if the message is rejected: because it contains a force instead
-                of
-            a target or vice versa, has the wrong number of coordinates, or is out of range.
+            of a target or vice versa, has the wrong number of coordinates, or is out of range.
         """
         if self._hand.mode == "force":
             noun = "force"
@@ -247,8 +246,8 @@ class RemoteHand(HandPlayer):
             tick: Number of the tick.
 
         Returns:
-            The target or force on the arm, as a list of floats for the computation of the
-            tick. The format is described in `HandInForce.read`.
+            The target or force on the arm, as a list of floats for the computation of the tick.
+            The format is described in `HandInForce.read`.
         """
         for message in self._read_decisions():
             self._decide(tick, message)

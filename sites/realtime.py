@@ -88,8 +88,7 @@ def _set_affinity(cpu: int | None) -> str:
         cpu: Number of the processor. If None, nothing is changed.
 
     Returns:
-        The processors that the process may use, in the form stored in the log: "cpu 3" or
-        "cpu 0,1".
+        The processors that the process may use, as stored in the log, such as "cpu 0,1".
     """
     if cpu is not None:
         os.sched_setaffinity(0, {cpu})

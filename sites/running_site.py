@@ -252,8 +252,7 @@ class RunningSite:
 
         Returns:
             True if the site failed, if a member ended the run for everyone, if the user stopped
-            the
-            session or this process, or if a peer has been away for too long.
+            the session or this process, or if a peer has been away for too long.
         """
         parts = self._parts
         for device in (parts.arm, parts.switch):
@@ -276,8 +275,7 @@ class RunningSite:
 
         Returns:
             The record of the tick, or None if the user's own law, plant or operator failed,
-            which
-            ends the run.
+            which ends the run.
         """
         parts = self._parts
         measured = None if parts.arm is None else parts.arm.newest

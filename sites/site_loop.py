@@ -137,8 +137,7 @@ class PeerInbox:
 
         Returns:
             The last tick received from the previous process. None if no sample from that
-            process
-            has arrived, or if the samples with `boot` are already accepted.
+            process has arrived, or if the samples with `boot` are already accepted.
         """
         accepted_boot = self._boots[index]
         is_accepted_already = boot == accepted_boot

@@ -364,10 +364,8 @@ class RecordedInputs(Generic[Change]):
 
         Returns:
             Ticks of the samples that certainly arrived, because an earlier record lists them,
-            and
-            ticks of samples that probably arrived. The latter are in no record, and are older
-            than
-            the given record or than the first sample listed in a later record.
+            and ticks of samples that probably arrived. The latter are in no record, and are
+            older than the given record or than the first sample listed in a later record.
         """
         states = self._states
         t_ns = states[row].t_ns

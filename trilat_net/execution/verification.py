@@ -487,8 +487,7 @@ class _SiteVerifier:
 
         Returns:
             The number of records that are identical to the re-execution. 0 if the next record
-            must
-            be examined individually.
+            must be examined individually.
         """
         plain_rows = self._plain_rows
         if plain_rows is None or not self._certain or self._law_failed:
@@ -626,10 +625,8 @@ class _SiteVerifier:
 
         Returns:
             Tick that is expected next, which is the first tick of the start. If the log does
-            not
-            state this tick, or if it has already been examined, the site is not restarted, and
-            the
-            result is `next_tick`.
+            not state this tick, or if it has already been examined, the site is not restarted,
+            and the result is `next_tick`.
         """
         name = self._log.name
         self._boot = self._read_boot(row)
@@ -705,8 +702,7 @@ class _SiteVerifier:
 
         Returns:
             The difference if the record names another start of the process (boot) or another
-            site,
-            otherwise None.
+            site, otherwise None.
         """
         name = self._log.name
         if state.boot != self._boot:
@@ -820,8 +816,7 @@ class _SiteVerifier:
 
         Returns:
             The arrivals before the first impossible arrival, and the difference that reports
-            the
-            impossible arrival, which is None if all arrivals are possible.
+            the impossible arrival, which is None if all arrivals are possible.
         """
         samples = self._inputs.samples
         ends = self._inputs.ends

@@ -137,8 +137,7 @@ class SiteChannels:
 
         Returns:
             One entry for the statistics if they are due, and one for an event if the mode of
-            the
-            site has changed.
+            the site has changed.
         """
         self.ticks = output.tick + 1
         self._last_ns = output.t_ns

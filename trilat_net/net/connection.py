@@ -264,8 +264,7 @@ class Connection:
 
         Returns:
             The warning, or an empty string if the process has no keys or the keys remain valid
-            for
-            longer than `ENDS_SOON`.
+            for longer than `ENDS_SOON`.
         """
         if self.keys_end is None or self.keys_end - datetime.now(UTC) > ENDS_SOON:
             return ""

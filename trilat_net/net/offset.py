@@ -115,8 +115,7 @@ class OffsetEstimate(NamedTuple):
 
         Returns:
             A new estimate with the same offset and drift, whose range from `low_ns` to
-            `high_ns`
-            includes all given limits.
+            `high_ns` includes all given limits.
         """
         offsets = [limit.offset_ns for limit in limits if limit is not None]
         low_ns = min([self.low_ns, *offsets])
@@ -294,8 +293,7 @@ class _AdmissibleLines:
 
         Returns:
             The time of each limit in s relative to the present, which is never positive, and
-            its
-            offset in ns relative to the latest ceiling.
+            its offset in ns relative to the latest ceiling.
         """
         times_ns = [min(0, limit.local_ns - self._now_ns) for limit in limits]
         offsets_ns = [limit.offset_ns - self._base_ns for limit in limits]

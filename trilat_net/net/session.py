@@ -310,8 +310,7 @@ class SessionJoin:
 
         Returns:
             The epoch and the first tick once all running sites have admitted this site, and
-            None
-            until then.
+            None until then.
         """
         info = self._info
         rate_hz = self._late.rate_hz
@@ -357,10 +356,8 @@ class SessionJoin:
 
         Returns:
             The given epoch, extended by the boot of each member (which identifies the start of
-            its
-            process), the time of tick 0 on the clocks of the running sites and of this site in
-            ns,
-            the first tick of this site, and its request.
+            its process), the time of tick 0 on the clocks of the running sites and of this site
+            in ns, the first tick of this site, and its request.
         """
         info = self._info
         # Later entries replace earlier ones: the members at the start of the session, those

@@ -318,8 +318,7 @@ class LinkTimingMonitor:
 
         Returns:
             True if the peer is receiving this site, and False if not. None if unknown, because
-            the
-            peer has not acknowledged any sample yet or no samples from the peer arrive.
+            the peer has not acknowledged any sample yet or no samples from the peer arrive.
         """
         has_confirmed_any = self._acknowledged_tick >= 0
         if not has_confirmed_any or not self.is_receiving(now_ns):
@@ -342,8 +341,7 @@ class LinkTimingMonitor:
 
         Returns:
             The new estimate. None if the window is not long enough yet, or if the peer runs on
-            this
-            machine, where both sites use the same clock.
+            this machine, where both sites use the same clock.
         """
         estimator = self.peer.estimator
         if estimator is None:
@@ -596,8 +594,7 @@ class SiteTiming:
 
         Returns:
             Events about new estimates, about clock faults, and about peers that are not
-            receiving
-            this site.
+            receiving this site.
         """
         due_ns = self.schedule.due_ns(k)
         notices = self._update_next_estimate(k, now_ns, due_ns)
@@ -674,9 +671,8 @@ class SiteTiming:
         Returns:
             The timing fields of `LinkStats`. The first fields are the lateness of this site
             relative to the leader's schedule and the correction of its own rate. Each other
-            field
-            is a dictionary that maps the name of the site at the other end of a link to the
-            measured quantity.
+            field is a dictionary that maps the name of the site at the other end of a link to
+            the measured quantity.
         """
         stats: dict[str, Any] = {
             "grid_error_us": self.schedule.error_ns // 1000,
