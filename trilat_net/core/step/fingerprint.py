@@ -1,8 +1,8 @@
-"""Computes a fingerprint of the platform's arithmetic, which tells if runs repeat exactly.
+"""Computes a fingerprint of the platform's arithmetic, to tell whether a run repeats exactly.
 
-Results of the same program can differ in the last bit between platforms. A log of a run
-contains the fingerprint of the platform that wrote it. When a log is verified, the run is
-computed again. The results must be equal to the last bit only if the fingerprint of the present
+The same program can produce results that differ in the last bit between platforms. Every log
+contains the fingerprint of the platform that wrote it. Verifying a log recomputes the run, and
+its results are required to match to the last bit only if the fingerprint of the current
 platform is the same (law L5 of docs/develop/design.md).
 
 The fingerprint is a hash of the results of a fixed computation: many sines and cosines, and a
@@ -94,11 +94,10 @@ def _build_setup(name: str, peer: str, q0: tuple[float, float]) -> SiteSetup:
 
 @cache
 def compute_fingerprint() -> str:
-    """Returns a fingerprint of the arithmetic of this platform, sixteen hexadecimal digits.
+    """Returns a fingerprint of this platform's arithmetic, as sixteen hexadecimal digits.
 
-    Two platforms with the same fingerprint can be expected to compute the same bits. It is a
-    hash of many sines and cosines, and of a short simulation of two arms that follow each
-    other.
+    Two platforms with the same fingerprint can be expected to compute bit-identical results.
+    See the module docstring for what is hashed.
     """
     angles = np.linspace(-12.0, 12.0, 4001)
     results = np.empty((2, len(angles)))

@@ -1,15 +1,15 @@
-"""Simulates all arms of an experiment in one compiled call, for studies of many runs.
+"""Simulates all arms of an experiment in one compiled call, for studies with many runs.
 
-A parameter sweep needs thousands of runs, but only a few figures of each. Therefore such a run
-writes no log. It keeps only the largest errors and speeds and a few sums. The clock of the
-simulation jumps from one tick (period of the control loop of an arm) to the next.
+A parameter sweep needs thousands of runs, but only a few figures from each, so these runs write
+no log. They only keep the largest errors and speeds, and a few sums. The simulation clock jumps
+from one tick to the next.
 
 Invariant:
 
 - The call uses the same compiled functions as `Site.step`, which computes a single tick.
-- The ticks are computed in the same order as in an ordinary run in virtual time: by nominal
-  time, and at equal times in the order of the sites in the scenario file.
-- The numbers are equal to those of an ordinary run, bit for bit.
+- Ticks are computed in the same order as in an ordinary run in virtual time: by nominal time,
+  and for equal times in the order of the sites in the scenario file.
+- The results are bit-identical to those of an ordinary run.
 """
 
 from functools import cache
@@ -37,16 +37,15 @@ PROGRESS_DTYPE = row_dtype("progress", {})
 
 
 class RecentRecords(NamedTuple):
-    """Latest states that an arm's process has computed, for the other arms that receive them.
+    """The latest records of a site, kept until all peers have received them.
 
-    A record contains the numbers that are computed in one period of the control loop. It is
-    kept only as long as a delayed message may still need it. The arrays are ring buffers. For
-    several arms, they have an additional first axis.
+    A record stays in this ring buffer only as long as a delayed message may still need it. For
+    several sites, the arrays have an additional leading axis.
 
     Attributes:
         t_ns: Times of the records, in ns since the start of the session. The length is a power
             of two.
-        rows: Floating-point numbers of the records, one row per record, see `Layout.columns`.
+        rows: Floating-point values of the records, one row per record, see `Layout.columns`.
     """
 
     t_ns: IntArray
@@ -70,30 +69,26 @@ _DIVERGED = int(Mode.DIVERGED)
 
 @leaf
 def first_sent_column(s: SiteRow) -> int:
-    """Returns the first column of a record with values that the control law sends.
-
-    A record is the row of floats that an arm's process computes in one control period.
-    """
+    """Returns the first column of a record that holds values sent by the control law."""
     shared_vectors = 5 if s.task else 2
     return 4 * s.joints + shared_vectors * s.shared + s.parameters
 
 
 class ReplayedInputs(NamedTuple):
-    """Inputs of a recorded run of N arms, with which a simulation repeats the run.
+    """Inputs of a recorded run of N arms, used to repeat the run in a simulation.
 
-    Each arm receives the states of P other arms, its peers. A tick is one control period.
+    Each arm receives samples from P peers.
 
     Attributes:
-        first: Index into `samples` of the first arrival, by site, peer and tick. For K ticks
-            the shape is (N, P, K + 1). If K is 0, each sample arrives at the first tick after
-            it was sent.
-        samples: The ticks in which the peers sent the samples, in the order of arrival.
-        hands: Actions of the person or program that moves the arm, by site and tick. The shape
-            is (N, K, 1 + 2 m). The numbers are the firmness of the grip from 0 to 1, the m
-            coordinates of the target, and the target one second later. If K is 0, nobody holds
-            the arms.
-        hand_indices: For each site the index of this person or program among its operators and
-            environments, shape (N,). -1 if nobody moves the arm.
+        first: Index into `samples` of the first arrival, by site, peer and tick. The shape is
+            (N, P, K + 1) for K ticks. If K is 0, each sample arrives at the first tick after it
+            was sent.
+        samples: Ticks in which the peers sent the samples, in order of arrival.
+        hands: Actions of the person or program that moves each arm, by site and tick, shape (N,
+            K, 1 + 2 m). The columns are the grip firmness from 0 to 1, the m target
+            coordinates, and the target one second later. If K is 0, nobody holds the arms.
+        hand_indices: For each site, the index of this person or program among its torque
+            sources (operators and environments), or -1 if nobody moves the arm. Shape (N,).
     """
 
     first: IntArray
@@ -239,18 +234,18 @@ def update_peaks(
     peaks: Array,
     sums: SumsRow,
 ) -> None:
-    """Updates the largest errors and speeds of an arm, and its sums of errors, for a record.
+    """Updates the peak errors and speeds of an arm, and its error sums, with a new record.
 
-    A simulation of many runs keeps these statistics instead of the records. The largest values
-    are kept for each interval of time (bucket).
+    A simulation of many runs keeps these statistics instead of the records. Peaks are kept per
+    time interval (bucket).
 
     Args:
-        row: Floating-point numbers of the record, the results of one control period.
-        t_ns: Nominal time of the period, ns since the start of the session.
+        row: Floating-point values of the record.
+        t_ns: Nominal time of the control period, ns since the start of the session.
         settled_rad: Position error below which the arm counts as settled, rad.
-        s: State of the site (the process that runs the arm).
-        progress: Progress of the site. The time of the last larger error is updated.
-        peaks: Largest values in the present interval, see `run_until`, shape (3 n,).
+        s: State of the site.
+        progress: Progress of the site, in which the time of the last larger error is updated.
+        peaks: Peaks of the current interval, see `run_until`, shape (3 n,).
         sums: Sums over all records of the site.
     """
     largest_error = 0.0
@@ -370,18 +365,19 @@ def update_sums(
     """Adds a control period to the sums of an arm's motor effort and its environments' work.
 
     The effort is the sum of the squared torques beyond gravity. The work in a control period is
-    the torque times the change of the joint angles q. The torque that varies during the period
-    is taken as the mean of both ends (trapezoid rule), and the constant torque is added.
+    the torque times the change in the joint angles q. For a torque that varies during the
+    period, the mean of its values at both ends is used (trapezoidal rule). The constant torque
+    is added.
 
     Args:
-        k: Number of the tick (control period).
+        k: Tick to add.
         t_ns: Nominal time of the tick, ns since the start of the session.
-        s: State of the site (the process that runs the arm).
+        s: State of the site.
         chain: Data of the joints, one row per joint. None for the planar two-link arm.
-        environments: Environments that the arm may touch, without its operators.
+        environments: Environments that the arm may touch, excluding its operators.
         table: Tables of all operators and environments, for example of recorded torques.
-        row: Floating-point numbers of the record, the results of the tick.
-        sums: Sums over all records of the site; changed.
+        row: Floating-point values of the record of this tick.
+        sums: Sums over all records of the site; updated in place.
     """
     n = s.joints
     t_s = t_ns * 1e-9
@@ -432,16 +428,13 @@ def update_sums(
 
 
 class LawArrays(NamedTuple):
-    """Arrays with which the compiled simulation calls users' control laws, for all N arms.
-
-    They contain the addresses of the compiled laws, and the numbers that the laws keep and
-    send.
+    """Arrays through which the compiled simulation of N arms calls users' control laws.
 
     Attributes:
         addresses: Address of the machine code of each site's law, shape (N,), see
-            `CompiledLaw`. 0 if the law of the site is built in.
-        rows: Gains and memory of each law, one row per site, filled up to equal length.
-        sent: Numbers that each law sends to other sites, one row per site, filled up to equal
+            `CompiledLaw`. 0 if the site uses a built-in law.
+        rows: Gains and memory of each law, one row per site, padded to equal length.
+        sent: Values that each law sends to other sites, one row per site, padded to equal
             length.
     """
 
@@ -523,11 +516,11 @@ def sense_site(
     arrays: SiteArrays,
     chain: RowArray | None,
 ) -> None:
-    """Computes the part of an arm's next control period that comes before its control law.
+    """Computes the part of an arm's next control period that precedes its control law.
 
-    This part accepts the messages (states) of the other arms, and computes the reference, which
-    is the position to follow, the errors and the parameter estimate. The messages arrive as in
-    a recorded run, or without delay if no run is repeated.
+    Accepts the messages of the other arms, then computes the reference, the errors and the
+    parameter estimate. Messages arrive as they did in the recorded run, or without delay if no
+    run is being repeated.
 
     Args:
         i: Index of the site.
@@ -605,21 +598,21 @@ def finish_site(
     chain: RowArray | None,
     laws: LawArrays | None,
 ) -> int:
-    """Completes a control period of one arm, after `sense_site` has computed its first part.
+    """Completes the control period of one arm that `sense_site` has started.
 
-    The control law computes the torque, and the arm moves to the next period. The results of
-    the period are added to statistics of the run.
+    The control law computes the torque, the arm moves on to the next period, and the results
+    are added to the statistics of the run.
 
     Args:
-        i: Index of the site, the process that runs one arm.
+        i: Index of the site.
         settled_rad: Position error below which the arm counts as settled, rad.
         progress: State of the simulation, one row per site, see `ProgressRow`.
-        sent: Latest records of the sites; the new record is written.
-        peaks: Largest errors and speeds so far, see `run_until`; updated.
-        sums: Sums over the records, see `SumsRow`; updated.
-        arrays: Arrays of all sites; updated.
+        sent: Latest records of the sites; the new record is written here.
+        peaks: Largest errors and speeds so far, see `run_until`; updated in place.
+        sums: Sums over the records, see `SumsRow`; updated in place.
+        arrays: Arrays of all sites; updated in place.
         chain: Data of the joints, one row per joint. None for the planar two-link arm.
-        laws: Compiled control laws that users wrote. None if there are no such laws.
+        laws: Compiled user-written control laws, or None if there are none.
 
     Returns:
         The mode of the site, a member of `Mode`.
@@ -689,28 +682,28 @@ def run_until(
     chains: RowArray | None,
     laws: LawArrays | None,
 ) -> None:
-    """Simulates all arms of an experiment up to a time, or until an arm diverges.
+    """Simulates all arms of an experiment until a given time, or until an arm diverges.
 
-    The control periods of all arms are computed in the order of their times, because each arm
+    The control periods of all arms are interleaved in chronological order, because each arm
     receives the states of the others.
 
     Args:
         last_ns: Time of the last control period to compute, ns since the start of the session.
         settled_rad: Position error below which an arm counts as settled, rad. The progress of a
-            site contains the last time of a larger error.
+            site stores when this error was last exceeded.
         progress: Progress of the sites, shape (N,), PROGRESS_DTYPE.
-        next_samples: Number of the next sample (state of another arm) to accept, for each of N
-            sites and P peers (the other sites), shape (N, P).
+        next_samples: Number of the next sample to accept, for each of N sites and P peers,
+            shape (N, P).
         sent: Latest records of the sites, from which the samples are taken.
-        feed: Inputs of a recorded run that is repeated.
-        peaks: For each interval of time (bucket) the largest position error |e| of each joint,
-            then the largest speed |qd| of each joint, then the last angle q of each joint; -1
-            if there is no record. The shape is (N, buckets, 3 n).
+        feed: Inputs of the recorded run to repeat.
+        peaks: For each time interval (bucket), the largest position error |e| of each joint,
+            then the largest speed |qd| of each joint, then the last angle q of each joint, or
+            -1 if the interval contains no record. Shape (N, buckets, 3 n).
         sums: Sums over the records of the sites, shape (N,), see `sums_dtype`.
         arrays: Arrays of all sites, see `SiteArrays.stack`.
-        chains: The field `chain` of `arrays` once more. If this argument is None, Numba does
-            not compile the functions for chains of joints.
-        laws: Compiled control laws that users wrote. None if there are no such laws.
+        chains: The same array as the field `chain` of `arrays`. If None, Numba does not compile
+            the functions for chains of joints.
+        laws: Compiled user-written control laws, or None if there are none.
     """
     count = progress.shape[0]
     while True:

@@ -1,22 +1,22 @@
 # mypy: disallow-untyped-calls=False, disable-error-code="no-any-return"
-"""Compiles numerical functions with Numba, and stores their machine code on disk.
+"""Compiles numerical functions with Numba, and caches their machine code on disk.
 
-A function with the decorator `leaf` is compiled at its first call. Compiling the whole core
-takes long, so later processes load the stored code. Numba has such a cache too, but it does not
-notice a change of a function that the stored function calls.
+A function decorated with `leaf` is compiled on its first call. Compiling the whole core is
+slow, so later processes load the cached code instead. Numba's own cache is not used, because it
+does not notice when a function called by a cached function changes.
 
-- The code is stored in the user's cache directory, in a folder named after a hash of all source
-  files of this package and of `records.py`, whose constants it contains.
-- A binary wheel contains the same kind of folder, with code for any processor of its platform.
-  This code is used if the cache directory has no code for the present processor.
-- A function that is called by another compiled function only, an inner leaf, is stored as LLVM
-  code before optimisation, because it is optimised together with its caller. All others are
-  stored as machine code alone, which halves the files and shortens the start of a command.
+- The code is stored in a folder of the user's cache directory. The folder is named after a hash
+  of all source files of this package, and of `records.py`, whose constants are compiled in.
+- Binary wheels ship the same kind of folder, with code that runs on any processor of their
+  platform. It is used if the cache directory has no code for the current processor.
+- An inner leaf, which is only called by other compiled functions, is stored as unoptimised LLVM
+  code, since it is optimised together with its caller. All other functions are stored as
+  machine code only, which halves the size of the files and speeds up the start of a command.
 
 Invariant:
-    - Floating-point operations are not reordered (no fastmath). Therefore compiled functions
-      and plain Python give the same bits.
-    - The compilation and the caches of other code in the process are not affected.
+    - Floating-point operations are not reordered (no fastmath), so compiled functions and plain
+      Python produce identical bits.
+    - Compilation and caching of other Numba code in the process are not affected.
 """
 
 import hashlib
@@ -113,11 +113,11 @@ _ships = _SHIPPED.is_dir()
 
 
 def is_core_cached() -> bool:
-    """Returns True if a simulation can start at once, because its code was compiled earlier.
+    """Returns True if a simulation can start immediately, without compiling the core first.
 
-    Otherwise the first run takes longer, and a command can say so beforehand. Only the function
-    `kernel.site_tick` is looked for on disk. It is compiled last, so the other functions are
-    there too.
+    Commands use this to announce that the first run will take longer. Only the function
+    `kernel.site_tick` is looked up on disk: it is compiled last, so if it is there, the others
+    are too.
     """
     folders = [_CACHE, _SHIPPED if _ships else None]
     for folder in folders:
@@ -153,10 +153,10 @@ class _CompilingNotice(event.Listener):
         self._restorers: list[Callable[[], None]] = []
 
     def on_start(self, event_data: Any) -> None:
-        """Reports the first compilation of a function of the core, because it takes long.
+        """Prints a notice before the first compilation of a core function, which is slow.
 
-        Numba calls this method at the start of each compilation. Until the end of the
-        compilation, signals such as Ctrl-C end the process at once.
+        Numba calls this method at the start of each compilation. While the compilation is
+        running, signals such as Ctrl-C end the process immediately.
 
         Args:
             event_data: Numba's description of the compilation.
@@ -171,7 +171,7 @@ class _CompilingNotice(event.Listener):
             self.report(COMPILING)
 
     def on_end(self, _: Any) -> None:
-        """Restores the handlers of signals when Numba reports the end of a compilation."""
+        """Restores the signal handlers when Numba reports the end of a compilation."""
         restore = self._restorers.pop()
         restore()
 
@@ -268,16 +268,15 @@ class _LeafCacheImpl(CompileResultCacheImpl):
     def rebuild(self, context: Any, content: Any) -> Any:
         """Converts the content of a cache file to a compiled function.
 
-        A leaf is a function with the decorator `leaf`. Numba itself loads the machine code of a
-        leaf. For the LLVM code of an inner leaf, which only other leaves call, this method
-        creates the objects that Numba has after a compilation. It uses private names of Numba,
-        because Numba has no interface for this.
+        For the machine code of a leaf, this is left to Numba. For the LLVM code of an inner
+        leaf, this method creates the objects that Numba would have after a compilation. Numba
+        has no public interface for this, so private names are used.
 
         Args:
             context: Numba's description of the target processor.
-            content: Content of the file, as `CompileResult._reduce` wrote it. The first entry
-                is what `_LeafLibrary.serialize_using_object_code` returned, and the others are
-                arguments of `compile_result` in a fixed order.
+            content: Content of the file, as written by `CompileResult._reduce`. The first entry
+                was returned by `_LeafLibrary.serialize_using_object_code`; the others are the
+                positional arguments of `compile_result`.
 
         Returns:
             Numba's description of the compiled function.
@@ -325,15 +324,15 @@ class _CompressedFiles(IndexDataCacheFile):
     """
 
     def save(self, key: Any, code: Any) -> None:
-        """Writes compiled code to a file, and adds the file to the index of the cache.
+        """Writes compiled code to a file, and adds the file to the cache index.
 
-        The index contains the name of the file for each key. Numba numbers the files. Two
-        processes that compile at the same time may then choose the same number. A hash of the
-        key instead of a number makes the names differ.
+        The index maps each key to a file name. Numba would number the files, so two processes
+        that compile at the same time could pick the same number. The names used here contain a
+        hash of the key instead.
 
         Args:
-            key: Types of the arguments and the processor, for which the code was compiled.
-            code: The compiled code, as Numba serialises it.
+            key: Argument types and processor for which the code was compiled.
+            code: The compiled code, as serialised by Numba.
         """
         names = self._load_index()
         # Numba's name for file 0 is "FUNCTION.0.SUFFIX": the hash replaces the number.
@@ -376,18 +375,18 @@ class _LeafCache(FunctionCache):
         self._inner = files(str(folder), f"{base}-within", stamp)
 
     def load_overload(self, signature: Any, context: Any) -> Any:
-        """Loads the machine code of the function for given types of arguments.
+        """Loads the machine code of the function for given argument types.
 
-        The user's cache directory is searched first. The code in the installed wheel comes
-        second. In contrast to the method of Numba, this method does not prepare the compiler,
-        which would take far longer than loading.
+        The user's cache directory is searched first, then the code in the installed wheel.
+        Unlike Numba's own method, this one does not initialise the compiler, which would take
+        far longer than loading.
 
         Args:
             signature: Types of the arguments.
             context: Numba's description of the target processor.
 
         Returns:
-            Numba's description of the compiled function. None if there is no stored code.
+            Numba's description of the compiled function, or None if there is no stored code.
         """
         with self._guard_against_spurious_io_errors():
             result = self._load_overload(signature, context)
@@ -407,14 +406,15 @@ class _LeafCache(FunctionCache):
     def load_inner(self, argument_types: Any, context: Any) -> Any:
         """Loads the LLVM code of a function that another compiled function calls.
 
-        LLVM code is the intermediate form from which the compiler makes machine code.
+        LLVM code is the intermediate representation from which the compiler generates machine
+        code.
 
         Args:
-            argument_types: Numba's types of the arguments.
+            argument_types: Numba types of the arguments.
             context: Numba's description of the target processor.
 
         Returns:
-            Numba's description of the compiled function. None if the cache has no code for
+            Numba's description of the compiled function, or None if the cache has no code for
             these types.
         """
         key = self._index_key(argument_types, context.codegen())
@@ -424,11 +424,11 @@ class _LeafCache(FunctionCache):
     def save_inner(self, argument_types: Any, result: Any) -> None:
         """Stores the LLVM code of an inner leaf, which only other compiled functions can call.
 
-        The code is kept in its own files, separate from the machine code that Python calls.
-        Nothing is stored if there is no cache directory in which files can be written.
+        The files are kept separate from the machine code that is called from Python. Nothing is
+        stored if no cache directory is writable.
 
         Args:
-            argument_types: Numba's types of the arguments.
+            argument_types: Numba types of the arguments.
             result: Numba's description of the compiled function.
         """
         has_cache = _CACHE is not None
@@ -502,10 +502,9 @@ class _LeafCompiler(Compiler):
     def compile_extra(self, function: Any) -> Any:
         """Compiles a leaf to machine code that Python can call, or to LLVM code.
 
-        A leaf is a function with the decorator `leaf`. While the compilation of another leaf is
-        in progress, this leaf is compiled because the other leaf calls it. It is then an inner
-        leaf. Only LLVM code is produced, which becomes a part of the other leaf. Numba calls
-        this method.
+        If this happens while another leaf is being compiled, the other leaf must be the caller.
+        The function is then an inner leaf, and only LLVM code is produced, which becomes part
+        of the caller. Called by Numba.
 
         Args:
             function: The Python function.
@@ -655,14 +654,14 @@ class _Leaf(CPUDispatcher):
         return self.py_func
 
     def get_call_template(self, arguments: Any, keywords: Any) -> Any:
-        """Returns Numba's typing information for a call with given types of arguments.
+        """Returns Numba's typing information for a call with given argument types.
 
-        A constant argument is treated like any other value of its type. Otherwise Numba would
-        compile the function again for each constant. Numba calls this method.
+        Constant arguments are treated like any other value of their type, because Numba would
+        otherwise recompile the function for each constant. Called by Numba.
 
         Args:
             arguments: Types of the positional arguments.
-            keywords: Types of the keyword arguments, by name.
+            keywords: Types of the keyword arguments, keyed by name.
         """
         plain_arguments = tuple(map(types.unliteral, arguments))
         plain_keywords = {name: types.unliteral(kind) for name, kind in keywords.items()}
@@ -673,14 +672,13 @@ class _Leaf(CPUDispatcher):
             return super().get_call_template(plain_arguments, plain_keywords)
 
     def add_overload(self, result: Any) -> None:
-        """Stores a compiled form of the function, so that it need not be compiled again.
+        """Registers a compiled form of the function for later calls with the same types.
 
-        There are two forms. A leaf that Python calls is machine code. An inner leaf, which was
-        compiled because another leaf calls it, is LLVM code, which cannot be executed. Both are
-        entered into `overloads`, the table in which compiled callers look up a function by the
-        types of its arguments. Numba's own method also enters the machine code into the table
-        of functions that Python can call, where an inner leaf must not appear. Numba calls this
-        method.
+        A leaf called from Python is compiled to machine code. An inner leaf, compiled because
+        another leaf calls it, is LLVM code that cannot be executed. Both are added to
+        `overloads`, where compiled callers look up a function by its argument types. Numba's
+        own method would also add it to the table of functions callable from Python, where an
+        inner leaf must not appear. Called by Numba.
 
         Args:
             result: Numba's description of the compiled form.
@@ -694,19 +692,17 @@ class _Leaf(CPUDispatcher):
         self.overloads[argument_types] = result
 
     def compile(self, signature: Any) -> Any:
-        """Loads or compiles the function for given types of arguments.
+        """Loads or compiles the function for given argument types.
 
-        If Python calls the function, machine code is produced. If another function that is
-        being compiled calls it, LLVM code is produced, which is then optimised together with
-        its caller. `overloads` contains the compiled forms of the function, machine code or
-        LLVM code, by the types of the arguments.
+        A call from Python needs machine code. A call from another function that is being
+        compiled needs LLVM code, which is then optimised together with its caller. Both forms
+        are stored in `overloads`, keyed by the argument types.
 
         Args:
-            signature: Types of the arguments, in a form that Numba accepts.
+            signature: Argument types, in any form that Numba accepts.
 
         Returns:
-            The compiled function. For LLVM code, an object that stands for it in Numba's
-            tables.
+            The compiled function. For LLVM code, a placeholder for it in Numba's tables.
         """
         with global_compiler_lock:
             argument_types, return_type = normalize_signature(signature)
@@ -749,15 +745,15 @@ class _Leaf(CPUDispatcher):
 
 
 def bind_leaf(function: Callable[P, R], *arguments: P.args, **_: P.kwargs) -> Callable[P, R]:
-    """Compiles a function for arguments of given types, so that calls need not check the types.
+    """Compiles a function for the types of the given arguments, to avoid checks on each call.
 
-    A control loop calls such a function in each period. The result must only be called with
-    arguments of the same types as those given here. If Numba is disabled, the function itself
-    is returned.
+    Used for functions that a control loop calls in every period. The result must only be called
+    with arguments of the same types as those given here. If Numba is disabled, returns the
+    function itself.
 
     Args:
-        function: A function with the decorator `leaf`.
-        *arguments: Examples of the arguments.
+        function: A function decorated with `leaf`.
+        *arguments: Example arguments.
     """
     if _config.DISABLE_JIT:
         return function
@@ -767,12 +763,11 @@ def bind_leaf(function: Callable[P, R], *arguments: P.args, **_: P.kwargs) -> Ca
 
 
 def leaf(function: Callable[P, R]) -> Callable[P, R]:
-    """Marks a numerical function to be compiled by Numba at its first call (decorator).
+    """Decorator that compiles a numerical function with Numba on its first call.
 
-    In contrast to `numba.njit`, the compiled code is stored on disk and found again until a
-    source file of this package changes, and the function must not allocate arrays. The type of
-    the function is unchanged for readers and type checkers. If Numba is disabled, the function
-    itself is returned.
+    Unlike with `numba.njit`, the function must not allocate arrays, and the compiled code is
+    cached on disk until a source file of this package changes. Readers and type checkers see
+    the type of the original function. If Numba is disabled, returns the function itself.
     """
     if _config.DISABLE_JIT:
         return function
@@ -794,22 +789,21 @@ def _make_leaf(function: Callable[P, R], compiler: type[_LeafCompiler]) -> Calla
 
 
 def loop_leaf(function: Callable[P, R]) -> Callable[P, R]:
-    """Marks a function with a long loop that calls other leaves (decorator).
+    """Decorator for a function with a long loop that calls other leaves.
 
-    All leaves that the loop calls become part of its code. This saves the time for passing
-    descriptions of arrays to these leaves. Python calls the function like any other leaf.
+    All leaves called by the loop are inlined into its code, which saves the cost of passing
+    array descriptors to them. Python calls the function like any other leaf.
     """
     return leaf(function) if _config.DISABLE_JIT else _make_leaf(function, _LoopCompiler)
 
 
 def lane_leaf(function: Callable[P, R]) -> Callable[P, R]:
-    """Marks a function that computes several simulations at once, by SIMD (decorator).
+    """Decorator for a function that computes several simulations at once, using SIMD.
 
-    Each simulation has a lane, a position in the processor's vector registers. The compiler
-    needs two guarantees, which apply to the marked function only: all functions that it calls
-    become part of its code, and no two of its arguments overlap in memory. The caller has to
-    make sure that no arguments overlap. Such a function is called from compiled code by its
-    address (`LaneCode`).
+    Each simulation occupies a lane, which is a position in the processor's vector registers.
+    The compiler needs two guarantees, for the decorated function only: all functions that it
+    calls are inlined, and no two of its arguments overlap in memory. The caller must ensure the
+    latter. Compiled code calls such a function by its address (`LaneCode`).
     """
     return _make_leaf(function, _LaneCompiler)
 
@@ -829,8 +823,8 @@ class LaneCode:
     """Machine code of a function that computes several simulations side by side.
 
     Args:
-        function: A function with the decorator `lane_leaf`.
-        argument_types: Numba's types of its arguments.
+        function: A function decorated with `lane_leaf`.
+        argument_types: Numba types of its arguments.
     """
 
     def __init__(self, function: Callable[..., Any], argument_types: tuple[Any, ...]) -> None:
@@ -838,10 +832,10 @@ class LaneCode:
         self._argument_types = argument_types
 
     def find_address(self) -> int:
-        """Returns the memory address of the code, by which other compiled code calls it.
+        """Returns the memory address at which other compiled code can call this code.
 
-        The function is compiled if needed. Its code is not stored on disk if the attribute
-        `is_stored` of some argument type is False.
+        Compiles the function if necessary. The code is not cached on disk if any argument type
+        has an `is_stored` attribute that is False.
         """
         dispatcher = self._dispatcher
         is_stored = all(getattr(kind, "is_stored", True) for kind in self._argument_types)
@@ -852,9 +846,10 @@ class LaneCode:
         return int(result.library.get_pointer_to_function(result.fndesc.llvm_func_name))
 
     def is_stored(self) -> bool:
-        """Returns True if the machine code is on disk already.
+        """Returns True if the machine code is already on disk.
 
-        If not, the first use of the function takes long, because it has to be compiled.
+        If not, the first use of the function is slow, because the function must be compiled
+        first.
         """
         dispatcher = self._dispatcher
         if self._argument_types in dispatcher.overloads:
@@ -866,8 +861,8 @@ class LaneCode:
     def read_assembly(self) -> str:
         """Returns the assembly code of the function.
 
-        A test checks that it contains vector instructions, without which the function would be
-        slow.
+        A test uses it to check that the code contains vector instructions, without which the
+        function would be slow.
         """
         # Numba has no assembly text for code from the cache.
         compiled = _make_unstored(self._dispatcher.py_func)
@@ -878,14 +873,14 @@ class LaneCode:
 def set_lane_form(
     function: Callable[..., Any], choose: Callable[[tuple[Any, ...]], Callable[..., Any]]
 ) -> None:
-    """Registers another version of a function, for code that computes several simulations.
+    """Registers another version of a function for code that computes several simulations.
 
-    For example, `compute_law` of `core.lanes.lane_laws` has a version for each control law,
+    For example, `compute_law` of `core.lanes.lane_laws` has one version per control law,
     because all simulations that are computed side by side use the same law.
 
     Args:
-        function: A function with the decorator `leaf`.
-        choose: Function that returns the implementation for given types of the arguments.
+        function: A function decorated with `leaf`.
+        choose: Function that returns the implementation for given argument types.
     """
     if not _config.DISABLE_JIT:
         dispatcher: Any = function
@@ -907,22 +902,22 @@ class _NamedCache(_LeafCache):
 def compile_named(
     function: Callable[..., None], name: str, signature: Any, **options: Any
 ) -> Any:
-    """Compiles a closure, and stores its machine code on disk under a name.
+    """Compiles a closure, and caches its machine code on disk under a name.
 
-    A closure is a function that uses variables of an outer function. If a closure with this
-    name was compiled before, its code is loaded. The caller must therefore derive the name from
-    everything that the code depends on. The name is part of the symbols of the machine code: no
-    two such functions may have the same name in any process.
+    If a closure with this name was compiled before, its code is loaded instead. The name must
+    therefore be derived from everything that the code depends on, including the variables
+    captured by the closure. It is also used for the symbols in the machine code, so no two such
+    functions in a process may share a name.
 
     Args:
         function: The closure. Its qualified name is changed to `name`.
         name: Name of the function.
-        signature: Numba's signature of the function.
-        **options: Options of `numba.njit`. The options that all leaves have in common, such as
-            no counting of references, take precedence.
+        signature: Numba signature of the function.
+        **options: Options for `numba.njit`. The options shared by all leaves, such as disabling
+            reference counting, take precedence.
 
     Returns:
-        Numba's dispatcher of the compiled function.
+        Numba's dispatcher for the compiled function.
     """
     function.__qualname__ = name
     # The common options apply to both new and loaded code: neither counts references.
