@@ -1,9 +1,8 @@
-"""Computes one period of the control loop of an arm, as compiled code.
+"""Computes one control period (tick) of a site in compiled code.
 
-The process that runs one arm is called a site, and one period of its control loop a tick. A
-tick has eight stages, in this order:
+A tick has eight stages, executed in this order:
 
-- 1 accept: store the samples (states) that arrived from other sites.
+- 1 accept: store the samples that arrived from other sites.
 - 2 release: take the newest sample of each site whose simulated delay has passed.
 - 3 reference: compute the position that the arm should follow.
 - 4 errors: compute the tracking errors.
@@ -12,16 +11,16 @@ tick has eight stages, in this order:
 - 7 emit: write the record, which contains the results of the tick.
 - 8 advance: simulate the arm until the next tick.
 
-The state of a site is a row of numbers, `SiteRow`, which the stages read and write. For an arm
-that is a chain of joints, `chain` contains the data of its joints. For the planar two-link arm
-it is None.
+The stages read and write the state of a site, stored as a row of type `SiteRow`. For an arm
+that is a chain of joints, `chain` contains the joint data; for the planar two-link arm it is
+None.
 
 Invariant:
-    - Live sites and the fused run, a simulation of all sites in one compiled loop, call the
+    - Live sites and the fused run (a simulation of all sites in one compiled loop) call the
       same functions for the stages.
-    - Stage 8 integrates with the classical Runge-Kutta method of fourth order. The torque of
-      the motors is constant during the tick. The torques of operators and environments are
-      computed anew in each of the four evaluations, unless they are marked as sampled.
+    - Stage 8 integrates with the classical fourth-order Runge-Kutta method. Motor torque is
+      constant during the tick. The torques of operators and environments are recomputed at each
+      of the four evaluations, unless they are marked as sampled.
 """
 
 from math import isfinite
@@ -112,10 +111,10 @@ def _advance_estimate(s: SiteRow, chain: RowArray | None, gain_s: float, Yr: Vec
 
 @leaf
 def adapts(s: SiteRow) -> bool:
-    """Returns True if the estimate of the arm's parameters may change in the present mode.
+    """Returns True if the estimate of the arm's parameters may change in the current mode.
 
-    It may not change in DIVERGED. While the arm rests, it changes only if the torque at rest is
-    that of the control law, see `rests_by_law`.
+    The estimate is frozen in the mode DIVERGED. While the arm is at rest, it changes only if
+    the arm is held by the torque of the control law; see `rests_by_law`.
     """
     return bool(s.mode != _DIVERGED and (rests_by_law(s) or not rests(s)))
 
@@ -150,19 +149,19 @@ def _update_estimate(k: int, s: SiteRow, chain: RowArray | None) -> None:
 def updates_estimate(k: int, s: SiteRow) -> bool:
     """Returns True if an adaptive law integrates its parameter estimate in this control period.
 
-    The result is False in the first period of an arm's process, and under the scheme `digital`,
-    which integrates at the end of the period. `adapts` decides whether the mode allows
-    adaptation.
+    This is never the case in the first period of a site, nor under the scheme `digital`, which
+    integrates at the end of the period. Whether the mode allows adaptation is decided by
+    `adapts`.
     """
     return bool(s.scheme != _DIGITAL and k != s.first and s.law == _ADAPTIVE)
 
 
 @leaf
 def sum_trapezoid(s: SiteRow) -> None:
-    """Adds the adaptation rate Y' r of the previous control period to the present rate.
+    """Adds the adaptation rate Y' r of the previous control period to the current rate.
 
-    The estimate of the arm's parameters is integrated by the trapezoid rule, which needs this
-    sum. It is written into `Yr_before`, see `_update_estimate`.
+    The parameter estimate is integrated with the trapezoidal rule, which needs this sum. The
+    result is stored in `Yr_before`; see `_update_estimate`.
     """
     for p in range(s.Yr.shape[0]):
         s.Yr_before[p] += s.Yr[p]
@@ -172,12 +171,10 @@ def sum_trapezoid(s: SiteRow) -> None:
 def torque_stage(site: RowArray, chain: RowArray | None) -> None:
     """Computes the torque of a control law that is built into the compiled simulation.
 
-    The function does nothing for a law that was written as a Python class; `law_stage` calls
-    such a law.
+    Does nothing for a law written as a Python class, which is called by `law_stage`.
 
     Args:
-        site: State of the site (the process that runs the arm), shape (1,). The torque is
-            written into it.
+        site: State of the site, shape (1,). The torque is written to it.
         chain: Data of the joints, one row per joint. None for the planar two-link arm.
     """
     s: SiteRow = site[0]
@@ -212,22 +209,22 @@ def _put_known_gravity(s: SiteRow, chain: RowArray | None, torque: Array) -> Non
 
 @leaf
 def guard_torque(k: int, t_ns: int, s: SiteRow, chain: RowArray | None) -> None:
-    """Turns the torque of the control law into the torque that the motors get.
+    """Converts the torque of the control law to the torque sent to the motors.
 
-    The function is called after the law has written the torque `tau`. The rate of every torque
-    is limited. Under the rule `glide`, by which an arm comes to rest while another arm is
-    silent, the torque is first modified in these cases:
+    Called after the law has written its torque to `tau`. The rate of change is always limited.
+    Under the rule `glide` (where an arm comes to rest while another arm is silent), the torque
+    is modified first in the following cases:
 
-    - The torque is not finite: the mode becomes FAULT, in which the arm comes to rest.
-    - The arm comes to rest or is at rest: damping and an integral term are added, see
-      `resting`. If the law cannot hold the arm, the gravity torque replaces that of the law.
-    - The arm has just left its rest: the torque blends from the torque at rest to the torque of
-      the law.
+    - The torque is not finite: the mode changes to FAULT, in which the arm comes to rest.
+    - The arm is at rest or coming to rest: damping and an integral term are added, see
+      `resting`. If the law cannot hold the arm, its torque is replaced with the gravity torque.
+    - The arm has just left rest: the torque is blended from the rest torque to the law's
+      torque.
 
     Args:
-        k: Number of the tick, a period of the control loop.
-        t_ns: Nominal time of the tick, ns since the epoch, the common start of the session.
-        s: State of the site (the process that runs the arm); changed.
+        k: Current tick.
+        t_ns: Nominal time of the tick, ns since the epoch (the common start of the session).
+        s: State of the site; updated in place.
         chain: Data of the joints, one row per joint. None for the planar two-link arm.
     """
     resting = False
@@ -348,18 +345,18 @@ def _advance_arm(
 
 @leaf
 def hold_motor_torque(k: int, s: SiteRow) -> None:
-    """Computes the motor torque u that is held during the whole control period.
+    """Computes the motor torque u that is held constant during the control period.
 
-    The constant torque that represents the period best is the torque in the middle of the
-    period. It is extrapolated from the torques of this tick and the previous tick:
+    The constant torque that best represents the period is the torque at its midpoint,
+    extrapolated from this tick and the previous one:
 
         u = 1.5 tau_k - 0.5 tau_{k-1}, within the limit
 
     At the first tick, and under the scheme DIGITAL, u = tau_k.
 
     Args:
-        k: Number of the tick (control period).
-        s: State of the site (the process that runs the arm); `u` and `q_before` are written.
+        k: Current tick.
+        s: State of the site. `u` and `q_before` are written.
     """
     for i in range(s.q.shape[0]):
         s.q_before[i] = s.q[i]
@@ -377,11 +374,11 @@ def hold_motor_torque(k: int, s: SiteRow) -> None:
 def finish_advance(s: SiteRow, chain: RowArray | None, is_adapting: bool) -> None:
     """Stores the torque and the adaptation rate Y' r of this tick for the next tick.
 
-    Y' r drives the parameter estimate, see `_update_estimate`. Under the scheme DIGITAL the
-    estimate itself is advanced here.
+    Y' r drives the parameter estimate; see `_update_estimate`. Under the scheme DIGITAL, this
+    function also advances the estimate itself.
 
     Args:
-        s: State of the site (the process that runs the arm).
+        s: State of the site.
         chain: Data of the joints, one row per joint. None for the planar two-link arm.
         is_adapting: Result of `adapts` before the arm moved.
     """
@@ -428,17 +425,17 @@ def _advance(
 
 @leaf
 def channel_of(channel: ChannelArrays | None, peer: int) -> ChannelArrays | None:
-    """Returns the arrays for the values that the control law of one other arm (peer) sends.
+    """Selects the arrays for the values sent by the control law of one peer.
 
-    Some laws send values besides the motion of the arm, for example energies.
+    Some laws send values other than the motion of the arm, for example energies.
 
     Args:
-        channel: Arrays of all peers of a site, or of all sites of a simulation. None if the
-            control law of this site reads no such values.
+        channel: Arrays of all peers of a site, or of all sites of a simulation. None if this
+            site's control law reads no such values.
         peer: Index of the peer, or of the site.
 
     Returns:
-        Views of the arrays of the peer or the site. None if `channel` is None.
+        Views of the arrays, or None if `channel` is None.
     """
     if channel is None:
         return None
@@ -469,34 +466,31 @@ def _link_arrays(arrays: SiteArrays, peer: int) -> LinkArrays:
 
 @leaf
 def find_release(peer: int, tick: int, arrays: SiteArrays) -> int:
-    """Finds the control period of this arm in which a message from another arm is first used.
-
-    A message (sample) is the state that the other arm sends once per period of its own loop.
+    """Finds the control period of this arm in which a peer's sample is first used.
 
     Args:
         peer: Index of the peer.
-        tick: Number of the period in which the peer sent the sample.
+        tick: Tick in which the peer sent the sample.
         arrays: Arrays of the site.
 
     Returns:
-        The number of the period if the sample arrives in time. LOST if the link loses the
-        sample, or if the sample is too old.
+        The tick of this site if the sample arrives in time. LOST if the link drops the sample,
+        or if the sample is too old.
     """
     return release_tick(tick, arrays.site[0].rate_hz, _link_arrays(arrays, peer))
 
 
 @leaf
 def accept_stage(k: int, count: int, arrays: SiteArrays, buffers: TickBuffers) -> None:
-    """Stores the messages that arrived, until their simulated network delay has passed.
+    """Stores the messages that arrived until their simulated network delay has passed.
 
-    A message (sample) is the state that another arm sends once per control period. Messages
-    wait in ring buffers, which are called calendars.
+    The ring buffers in which messages wait are called calendars.
 
     Args:
-        k: Number of the present control period.
-        count: Number of samples that arrived since the previous period.
-        arrays: Arrays of the site (the process that runs the arm); written.
-        buffers: Contains the samples.
+        k: Current tick.
+        count: Number of samples that arrived since the previous tick.
+        arrays: Arrays of the site; updated in place.
+        buffers: Buffers that contain the samples.
     """
     rate_hz = arrays.site[0].rate_hz
     for n in range(count):
@@ -515,15 +509,14 @@ def accept_stage(k: int, count: int, arrays: SiteArrays, buffers: TickBuffers) -
 
 @leaf
 def guard_reference(k: int, t_ns: int, s: SiteRow, links: RowArray) -> None:
-    """Stops the reference while other arms are silent, and limits its speed.
+    """Limits the speed of the reference, and stops it while peers are silent.
 
-    The reference is the position that the arm follows. It stops if no messages arrive from the
-    other arms for too long.
+    The reference stops if no messages have arrived from the peers for too long.
 
     Args:
-        k: Number of the tick (control period).
+        k: Current tick.
         t_ns: Nominal time of the tick, ns since the start of the session.
-        s: State of the site, with the reference; changed.
+        s: State of the site, including the reference; updated in place.
         links: States of the links from the other sites.
     """
     if s.on_stale == _GLIDE:
@@ -545,15 +538,15 @@ def error_stages(
 ) -> None:
     """Computes the tracking errors, the parameter estimate and the external torque of an arm.
 
-    These are stages 4 and 5 of a control period, after the reference is known and before the
+    These are stages 4 and 5 of a control period, which follow the reference and precede the
     control law.
 
     Args:
-        k: Number of the tick, a period of the control loop.
+        k: Current tick.
         t_ns: Nominal time of the tick, ns since the start of the session.
-        s: State of the site (the process that runs the arm), with the reference; written.
+        s: State of the site, including the reference; updated in place.
         chain: Data of the joints, one row per joint. None for the planar two-link arm.
-        actors: Operators and environments, one row for each.
+        actors: Operators and environments, one row each.
         table: Numerical data of all operators and environments.
     """
     # 4 errors
@@ -576,17 +569,17 @@ def reference_stages(
 ) -> None:
     """Computes the reference, tracking errors and parameter estimate of a control period.
 
-    The reference is the position that the arm follows. It results from the newest states of the
-    other arms whose network delay has passed. Finally, the external torque of operators and
-    environments is computed.
+    The reference (the position to follow) is derived from the newest states of the peers whose
+    network delay has passed. The external torque of operators and environments is computed
+    last.
 
     Args:
-        k: Number of the tick, a period of the control loop.
+        k: Current tick.
         t_ns: Nominal time of the tick, ns since the start of the session.
-        site: State of the site (the process that runs the arm), shape (1,); written.
+        site: State of the site, shape (1,); updated in place.
         links: States of the links from the other sites, one row per link.
-        ramps: Planned changes of the weights with which the arm follows the other arms.
-        actors: Operators and environments, one row for each.
+        ramps: Planned changes of the dominance factors.
+        actors: Operators and environments, one row each.
         table: Numerical data of all operators and environments.
         chain: Data of the joints, one row per joint. None for the planar two-link arm.
     """
@@ -604,23 +597,20 @@ def sense_stages(
 ) -> None:
     """Computes the part of a tick that precedes the control law (stages 1 to 5).
 
-    A tick is one period of the control loop. A sample is the state that a peer, another arm's
-    process, sends in one of its ticks. The stages are:
-
     - 1 accept: store the samples that arrived, until their simulated delay has passed.
     - 2 release: take the newest sample of each peer whose delay has passed.
     - 3 reference: compute the position that the arm should follow.
     - 4 errors: compute the tracking errors.
     - 5 estimate: update the estimate of the arm's dynamic parameters.
 
-    Finally, the torque of operators and environments on the arm is computed.
+    Finally, the torque exerted on the arm by operators and environments is computed.
 
     Args:
-        k: Number of the tick (control period).
-        t_ns: Nominal time of the tick, ns since the epoch, the common start of the session.
+        k: Current tick.
+        t_ns: Nominal time of the tick, ns since the epoch (the common start of the session).
         count: Number of samples that arrived since the previous tick.
-        arrays: Arrays of the site (the process that runs the arm), see `SiteArrays`; written.
-        buffers: Contains the samples that arrived.
+        arrays: Arrays of the site, see `SiteArrays`; updated in place.
+        buffers: Buffers that contain the samples that arrived.
     """
     rate_hz = arrays.site[0].rate_hz
     # Samples wait in a ring buffer with one page per tick. The pages of the ticks that the site
@@ -649,15 +639,14 @@ def sense_stages(
 
 @leaf
 def emit_stage(s: SiteRow, record: Array) -> None:
-    """Writes the results of a control period into its record, which is logged (stage 7).
+    """Writes the results of a control period to its record, for the log (stage 7).
 
-    If a joint is faster than its limit, the run of this arm ends in the mode DIVERGED. Under
-    the rule `glide`, the arm comes to rest instead, see `session_life`.
+    If a joint exceeds its speed limit, the run of this arm ends in the mode DIVERGED. Under the
+    rule `glide`, the arm comes to rest instead; see `session_life`.
 
     Args:
-        s: State of the site (the process that runs the arm), with the torque of the motors;
-            written.
-        record: Receives the floating-point numbers of the record, the results of the tick.
+        s: State of the site, including the motor torque; updated in place.
+        record: Output array for the floating-point values of the record.
     """
     for i in range(s.joints):
         is_within_limit = abs(s.qd[i]) <= s.qd_limit[i]  # False for NaN
@@ -678,18 +667,17 @@ def act_stages(
 ) -> None:
     """Computes the part of a control period that follows the control law.
 
-    The torque is limited, the results are written for the log, and the arm moves to the next
-    period (stages 6 to 8). See `emit_stage` for a joint that is faster than its limit.
+    Limits the torque, writes the record and moves the arm to the next period (stages 6 to 8).
+    For joints that exceed their speed limit, see `emit_stage`.
 
     Args:
-        k: Number of the tick, a period of the control loop.
+        k: Current tick.
         t_ns: Nominal time of the tick, ns since the start of the session.
-        site: State of the site (the process that runs the arm), shape (1,), with the torque of
-            the law; written.
-        actors: Operators and environments, one row for each.
+        site: State of the site, shape (1,), including the torque of the law; updated in place.
+        actors: Operators and environments, one row each.
         table: Numerical data of all operators and environments.
         chain: Data of the joints, one row per joint. None for the planar two-link arm.
-        record: Receives the floating-point numbers of the record, the results of the tick.
+        record: Output array for the floating-point values of the record.
     """
     s: SiteRow = site[0]
     guard_torque(k, t_ns, s, chain)
@@ -721,14 +709,13 @@ def site_tick(
     sent: Array,
     record: Array,
 ) -> None:
-    """Computes one whole control period of an arm, with a control law that is built in.
+    """Computes one complete control period of an arm that uses a built-in control law.
 
-    The number of the period (tick) is k, and its nominal time t_ns is in ns since the start of
-    the session. Only the first `count` rows of `arrivals` are read; they are the messages that
-    arrived.
+    `k` is the tick, and `t_ns` its nominal time in ns since the start of the session. Only the
+    first `count` rows of `arrivals`, which hold the messages that arrived, are read.
 
-    All other arguments are the fields of `SiteArrays` and `TickBuffers`. They are passed one by
-    one, because passing the two tuples from Python takes a microsecond longer.
+    The remaining arguments are the fields of `SiteArrays` and `TickBuffers`. They are passed
+    individually because passing the two tuples from Python takes a microsecond longer.
     """
     arrays = SiteArrays(
         site=site,
@@ -759,15 +746,14 @@ def site_tick(
 
 @leaf
 def resume_stages(k: int, arrays: SiteArrays) -> None:
-    """Completes the state of an arm that was restored from a log, to continue the run.
+    """Completes the state of an arm restored from a log, to allow the run to continue.
 
-    Some values that the next control period needs are not in the log: the tracking errors, the
-    external torques, and the motion until that period. They are computed here from the restored
-    state. Control periods are called ticks.
+    Some values that the next tick needs are not in the log: the tracking errors, the external
+    torques, and the motion up to that tick. They are recomputed here from the restored state.
 
     Args:
-        k: The last tick that was recorded.
-        arrays: Arrays of the site, with the restored state; changed.
+        k: The last recorded tick.
+        arrays: Arrays of the site, with the restored state; updated in place.
     """
     s: SiteRow = arrays.site[0]
     t_ns = tick_ns(k, s.rate_hz)

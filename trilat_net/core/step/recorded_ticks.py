@@ -1,16 +1,15 @@
 """Verifies many recorded control periods of an arm in one compiled loop.
 
-A log has a record of each control period (tick), with its inputs, such as the received states
-of the other arms, and its results. The loop computes the ticks again from their inputs and
-compares the results. The loop gives the same results as repeated calls of `Site.step`, but
-faster.
+A log contains a record of each tick, with its inputs (such as the states received from other
+arms) and its results. The loop recomputes the ticks from their inputs and compares the results.
+It is equivalent to repeated calls of `Site.step`, but faster.
 
 Invariant:
-    - The loop calls the stages of the kernel, as `Site.step` does. It contains no equation.
-    - A row of the record counts as repeated only if every computed number has the same bits.
-    - The loop ends before the first tick that it cannot execute or does not repeat. The site
-      (the state of the arm and its controller) is then in the state before this tick, and
-      `Site.step` can execute it.
+    - The loop calls the stages of the kernel, as `Site.step` does. It contains no equations of
+      its own.
+    - A record counts as reproduced only if every computed value is bit-identical.
+    - The loop stops before the first tick that it cannot execute or does not reproduce. The
+      site is then in the state before that tick, and `Site.step` can execute it.
 """
 
 import zlib
@@ -80,24 +79,24 @@ def _update_checksum(crc: int, word: int) -> int:
 class RecordedRows(NamedTuple):
     """Results of consecutive control periods of an arm from a log, as arrays for compiled code.
 
-    K is the number of periods, P the number of other arms, m the number of coordinates that the
-    arms share, n the number of joints. A word is the bits of a floating-point number as an
-    integer.
+    There are K ticks, P peers, m coordinates shared between arms, and n joints. A word is a
+    64-bit integer with the same bits as a floating-point value.
 
     Attributes:
-        bits: Numbers of the record, see `Layout.columns`, shape (K, floats), as words.
-        used: Tick of the sample in use of each peer, shape (K, P).
+        bits: Values of the records as words, see `Layout.columns`, shape (K, floats).
+        used: Tick of the sample in use from each peer, shape (K, P).
         modes: Mode, shape (K,), see `Mode`.
         checksums: CRC-32 of the arrivals, shape (K,).
-        first_memory: Index of the first number of `memory` of each record, shape (K + 1,).
-        memory: Numbers of the field `mem` of all records.
-        memory_words: The same numbers as words.
+        first_memory: Index of the first entry in `memory` of each record, shape (K + 1,).
+        memory: Contents of the field `mem` of all records.
+        memory_words: The same contents as words.
         first_arrival: Index of the first arrival of each record, shape (K + 1,).
-        arrivals: Peer, tick, and row in the table of samples of all N arrivals, shape (N, 3).
+        arrivals: Peer, tick, and row in the table of samples for each of N arrivals, shape (N,
+            3).
         hands: Grip, target, and target one second later of a live hand, shape (K, 1 + 2 m).
             Shape (0, 0) if the site has no live hand.
-        plants: q, qd and the torque ON an external arm, shape (K, 3 n). Shape (0, 0) if the
-            arm is not external.
+        plants: q, qd and the torque ON an external arm, shape (K, 3 n). Shape (0, 0) if the arm
+            is not external.
     """
 
     bits: IntArray
@@ -397,13 +396,12 @@ _run_chain_ticks = leaf(_run_recorded_ticks)
 
 
 class TickRepeater:
-    """Computes recorded control periods of an arm again, many in one compiled call.
+    """Recomputes recorded control periods of an arm, many per compiled call.
 
-    Each result is compared with the log, to verify that the run can be reproduced. Control
-    periods are called ticks.
+    Each result is compared with the log, to verify that the run can be reproduced.
 
     Args:
-        site: State of the arm and its controller. The control law must be built in.
+        site: The site, which must use a built-in control law.
     """
 
     def __init__(self, site: Site) -> None:
@@ -433,16 +431,17 @@ class TickRepeater:
         self._saved = [np.empty_like(array) for array in self._list_arrays()]
 
     def repeat(self, first_tick: int, rows: RecordedRows, samples: IntArray) -> int:
-        """Computes recorded control periods (ticks) again, until a result differs from the log.
+        """Recomputes recorded ticks until a result differs from the log.
 
         Args:
-            first_tick: Number of the first tick. It must be the next tick of the site.
+            first_tick: First tick, which must be the next tick of the site.
             rows: Records of consecutive ticks.
-            samples: Table of the samples that arrived, shape (N, 3 m), as the bits of the
-                numbers: q, qd, tau_x.
+            samples: Table of the samples that arrived, shape (N, 3 m). The columns are q, qd
+                and tau_x, each as the bits of a floating-point value.
 
         Returns:
-            The number of ticks that were repeated exactly. The site is in the state after them.
+            The number of ticks that were reproduced exactly. The site is left in the state
+            after them.
         """
         # Save the state, because a tick that differs has changed it.
         arrays = self._list_arrays()
@@ -531,10 +530,10 @@ def _list_memory_sources(site: Site) -> IntArray:
     link_type = site.arrays.links.dtype
 
     def add(dtype: np.dtype[Any], field: str, row: int = 0) -> None:
-        """Adds the positions of the numbers of one field, counted in words of eight bytes.
+        """Adds the positions of all elements of one field, counted in 8-byte words.
 
         Args:
-            dtype: Type of the row, that of the site or that of a link.
+            dtype: Type of the row (of the site or of a link).
             field: Name of the field.
             row: Index of the row.
         """

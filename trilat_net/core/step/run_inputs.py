@@ -1,6 +1,6 @@
 """Stores the external inputs of a simulated run: arrivals, changes and operators' actions.
 
-A run that repeats a log receives the recorded inputs. A new run receives nothing except the
+A run that repeats a log is fed the recorded inputs. The only inputs of a new run are the
 actions of programs that move an arm.
 """
 
@@ -19,17 +19,15 @@ _TARGET_COLUMN = 3
 
 
 class RunInputs(NamedTuple):
-    """All external inputs of a recorded run, with which the run can be repeated.
+    """All external inputs of a recorded run, from which the run can be repeated.
 
     Attributes:
-        feed: Ticks (control periods) in which samples of other sites arrived, and actions of
-            live operators (persons or programs that move an arm during the run). A site is a
-            process that runs one arm, and a sample is a state that a site sends.
-        changes: Changes of links or sites during the run, in order of time. Each entry contains
-            the tick before which the site applies the change, the index of the site, and the
-            change.
-        late_ns: Largest time from the stamp of a sample to its arrival, in ns. The loop needs
-            it to decide how long samples are stored.
+        feed: Ticks in which samples of other sites arrived, and actions of live operators.
+        changes: Changes of links or sites during the run, in chronological order. Each entry
+            contains the tick before which the site applies the change, the index of the site,
+            and the change.
+        late_ns: Longest time from the time stamp of a sample to its arrival, in ns, which
+            determines how long samples must be stored.
     """
 
     feed: ReplayedInputs
@@ -41,8 +39,8 @@ class RunInputs(NamedTuple):
         """Returns the inputs of a run that receives nothing from outside.
 
         In such a run, every sample arrives promptly, in the first tick after it was sent. No
-        setting changes, and no live operator moves an arm. The delays that the setup states for
-        the links are still applied, by the receivers.
+        setting changes, and no live operator moves an arm. Link delays from the setup still
+        apply, because they are simulated by the receivers.
 
         Args:
             sites: Number of sites.
@@ -61,12 +59,12 @@ class RunInputs(NamedTuple):
     def with_hands(
         self, setups: Sequence[SiteSetup], sites: Collection[int], ticks: int
     ) -> "RunInputs":
-        """Returns these inputs with memory for the actions of live operators.
+        """Returns these inputs with memory allocated for the actions of live operators.
 
         Args:
             setups: Setups of all sites.
             sites: Indices of the sites with a live operator.
-            ticks: Number of ticks for which there is memory.
+            ticks: Number of ticks to allocate memory for.
         """
         if not sites:
             return self
@@ -80,10 +78,10 @@ class RunInputs(NamedTuple):
         return self._replace(feed=feed)
 
     def with_ticks(self, ticks: int) -> "RunInputs":
-        """Returns these inputs with memory for more actions of live operators.
+        """Returns these inputs with more memory for the actions of live operators.
 
         Args:
-            ticks: Number of ticks for which there is memory, not less than before.
+            ticks: Number of ticks to allocate memory for, not less than before.
         """
         sites, old_ticks, columns = self.feed.hands.shape
         actions = np.zeros((sites, ticks, columns))
@@ -91,17 +89,16 @@ class RunInputs(NamedTuple):
         return self._replace(feed=self.feed._replace(hands=actions))
 
     def write_actions(self, i: int, first_tick: int, actions: Array) -> None:
-        """Converts the actions of an operator to the form that the compiled loop reads.
+        """Stores the actions of an operator in the form that the compiled loop reads.
 
-        A live operator is a person or program that moves the arm of a site. It prescribes m
-        target coordinates. The two forms of an action have these columns:
+        A live operator prescribes m target coordinates. The columns of the two forms are:
 
-        - Action of the operator (`HandInForce`): firmness of the grip; number of the operator's
+        - Action of the operator (`HandInForce`): grip firmness; number of the operator's
           message; source of the message; target (m columns); velocity of the target (m
           columns).
-        - Action in the feed (`ReplayedInputs.hands`): firmness of the grip; target (M columns);
-          the position that the target would reach after one second, the sum of target and
-          velocity (M columns). M is the largest m of all sites. The columns beyond m stay zero.
+        - Action in the feed (`ReplayedInputs.hands`): grip firmness; target (M columns); target
+          one second later, i.e. the sum of target and velocity (M columns). M is the largest m
+          of all sites. Columns beyond m stay zero.
 
         Args:
             i: Index of the site.
