@@ -1,17 +1,17 @@
 """Runs the control loop of an arm, one period per call of `Site.step`.
 
-The caller provides the input of a period, for example the states (samples) that arrived from
-other arms, and gets the record with all results. `Site.step` writes the samples into arrays,
-calls the compiled function `kernel.site_tick`, and converts the results to a record. If the
-control law was written by a user, the law is called between the two halves of the period, which
-are compiled separately.
+The caller passes in the inputs of a period, such as the samples that arrived from other arms,
+and gets back a record with all results. `Site.step` writes the samples to arrays, calls the
+compiled function `kernel.site_tick`, and converts the results to a record. A control law
+written by a user is called between the two halves of the period, which are compiled separately.
 
 Invariant:
-    - Live sessions, simulations and the verification of logs use `Site.step`. Only the fast
-      simulation of all arms (`fused_run`) does not, and it calls the same compiled functions.
+    - Live sessions, simulations and the verification of logs use `Site.step`. The only
+      exception is the fast simulation of all arms (`fused_run`), which calls the same compiled
+      functions.
     - The result of `Site.step` depends only on the state of the site and on its argument. The
-      method reads no clock and no network connection, and draws no random number.
-    - Equal inputs give results that are equal to the last bit.
+      method reads no clock and no network connection, and draws no random numbers.
+    - The same inputs always produce bit-identical results.
 """
 
 import math
@@ -90,9 +90,9 @@ class _TickParts(NamedTuple):
 
 
 class Site:
-    """One arm with its controller, and the network links over which it receives samples.
+    """An arm with its controller, and the network links over which it receives samples.
 
-    The process of an arm (site) creates this object and calls `step` once per control period. A
+    Each site process creates one such object and calls `step` once per control period. A
     simulation in virtual time does the same for each arm.
 
     Args:
@@ -103,8 +103,8 @@ class Site:
         rate_hz: Tick rate, Hz.
         peers: Names of the peers, in scenario order.
         layout: Lengths of the site's vectors.
-        law_failure: Last failure of a user's law under the rule `glide`. None if the law has
-            never failed.
+        law_failure: Most recent failure of a user's law under the rule `glide`. None if the law
+            has never failed.
     """
 
     def __init__(self, setup: SiteSetup) -> None:
@@ -227,14 +227,14 @@ class Site:
         )
 
     def apply_change(self, command: CoreChange, t_ns: int) -> None:
-        """Applies a change to an arm's process while it runs, for example a new network delay.
+        """Applies a change to a running site, for example a new network delay.
 
-        A change that starts later is stored until its time.
+        A change that takes effect later is stored until then.
 
         Args:
             command: The change.
-            t_ns: Present time in ns since the start of the session. The site computes no more
-                control periods before this time.
+            t_ns: Current time in ns since the start of the session. The site will not compute
+                control periods before this time any more.
 
         Raises:
             ValueError: There are too many planned changes.
@@ -244,14 +244,14 @@ class Site:
             self._sizer.add_model(command.peer, command.model)
 
     def start_at(self, k: int) -> None:
-        """Makes `k` the first tick (control period) of an arm that joins a running session.
+        """Makes `k` the first tick of an arm that joins a running session.
 
-        No tick must have been computed before. The arm is at rest in its start pose, and no
-        sample (state) of another arm is in use or waits. The models of delay and loss of the
-        links process all samples that the other arms have sent until tick k - 1.
+        Must be called before any tick is computed. The arm is at rest in its start pose, and no
+        sample from another arm is in use or waiting. The delay and loss models of the links are
+        advanced past all samples that the other arms have sent up to tick k - 1.
 
         Args:
-            k: Number of the first tick.
+            k: First tick.
         """
         links_may_be_ahead = k <= self._site["first"]
         if links_may_be_ahead:
@@ -271,12 +271,12 @@ class Site:
     def step(self, tick: TickInput) -> TickRecord:
         """Computes one period of the control loop: from messages to torque and motion.
 
-        This is the only way in which time advances, in live runs, simulations and replays
-        alike. Therefore the same input always gives the same results.
+        Time only advances through this method, whether in live runs, simulations or replays.
+        The same input therefore always produces the same results.
 
         Args:
-            tick: Number of the period and its inputs. The number must follow that of the
-                previous call.
+            tick: Number of the period, which must follow that of the previous call, and its
+                inputs.
 
         Returns:
             The record of the period: its inputs and results.
@@ -423,13 +423,13 @@ class Site:
 
     @property
     def speed_limits(self) -> list[float]:
-        """Largest permitted speed of each joint, rad/s or m/s: the key `qd_limit_rad_s`."""
+        """Largest permitted speed of each joint, rad/s or m/s, from the key `qd_limit_rad_s`."""
         limits: list[float] = self._site[0]["qd_limit"].tolist()
         return limits
 
     @property
     def mode(self) -> Mode:
-        """Mode of the arm in the last control period, for example RUN if it followed others."""
+        """Mode of the arm in the last control period, for example RUN if it follows others."""
         return _MODES[self._mode.item()]
 
     @property
@@ -442,12 +442,12 @@ class Site:
 
     @property
     def arrays(self) -> SiteArrays:
-        """Arrays with the present state of the arm's process. Callers must not change them."""
+        """Arrays with the current state of the site, which callers must not modify."""
         return self._arrays
 
     @property
     def parts(self) -> "_TickParts":
-        """Internal parts with which `recorded_ticks` computes many control periods at once."""
+        """Internals that `recorded_ticks` uses to compute many control periods at once."""
         return _TickParts(
             buffers=self._buffers,
             calendar_sizer=self._sizer,
@@ -463,7 +463,8 @@ class Site:
     def q(self) -> list[float]:
         """Joint angles at the start of the next control period, one per joint, rad.
 
-        The last record contains the joint angles at the start of its own period.
+        This differs from the last record, which contains the joint angles at the start of its
+        own period.
         """
         joints = self.layout.joints
         angles: list[float] = self._site[0]["q"][:joints].tolist()
@@ -554,9 +555,9 @@ class Site:
         return memory
 
     def counts(self) -> tuple[LinkCounts, ...]:
-        """Returns how many messages arrived, came late or were lost, for each network link.
+        """Returns how many messages arrived, were late or were lost, for each network link.
 
-        The links are in the order of the scenario. `LinkCounts` explains the counts.
+        The links are in scenario order. See `LinkCounts` for the individual counts.
         """
         counts = []
         for link in self._links:
@@ -565,25 +566,21 @@ class Site:
         return tuple(counts)
 
     def release_tick(self, peer: int, tick: int) -> int | None:
-        """Finds the control period of this arm in which another arm's message is first used.
-
-        Control periods are called ticks. A message (sample) is the state that the other arm
-        (peer) sends once per period of its own loop.
+        """Finds the control period of this arm in which a peer's sample is first used.
 
         Args:
             peer: Index of the peer.
-            tick: Number of the period in which the peer sent the sample.
+            tick: Tick in which the peer sent the sample.
 
         Returns:
-            The number of this site's period if the sample arrives in time. None if the link
-            loses the sample, or if the sample is so old that its delivery time is no longer
-            stored.
+            The tick of this site if the sample arrives in time. None if the link drops the
+            sample, or if the sample is so old that its delivery time is no longer stored.
         """
         release = int(find_release(peer, tick, self._arrays))
         return None if release == LOST else release
 
     def is_measured(self, peer: int) -> bool:
-        """Returns True if a link has only the delay of the real network, not a simulated one.
+        """Returns True if the only delay of a link is that of the real network.
 
         Args:
             peer: Index of the sender at the other end of the link.
@@ -593,32 +590,32 @@ class Site:
         return bool(model["kind"] == DelayKind.MEASURED)
 
     def peer_rate_hz(self, peer: int) -> int:
-        """Returns the rate of another arm's control loop, Hz, which may differ from this arm's.
+        """Returns the rate of a peer's control loop, Hz, which may differ from this arm's.
 
         Args:
-            peer: Index of the other arm (peer), in scenario order.
+            peer: Index of the peer, in scenario order.
         """
         return int(self._links[peer]["rate_hz"])
 
     def restore_state(self, before: TickRecord, last: TickRecord) -> None:
         """Restores the state of the arm and its control law from the records of a run.
 
-        After a further call of `restore_links`, `step` continues the run.
+        After a subsequent call of `restore_links`, `step` continues the run.
 
-        The field `mem` of a record contains the numbers of the site and its law that no other
-        field contains. For m coordinates that the sites share, these are
+        The field `mem` of a record contains the state variables of the site and its law that no
+        other field contains. For m coordinates shared between sites, these are
 
-        - the reference that is held (m numbers) and the time from which it is held, ns,
-        - under the rule `glide`, by which an arm comes to rest while a peer (another arm) is
-          silent, the further numbers that `_restore_life` reads,
-        - the numbers that the user's law remembers, if there is one.
+        - the held reference (m values) and the time since when it is held, ns,
+        - under the rule `glide` (where an arm comes to rest while a peer is silent), the
+          additional values read by `_restore_life`,
+        - the memory of the user's law, if there is one.
 
-        `mem` is empty if there are no such numbers.
+        `mem` is empty if there is nothing to store.
 
         Args:
             before: Record of the control period before `last`. If `last` is the first record,
-                any record can be given.
-            last: Last record of the part that is not computed again.
+                any record can be passed.
+            last: Last record of the part that is not recomputed.
         """
         s: Row = self._site[0]
         shared = self.layout.shared
@@ -697,19 +694,17 @@ class Site:
     ) -> None:
         """Restores the state of the network links, to continue a recorded run at tick k.
 
-        A site is a process that runs one arm, its peers are the other sites, and a tick is one
-        period of the control loop. A peer sends a sample, its state, in each tick. The state of
-        random models of delay and loss is not recorded. It is computed again from the start of
-        the run, which gives the same numbers.
+        The state of random delay and loss models is not recorded. It is recomputed from the
+        start of the run, which yields the same random numbers.
 
         Args:
-            k: The next tick.
-            in_use: For each peer the newest sample that has been used. None if there was no
-                sample.
+            k: Next tick.
+            in_use: For each peer, the newest sample that has been used, or None if there was
+                none.
             waiting: Samples that have arrived, but whose simulated delay has not passed.
 
         Raises:
-            ValueError: More than MAX_ARRIVALS samples wait.
+            ValueError: More than MAX_ARRIVALS samples are waiting.
         """
         self._arrays.calendars["tick"] = -1
         self._sizer.clear()
