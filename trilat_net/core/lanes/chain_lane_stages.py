@@ -1,14 +1,14 @@
-"""Computes one control period of an arm of n joints, for several simulations at once.
+"""Computes one control period of an arm with n joints, for several simulations at once.
 
-`lane_stages` does the same for planar arms. The recursions from joint to joint are computed for
-eight runs at a time, with `lane_vectors`. All other stages are loops over the runs, each of
+`lane_stages` does the same for planar arms. Recursions from joint to joint are computed for
+eight runs at a time, using `lane_vectors`. All other stages are loops over the runs, each of
 which has its own lane (position in the vector registers).
 
 Invariant:
-    - No equation is repeated here. The functions and the order of the stages are those of
+    - No equation is repeated here. The functions, and the order of the stages, are those of
       `kernel`.
-    - The frames of the joints of all lanes are up to date wherever a function of one lane needs
-      them. Therefore `place_joints` does nothing in one lane.
+    - The joint frames of all lanes are up to date whenever a single-lane function needs them.
+      `place_joints` therefore does nothing in a single lane.
 """
 
 from collections.abc import Callable
@@ -166,37 +166,37 @@ def advance_chain_site(
 ) -> None:
     """Computes one control period of an arm for several simulations that run side by side.
 
-    The arm is a chain of joints, see `advance_site`. All arrays have a place (lane) for each
-    simulation. No two arrays overlap in memory.
+    The arm is a chain of joints. See `advance_site` for the planar arm. All arrays have one
+    entry (lane) per simulation, and no two arrays may overlap in memory.
 
     Args:
-        k: The tick.
+        k: Current tick.
         t_ns: Nominal time of the tick, ns since the epoch.
         lanes: Number of lanes to compute, at most `LANES`.
         settled_rad: Position error below which an arm counts as settled, rad.
         i: Index of the site.
         block_row: Row of the tick in `used`.
-        pages: Number of latest states of each site in `states`, a power of two.
+        pages: Number of latest states stored per site in `states`, a power of two.
         bucket: Row of the tick in `peaks`.
         record_row: Row of the tick in `record`.
         site: Row of the site.
         links: Rows of its links.
         actors: Rows of its operators and environments.
-        environments: Rows of the environments alone.
-        ramps: Row with the changes of its dominance factors.
-        record: Rows with the floats of its latest records; one is written.
+        environments: Rows of its environments only.
+        ramps: Row of planned changes of its dominance factors.
+        record: Rows of its latest records; one is written.
         peaks: Peaks of the site, one row per bucket, see `update_peaks`.
         sums: Sums of the site.
         progress: Progress of the site.
         law: Row with the gains and memory of the site's compiled law.
-        received: Rows with the values that the peers' laws sent.
-        sent: Row with the values that the law sends.
+        received: Rows with the values sent by the peers' laws.
+        sent: Row with the values sent by this law.
         code: Selects the code of the law, see `LawCode`.
         chain: Rows of the joints.
         states: The latest states of all sites, see `advance_site`.
         used: Sample in use by peer, lane and tick of a block; -1 before the first.
         columns: Indices of the received values, see `LaneLaw`, shape (P, C).
-        table: Tables of the operators and environments of all sites, equal in all runs.
+        table: Tables of the operators and environments of all sites, the same in all runs.
     """
     groups = (lanes + GROUP - 1) // GROUP
 

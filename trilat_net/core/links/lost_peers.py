@@ -1,20 +1,19 @@
 """Lets an arm continue when another arm that it follows is lost.
 
-An arm follows several other arms, its peers, each with a certain weight (dominance factor). A
-peer is lost if no sample (received state) of it could be used for some time. The remaining
-peers then get its weight: a slave that followed two users with 0.7 and 0.3 follows the second
-user alone if the first user is lost.
+A peer is lost if no sample from it could be used for some time. Its weight (dominance factor)
+is then given to the remaining peers. For example, a slave that followed two users with 0.7 and
+0.3 follows the second user alone if the first one is lost.
 
 Invariant:
-    - All decisions follow from the samples in use and from the stored state of the site, the
-      process that controls the arm. Decisions are taken in each period of the control loop.
-    - A site only continues without a peer if the remaining sites all reach each other without
-      it, and if the site still follows another peer. Otherwise the arm stops.
-    - The reference, the position that the arm follows, never jumps. It moves smoothly to the
-      position of the remaining peers, and later back if the lost peer returns.
+    - All decisions depend only on the samples in use and the stored state of the site. They are
+      made anew in each control period.
+    - A site continues without a peer only if the remaining sites can all reach each other
+      without it, and if the site still follows another peer. Otherwise, the arm stops.
+    - The reference never jumps. It moves smoothly to the position of the remaining peers, and
+      back again if the lost peer returns.
 
 The field `gone` of a link stores the state of the peer. It is 0 while the peer is present, and
--1 while the peer is lost. After the return of the peer, it is the time of the return, in ns
+-1 while the peer is lost. After the peer has returned, it is the time of its return, in ns
 since the start of the session.
 """
 
@@ -205,27 +204,27 @@ def _redistribute_shares(links: RowArray) -> bool:
 
 @leaf
 def regroup(t_ns: int, site: SiteRow, links: RowArray) -> None:
-    """Gives the weight of lost peers to the other peers, and returns it when they come back.
+    """Gives the weight of lost peers to the other peers, and restores it when they return.
 
-    A site is the process that runs one arm, and its peers are the other sites. A dominance
-    factor is the weight with which the site follows a peer. The factors of lost peers are
-    redistributed to the others. Before the call `alpha` of a link is the planned factor,
-    afterwards the factor in force.
+    Before the call, `alpha` of each link is its planned dominance factor; afterwards, it is the
+    factor in force.
 
     The field `gone` of a link is the state of its peer:
 
-    - 0: present. If the peer falls silent and can be spared, it becomes lost.
-    - -1: lost. When samples of the peer arrive again, the field becomes the time of its return.
+    - 0: present. If the peer falls silent and is dispensable, it becomes lost.
+    - -1: lost. When samples from the peer arrive again, the field becomes the time of its
+      return.
     - Above 0: time of the return, ns. If the peer falls silent again, it is lost again. After
-      BACK_NS it becomes present, if it is near enough for the reference not to move far.
+      BACK_NS it becomes present, provided that it is near enough for the reference not to move
+      far.
 
     Args:
-        t_ns: Time, ns since the epoch, the common start of the session.
-        site: State of the site; changed. `regrouped` becomes the reason if a peer was dropped
-            or restored in this tick, otherwise 0.
-        links: State of each link, one row per peer; changed. A peer is silent if its last
-            sample came into use more than `site.stale_ns` ago. `dispensable` is 1 if the site
-            may drop the peer.
+        t_ns: Time, ns since the epoch (the common start of the session).
+        site: State of the site; updated in place. `regrouped` is set to the reason if a peer
+            was dropped or restored in this tick, otherwise to 0.
+        links: State of each link, one row per peer; updated in place. A peer is silent if its
+            last sample came into use more than `site.stale_ns` ago. `dispensable` is 1 if the
+            site may drop the peer.
     """
     site.regrouped = 0
     for j in range(links.shape[0]):

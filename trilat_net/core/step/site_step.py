@@ -423,7 +423,7 @@ class Site:
 
     @property
     def speed_limits(self) -> list[float]:
-        """Largest permitted speed of each joint, rad/s or m/s, from the key `qd_limit_rad_s`."""
+        """Largest permitted joint speeds, rad/s or m/s, from the key `qd_limit_rad_s`."""
         limits: list[float] = self._site[0]["qd_limit"].tolist()
         return limits
 
