@@ -1,15 +1,14 @@
-"""Computes in advance which received states each arm uses, for a block of control periods.
+"""Computes in advance which received samples each arm uses, for a block of control periods.
 
-In each control period (tick), every arm sends its state, a sample, to the other arms over a
-simulated network. The delay and the loss of a sample depend on the link and on the number of
-the sample, but not on its content. Therefore the deliveries of many ticks can be computed
-before the arms move. Random numbers are then drawn for many samples in one call.
+The delay and loss of a sample depend on the link and on the number of the sample, but not on
+its content. The deliveries of many ticks can therefore be computed before the arms move, and
+random numbers can be drawn for many samples in one call.
 
 Example: with a delay of 3 ticks, tick 10 uses sample 7, whatever the arms do.
 
 Invariant:
-    - The samples in use are those of `accept_sample` and `release_sample`, if each sample
-      arrives at the first tick of the receiver after it was sent.
+    - The samples in use are the same as with `accept_sample` and `release_sample`, provided
+      that each sample arrives at the receiver's first tick after it was sent.
 """
 
 from collections.abc import Sequence
@@ -72,20 +71,19 @@ class _DelayNumbers(NamedTuple):
 class LinkStates(NamedTuple):
     """State of the simulated networks of L runs, each with N sites that have P peers.
 
-    A site (arm controller) receives samples (states) from its peers, the other sites, over one
-    link per peer. The times of samples are computed for a block of ticks (control periods) at a
-    time.
+    Each site receives samples from each peer over its own link. Sample times are computed for
+    one block of ticks at a time.
 
     Attributes:
         links: States of the links, shape (L, N, P), see `LinkRow`.
-        models: Models of delay and loss, shape (L, N, P, M).
+        models: Delay and loss models, shape (L, N, P, M).
         points: Traces and outages of each run, shape (L, n, 2).
-        releases: For each tick the newest sample that is released then, or -1, shape (L, N, P,
-            R), a ring buffer. R is a power of two.
+        releases: For each tick, the newest sample that is released then, or -1. A ring buffer
+            of shape (L, N, P, R), where R is a power of two.
         newest: Sample in use at the last tick, or -1, shape (L, N, P).
-        uniforms: Buffer for two random numbers of each sample of a block.
+        uniforms: Buffer for two random numbers per sample of a block.
         delays_us: Buffer for the delay of each sample of a block, us.
-        stamps_ns: Buffer for the stamp of each sample of a block, ns.
+        stamps_ns: Buffer for the sending time of each sample of a block, ns.
         times_ns: Buffer for the nominal time of each tick of a block, ns.
         sample_counts: Buffer for the number of samples that a peer has sent before the end of
             each tick of a block.
@@ -104,13 +102,13 @@ class LinkStates(NamedTuple):
 
     @classmethod
     def copy_from(cls, tables: Sequence[SiteArrays]) -> "LinkStates":
-        """Copies the states of the network links of several runs to common arrays.
+        """Copies the network link states of several runs into shared arrays.
 
-        The runs are simulated together, each in one lane. This method is called before their
-        first tick (control period).
+        The runs are simulated together, with one run per lane. This must happen before their
+        first tick.
 
         Args:
-            tables: Arrays of all sites (arm controllers) of each run. They are not changed.
+            tables: Arrays of all sites for each run. They are not changed.
         """
         sites, peers, _ = tables[0].calendars.shape
         pages = max(arrays.calendars.shape[2] for arrays in tables)
@@ -137,13 +135,12 @@ class LinkStates(NamedTuple):
         )
 
     def keep(self, lanes: Sequence[int]) -> "LinkStates":
-        """Returns the states of the simulated network links of those runs that continue.
+        """Returns the link states of only those runs that continue.
 
-        Several runs are simulated side by side, each at one index (lane). A search drops runs
-        that it no longer needs, so that no time is spent on these runs.
+        A search drops runs that it no longer needs, to spend no more time on them.
 
         Args:
-            lanes: Indices (lanes) of the runs that continue.
+            lanes: Lane indices of the runs that continue.
         """
         chosen = list(lanes)
         return self._replace(
@@ -242,9 +239,9 @@ def _draw_losses(first: int, count: int, key: DrawKey, uniform_numbers: Array) -
 class DrawAddresses(NamedTuple):
     """Addresses of compiled functions that draw the random numbers of many messages at once.
 
-    The numbers are delays and losses in a simulated network. The loops of these functions use
-    vector instructions, which is possible because the compiler inlines every function that they
-    call.
+    The random numbers determine delays and losses in a simulated network. The loops of these
+    functions use vector instructions, which is possible because the compiler inlines every
+    function that they call.
     """
 
     delays: int
@@ -254,8 +251,8 @@ class DrawAddresses(NamedTuple):
     def find(cls) -> "DrawAddresses":
         """Returns the addresses of compiled functions that draw network delays and losses.
 
-        Each call draws the numbers of many messages, which is faster than one call per message.
-        The functions are compiled if their machine code is not stored on disk.
+        Drawing for many messages per call is faster than one call per message. The functions
+        are compiled if their machine code is not stored on disk.
         """
         integer = types.int64
         number = types.float64
@@ -506,24 +503,23 @@ def use_samples(
     draws: DrawAddresses,
     used: IntArray,
 ) -> int:
-    """Finds the received state that each arm uses in each tick of a block of control periods.
+    """Finds which received sample each arm uses in each tick of a block of control periods.
 
-    This is done for several simulations at once. A received state (sample) comes from a peer,
-    another arm, and is delayed by the simulated network.
+    This is done for several simulations at once. Samples are delayed by the simulated network.
 
     Args:
         first: First tick of the block.
         count: Number of ticks.
         rate_hz: Tick rate of all sites, Hz.
-        ended: For each lane the number of ticks of a run that has ended, else -1.
-        states: State of the links of the runs; changed.
+        ended: For each lane, the number of ticks of a run that has ended, or -1 if it has not.
+        states: State of the links of the runs; updated in place.
         draws: Functions that draw random numbers.
-        used: Receives the index of the sample in use, or -1 before the first sample, shape (N,
-            P, LANES, ticks).
+        used: Output array for the index of the sample in use, or -1 before the first sample,
+            shape (N, P, LANES, ticks).
 
     Returns:
-        The largest age of a sample in use, ticks. Before the first sample, it is the age that
-        the first sample would have.
+        The largest age of a sample in use, in ticks. Before the first sample, this is the age
+        that the first sample would have.
     """
     largest_age = 0
     has_whole_period = 1_000_000_000 % rate_hz == 0
@@ -602,20 +598,21 @@ def use_samples_of_rates(
     draws: DrawAddresses,
     used: IntArray,
 ) -> int:
-    """Does the work of `use_samples` for arms whose control loops have different rates.
+    """Variant of `use_samples` for arms whose control loops have different rates.
 
-    The block contains the control periods (ticks) of all arms in an interval of time. An arm
-    executes its tick before a later tick of another arm.
+    The block contains the ticks of all arms in an interval of time. Ticks of different arms are
+    executed in chronological order.
 
     Args:
         first: First tick of each site in the block, shape (N,).
         end: Tick of each site after the block, shape (N,).
         rates_hz: Tick rates, Hz, shape (N,).
-        next_samples: Next sample that each site accepts from each peer, shape (N, P); changed.
+        next_samples: Next sample that each site accepts from each peer, shape (N, P); updated
+            in place.
         ended: See `use_samples`.
-        states: State of the links of the runs; changed.
+        states: State of the links of the runs; updated in place.
         draws: Functions that draw random numbers.
-        used: Written, see `use_samples`. The ticks are counted from `first`.
+        used: Output array, see `use_samples`, with ticks counted from `first`.
 
     Returns:
         The largest age of a sample in use, see `use_samples`, in ticks of its sender.
@@ -741,25 +738,25 @@ def use_recorded_samples(
     state: Array,
     used: IntArray,
 ) -> int:
-    """Finds the received state that each arm uses when a run from a log is repeated.
+    """Finds which received sample each arm uses when a run from a log is repeated.
 
-    All arrivals are known from the log. The results have the form of `use_samples`.
+    All arrivals are known from the log. The results have the same form as in `use_samples`.
 
     Args:
         first: First tick of each site in the block, shape (N,).
         end: Tick of each site after the block, shape (N,).
         rates_hz: Tick rates, Hz, shape (N,).
         feed: Inputs of the recorded run.
-        links: Rows of the links, shape (N, P); changed.
+        links: Rows of the links, shape (N, P); updated in place.
         models: Models of the links, shape (N, P, M).
-        dues: Due times, shape (N, P, D); changed.
-        calendars: Calendars of the links, shape (N, P, pages); changed. Their samples have the
-            right index, but no content.
+        dues: Due times, shape (N, P, D); updated in place.
+        calendars: Calendars of the links, shape (N, P, pages); updated in place. Their samples
+            have the right index, but no content.
         points: Traces and outages.
-        channel: Values that laws receive, or None; changed.
-        state: Any numbers, at least as many as a site sends.
-        used: Receives the samples in use in lane 0, shape (N, P, LANES, ticks). The ticks are
-            counted from `first`.
+        channel: Values that laws receive, or None; updated in place.
+        state: An array of arbitrary content, at least as long as the state that a site sends.
+        used: Output array for the samples in use in lane 0, shape (N, P, LANES, ticks), with
+            ticks counted from `first`.
 
     Returns:
         The largest age of a sample in use, in ticks of its sender, see `use_samples_of_rates`.
@@ -808,27 +805,28 @@ def repeat_deliveries(
     joints: int,
     states: Array,
 ) -> None:
-    """Updates the simulated network links of one run, so that the run can continue alone.
+    """Brings the simulated network links of one run up to date, so that it can continue alone.
 
-    Runs that are simulated side by side (in lanes) compute the deliveries without the state of
-    the links (`use_samples`). The links are therefore executed again for the past ticks
-    (control periods), without the arms. Samples that were overwritten long ago have the wrong
-    content, but the right index.
+    Runs that are simulated side by side compute their deliveries without the link state
+    (`use_samples`). The links are therefore executed again for the past ticks, without the
+    arms. Samples that were overwritten long ago have the right index but the wrong content.
 
     Args:
         first: First tick of each site, shape (N,).
         end: Tick of each site before which its links stop, shape (N,).
         rates_hz: Tick rates, Hz, shape (N,).
-        next_samples: Next sample that each site accepts from each peer, shape (N, P); changed.
-        links: Rows of the links before the first tick, shape (N, P); changed.
+        next_samples: Next sample that each site accepts from each peer, shape (N, P); updated
+            in place.
+        links: Rows of the links before the first tick, shape (N, P); updated in place.
         models: Models of the links, shape (N, P, M).
-        dues: Due times, shape (N, P, D); changed.
-        calendars: Calendars of the links, shape (N, P, pages); changed.
+        dues: Due times, shape (N, P, D); updated in place.
+        calendars: Calendars of the links, shape (N, P, pages); updated in place.
         points: Traces and outages.
         channel: Values that laws receive, or None.
         joints: Number of joints.
-        states: The latest states of the sites (q, qd, tau_x and the values that the law sent),
-            shape (N, R + 1, width). The state of tick k is at k modulo R. R is a power of two.
+        states: The latest states of the sites (q, qd, tau_x and the values sent by the law),
+            shape (N, R + 1, width). The state of tick k is at index k modulo R, where R is a
+            power of two.
     """
     mask = states.shape[1] - 2
     for i in range(links.shape[0]):

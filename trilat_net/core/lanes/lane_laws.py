@@ -2,15 +2,15 @@
 # mypy: disable-error-code="no-any-return"
 """Compiles control laws into the simulation of several runs at once.
 
-Laws such as `tdpa`, and those that users write, are classes with a method `torque`. In a single
-run, the simulation calls the compiled method by its address. For several runs, each in one lane
-of the vector registers, the method is compiled as a part of the control period instead. This
-saves the call and the checks of the vector lengths, which are constants in this case.
+Laws such as `tdpa`, and those that users write, are classes with a method `torque`. A single
+run calls the compiled method by its address. For several runs, with one run per lane of the
+vector registers, the method is compiled into the control period instead. This saves the call,
+and also the checks of the vector lengths, which are constants in this case.
 
 Invariant:
     - The method is not changed. It raises the same errors, and reads and writes the same
-      numbers, as in a run that is computed alone.
-    - A user's law is compiled in each process, because the other files that it uses are
+      values, as in a run that is computed alone.
+    - A user's law is compiled in every process, because the other files that it uses are
       unknown. The code of a built-in law is stored under a hash of its sources.
 """
 
@@ -42,16 +42,16 @@ NO_LAW = "none"
 class LaneLaw(NamedTuple):
     """Properties of a control law on which the compiled code of a simulation depends.
 
-    Runs for which these properties are equal share the code.
+    Runs share the code if these properties are equal.
 
     Attributes:
-        name: Name that identifies the code of the law. `NO_LAW` for laws of the kernel.
+        name: Identifies the code of the law. `NO_LAW` for laws of the kernel.
         is_stored: True if the compiled code may be stored on disk.
         size: Number of gains and memory values of the law.
-        constants: Names and values of flags among these numbers: integers that are 0 or 1 and
-            do not change. They are equal in all runs.
-        columns: For each other site (peer), the indices of the values that the law receives
-            among the values that the peer sends. -1 for a value that the peer does not send.
+        constants: Names and values of the flags among these values, which are integers equal to
+            0 or 1 that never change. They are equal in all runs.
+        columns: For each peer, the indices of the values that the law receives among the values
+            that the peer sends, or -1 for a value that the peer does not send.
     """
 
     name: str
@@ -64,13 +64,12 @@ class LaneLaw(NamedTuple):
     def describe(cls, law: CompiledLaw | None, columns: Any) -> "LaneLaw":
         """Returns the properties of a control law on which the code of a simulation depends.
 
-        Several runs can be simulated side by side by the same code only if these properties are
-        equal.
+        The same code can simulate several runs side by side only if these properties are equal.
 
         Args:
-            law: The law. None if the law of the site (arm controller) is a part of the kernel.
-            columns: Indices of the C values that the law receives from each of P peers (other
-                sites), shape (P, C).
+            law: The law, or None if the site's law is part of the kernel.
+            columns: Indices of the C values that the law receives from each of P peers, shape
+                (P, C).
         """
         if law is None:
             return cls(NO_LAW, is_stored=True, size=0, constants=(), columns=())
@@ -122,9 +121,9 @@ def _name_law(torque: Callable[..., Any], form: LawForm) -> tuple[str, bool]:
 
 
 class LawCode(types.Type):
-    """Numba's type of an argument that tells the compiler which control law to call.
+    """Numba type of an argument that tells the compiler which control law to call.
 
-    The argument has no value at run time: its type alone selects the code.
+    The argument has no value at run time. The code is selected by its type alone.
 
     Args:
         law: The law.
@@ -140,7 +139,7 @@ class LawCode(types.Type):
 
     @property
     def mangling_args(self) -> tuple[str, tuple[str]]:
-        """Name of this type in the names of compiled functions, which Numba needs."""
+        """Form of this type that Numba uses in the names of compiled functions."""
         digest = hashlib.sha256(self.name.encode()).hexdigest()
         return "LawCode", (f"c{digest[:16]}",)
 
@@ -219,21 +218,21 @@ def compute_law(
 ) -> None:
     """Computes the torque of a compiled control law in one tick, for one of several runs.
 
-    Nothing happens if the law of the site is a part of the kernel, which computes such laws
-    itself. The function body is only a placeholder: the compiler replaces it by the version of
-    the law that the type of `code` selects (`_choose_law`).
+    Does nothing if the site's law is part of the kernel, which computes such laws itself. The
+    function body is only a placeholder: the compiler replaces it with the version of the law
+    selected by the type of `code` (`_choose_law`).
 
     Args:
         code: Tells the compiler which law to call.
-        k: Number of the tick (period of the control loop).
+        k: Current tick.
         t_ns: Nominal time of the tick, ns since the epoch.
-        site: Row of the site, in which the torque is written.
+        site: Row of the site, to which the torque is written.
         links: Rows of the site's links.
-        chain: Rows of the chain of joints, or None for the planar arm. Its model is
-            in the row of the site already.
-        law: Row with the gains and memory of the law; changed.
-        received: Rows with the values that the peers' laws sent.
-        sent: Row with the values that this law sends; written.
+        chain: Rows of the chain of joints, or None for the planar arm. The row of the site
+            already contains the chain's model.
+        law: Row with the gains and memory of the law; updated in place.
+        received: Rows with the values sent by the peers' laws.
+        sent: Row with the values sent by this law; updated in place.
 
     Raises:
         FloatingPointError: A result is not finite.
@@ -287,8 +286,8 @@ def _choose_law(argument_types: tuple[Any, ...]) -> Callable[..., None]:
     ) -> None:
         """Calls the control law of this site, with the arguments of `compute_law`.
 
-        The type of the first argument selects the law when the code is compiled. The argument
-        itself has no value.
+        The law is selected at compile time by the type of the first argument, which has no
+        value of its own.
         """
         s = site[0]
         if s.mode == _DIVERGED:

@@ -1,21 +1,21 @@
 # mypy: disallow-untyped-calls=False, disallow-untyped-decorators=False
 # mypy: disable-error-code="no-any-return, override"
-"""Stores the states of several runs side by side, so that loops use vector instructions.
+"""Stores the states of several runs side by side, for loops with vector instructions.
 
-The state of an arm in one run is a row of numbers (`row_fields`). In lanes, each number becomes
-`LANES` numbers that are adjacent in memory, one for each run. For example, the first joint
-angles of all runs follow each other, so one instruction loads several of them. The position of
-a run among the others is called its lane.
+The state of an arm in one run is a row of values (`row_fields`). In lanes, each of them becomes
+`LANES` values that are adjacent in memory, one per run. The first joint angles of all runs, for
+example, are stored next to each other, so one instruction loads several of them. The position
+of a run among the others is called its lane.
 
-The functions of a control period get an object that represents the row of one lane and has the
-same fields as the row of a single run. Therefore no function needs a second version.
+The functions of a control period receive an object that represents the row of one lane, and has
+the same fields as the row of a single run. No function therefore needs a second version.
 
-Fields that are equal in all lanes, such as the kind of control law, can be constants. The
+Fields that are equal in all lanes, such as the type of control law, can be constants. The
 compiler then removes the branches for other values.
 
 Invariant:
-    - A row in a lane has the fields, shapes and types of a row of one run.
-    - All properties on which compiled code depends are in the name of a type, which is a part
+    - A row in a lane has the same fields, shapes and types as a row of a single run.
+    - Every property on which compiled code depends is part of a type name. These names are part
       of the key under which the code is stored.
 """
 
@@ -57,15 +57,15 @@ Constants = tuple[tuple[str, int], ...]
 
 
 class LaneField(NamedTuple):
-    """One field of a row, the state of one arm in one run, with its position in the row.
+    """One field of a row (the state of one arm in one run), with its position in the row.
 
-    All values per row have eight bytes.
+    All values in a row are eight bytes long.
 
     Attributes:
         name: Name of the field.
-        kind: Kind of its numbers: "i8", "f8" or "u8".
-        first_word: Index of its first number in a row of one run.
-        shape: Shape of the field in a row of one run, () for a single number.
+        kind: Element type: "i8", "f8" or "u8".
+        first_word: Index of its first value in a row of a single run.
+        shape: Shape of the field in a row of a single run, or () for a scalar.
     """
 
     name: str
@@ -75,14 +75,14 @@ class LaneField(NamedTuple):
 
 
 class LaneTable(types.Type):
-    """Numba's type of an array with the states of an arm in several runs side by side.
+    """Numba type of an array with the states of an arm in several runs side by side.
 
-    The state in one run is a row of numbers with named fields. Each run has a lane: a number of
-    the row becomes `LANES` adjacent numbers, one per run. A value of this type is a pointer to
-    the first number of the array.
+    The state in one run is a row of values with named fields. Each run has a lane: a value of
+    the row becomes `LANES` adjacent values, one per run. In machine code, an instance of this
+    type is a pointer to the first value of the array.
 
     Args:
-        dtype: Data type of a row of one run. All its numbers have 64 bits.
+        dtype: Data type of a row of a single run, whose values must all have 64 bits.
         constants: For each row, the fields that are equal in all lanes.
     """
 
@@ -101,19 +101,19 @@ class LaneTable(types.Type):
 
     @property
     def mangling_args(self) -> tuple[str, tuple[str]]:
-        """Name of this type in the names of compiled functions, which Numba needs.
+        """Form of this type that Numba uses in the names of compiled functions.
 
-        The full name of the type has characters that such a name must not contain.
+        The full name of the type contains characters that are not allowed there.
         """
         digest = hashlib.sha256(self.name.encode()).hexdigest()
         return type(self).__name__, (f"l{digest[:16]}",)
 
     @property
     def count(self) -> int:
-        """Number of records with constant fields of their own, which the compiler knows.
+        """Number of records that have their own constant fields, known to the compiler.
 
         A field is constant if it is the same in all simulated runs (lanes), for example the
-        kind of a network link.
+        type of a network link.
         """
         return len(self.constants)
 
@@ -129,7 +129,7 @@ class _PartOfTable(LaneTable):
 
 
 class RowType(types.Type):
-    """Base of the Numba types of a record in lanes, which look up its fields by their names.
+    """Base class of the Numba types of a record in lanes, which look up fields by name.
 
     Attributes:
         fields: Fields of the record.
@@ -140,17 +140,17 @@ class RowType(types.Type):
     constants: tuple[Constants, ...]
 
     def find_field(self, name: str) -> LaneField | None:
-        """Returns the position and type of a field of the record, such as "q", by its name.
+        """Looks up the position and type of a field of the record, such as "q".
 
         Returns None if the record has no such field.
         """
         return next((field for field in self.fields if field.name == name), None)
 
     def find_constant(self, name: str) -> int | None:
-        """Returns the value of a field that is the same in all runs, and known to the compiler.
+        """Returns the value of a field that is the same in all runs and known to the compiler.
 
         The compiler then inserts the value into the machine code, and removes branches that the
-        value excludes. Returns None if the field can differ between the runs.
+        value rules out. Returns None if the field can differ between runs.
         """
         return dict(self.constants[0]).get(name)
 
@@ -158,25 +158,25 @@ class RowType(types.Type):
 class RowsInLane(_PartOfTable):
     """Numba type of an array of records of one simulation, for example of all links of a site.
 
-    Several runs are simulated side by side (each in one lane). The same numbers of all runs are
-    adjacent in memory, and this type selects those of a single run.
+    Several runs are simulated side by side, with one run per lane. The same value of all runs
+    is adjacent in memory, and this type selects those of a single run.
     """
 
 
 class LaneRow(RowType, _PartOfTable):
     """Numba type of one record of one simulation, whose fields compiled code reads by name.
 
-    Several runs are simulated side by side (each in one lane), with the same numbers of all
-    runs adjacent in memory. The type hides this arrangement, so that the same source code works
-    for a run that is simulated alone.
+    Several runs are simulated side by side, with the same value of all runs adjacent in memory.
+    This type hides that memory layout, so the same source code also works for a run that is
+    simulated alone.
     """
 
 
 class LaneNumbers(types.Type):
-    """Numba type of an array with one integer for each of several runs simulated side by side.
+    """Numba type of an array with one integer per run, for runs simulated side by side.
 
-    An example is the number of the present control period of each run. In machine code, a value
-    of this type is a pointer to the first integer.
+    An example is the current tick of each run. In machine code, a value of this type is a
+    pointer to the first integer.
     """
 
     in_lanes = True
@@ -186,7 +186,7 @@ class LaneNumbers(types.Type):
 
     @property
     def mangling_args(self) -> tuple[str, tuple[str]]:
-        """Name of this type in the names of compiled functions, which Numba needs."""
+        """Form of this type that Numba uses in the names of compiled functions."""
         return "LaneNumbers", (f"n{LANES}",)
 
 
@@ -217,13 +217,13 @@ def _offset_pointer(builder: Any, pointer: Any, offset: Any) -> Any:
 def offset_rows(builder: Any, pointer: Any, word_count: int) -> Any:
     """Generates LLVM code for the address a given number of words after a pointer.
 
-    The rows of several runs are stored side by side, so that each number of a row occupies
-    `LANES` numbers in memory.
+    The rows of several runs are stored side by side, so each value of a row occupies `LANES`
+    values in memory.
 
     Args:
-        builder: Appends LLVM instructions.
+        builder: Builder that appends LLVM instructions.
         pointer: The pointer.
-        word_count: Distance in 64-bit words of a row of one run.
+        word_count: Distance in 64-bit words of a row of a single run.
     """
     word = ir.IntType(64)
     return _offset_pointer(builder, pointer, ir.Constant(word, word_count * LANES * _WORD))
@@ -276,17 +276,17 @@ def make_view(
     shape: tuple[int, ...],
     itemsize: int,
 ) -> Any:
-    """Generates LLVM code for an array that shows a field of a row in one lane, or in several.
+    """Generates LLVM code for an array that views a row's field in one lane, or in several.
 
-    Successive elements of the field are `LANES` numbers apart in memory.
+    Successive elements of the field are `LANES` values apart in memory.
 
     Args:
-        context: Numba's context of the compilation.
-        builder: Appends LLVM instructions.
-        array_type: Numba's type of the array.
+        context: Numba's compilation context.
+        builder: Builder that appends LLVM instructions.
+        array_type: Numba type of the array.
         data: Pointer to the first element, as an LLVM value.
         shape: Shape of the field.
-        itemsize: Size of an element of the array, bytes.
+        itemsize: Size of an array element, bytes.
     """
     strides: list[int] = []
     step = LANES * _WORD
@@ -496,14 +496,14 @@ pointer_to: Any = _pointer_to
 
 
 def allocate_words(rows: int, row_length: int) -> Words:
-    """Returns an array of zeros for the states of several runs side by side.
+    """Allocates a zero-filled array for the states of several runs side by side.
 
-    The shape is (rows, values per row, LANES), and each run has one of the lanes. The array
-    is aligned to a cache line, because vector instructions read an aligned array faster.
+    The shape is (rows, values per row, LANES), with one lane per run. The array is aligned to a
+    cache line, because vector instructions read an aligned array faster.
 
     Args:
         rows: Number of rows.
-        row_length: Number of values in a row of one run.
+        row_length: Number of values in a row of a single run.
     """
     count = rows * row_length * LANES
     room = np.zeros(count + _ALIGNMENT // _WORD, np.int64)
@@ -514,7 +514,7 @@ def allocate_words(rows: int, row_length: int) -> Words:
 def read_words(rows: NDArray[Any]) -> Words:
     """Returns the values of structured records as integers with the same bits ("words").
 
-    The same code can then copy values of all types. The shape is (rows, words per row).
+    The same code can then copy values of any type. The shape is (rows, words per row).
 
     Args:
         rows: Structured array of the rows, shape (rows,).

@@ -1,12 +1,13 @@
 """Simulates up to `LANES` runs together, each in one lane of the vector registers.
 
 `LaneRun` takes runs with equal structure, for example the points of a sweep over a gain, and
-advances them to a time. It is the counterpart of `CompiledRun`, which simulates one run.
+advances them to a given time. It is the counterpart of `CompiledRun`, which simulates a single
+run.
 
 Invariant:
-    - After `advance_to`, each run has the numbers that `CompiledRun.advance_to` would give it,
-      bit for bit. Only intermediate results of a tick ("scratch" in `row_fields`), and obsolete
-      entries of ring buffers, may differ.
+    - After `advance_to`, each run is bit-identical to what `CompiledRun.advance_to` would have
+      produced. Only intermediate results of a tick ("scratch" in `row_fields`) and obsolete
+      entries of ring buffers may differ.
     - The arrays of the lanes do not overlap in memory, as `advance_site` requires.
 """
 
@@ -250,18 +251,17 @@ def _find_addresses(run: CompiledRun, structure: RunStructure, clock: types.Type
 
 
 def explain_uncompilable(run: CompiledRun, clock: types.Type = types.int64) -> str:
-    """Returns why a control law cannot be compiled for several runs at once, for a message.
+    """Explains why a control law cannot be compiled for several runs at once, for a message.
 
-    Such a law may still be compiled for a single run. The function finds the answer by
-    compiling the code.
+    Such a law may still be compilable for a single run. This compiles the code to find out.
 
     Args:
-        run: The run before its first tick (control period). `find_obstacle` must find no reason
-            against computing it in a lane.
+        run: The run before its first tick. `find_obstacle` must have found no obstacle to
+            computing it in a lane.
         clock: Type of the ticks, see `_list_argument_types`.
 
     Returns:
-        The reason. Empty if all laws can be compiled.
+        The reason, or an empty string if all laws can be compiled.
     """
     try:
         _find_addresses(run, RunStructure.find(run), clock)
@@ -271,10 +271,9 @@ def explain_uncompilable(run: CompiledRun, clock: types.Type = types.int64) -> s
 
 
 def read_assembly(run: CompiledRun, i: int) -> str:
-    """Returns the machine code for one arm as text, for tests.
+    """Returns the assembly code for one arm, for tests.
 
-    The tests check that it contains vector instructions, because the simulation is slow without
-    them.
+    The tests check that it contains vector instructions, without which the simulation is slow.
 
     Args:
         run: The run.
@@ -308,11 +307,10 @@ def _copy_records(first: IntArray, kept: Array, records: Array) -> None:
 def has_lane_code(run: CompiledRun) -> bool:
     """Returns True if the code that simulates a run in lanes is already stored on disk.
 
-    A lane is the position of one of several runs that are simulated at once. Without stored
-    code, the compilation takes some time before the runs can start.
+    Without stored code, the runs can only start after a compilation that takes some time.
 
     Args:
-        run: The run. `find_obstacle` must find no reason against computing it in a lane.
+        run: The run. `find_obstacle` must have found no obstacle to computing it in a lane.
     """
     structure = RunStructure.find(run)
     layout = _find_layout(run)
@@ -348,8 +346,8 @@ class _LinksOfRun:
 
         Args:
             ticks: Number of ticks that each site has executed.
-            links: Rows of its links after these ticks. Only fields of the sample in use, and
-                fields that stage 3 of a tick writes, are up to date.
+            links: Rows of its links after these ticks. Only the fields of the sample in use,
+                and those written in stage 3 of a tick, are up to date.
             states: The latest states of its sites, see `repeat_deliveries`.
             received: Values from laws that arrived with the samples in use, shape (N P, C).
         """
@@ -405,17 +403,16 @@ def _pack_tables(tables_of_runs: Sequence[NDArray[Any]]) -> Words:
 class LaneRun:
     """Simulates several runs of equal structure together with vector instructions.
 
-    Each run has a lane, an element of the vector registers, so that one instruction computes
-    the same number of several runs.
+    Each run occupies a lane (an element of the vector registers), so that one instruction
+    computes the same quantity for several runs.
 
     Args:
-        runs: The runs before their first tick (control period), at most `LANES`. They must have
-            the same structure, see `RunStructure`, and no obstacle, see `find_obstacle`.
-        record_rows: Number of latest records of each site (arm controller) that are kept, a
-            power of two.
+        runs: The runs before their first tick, at most `LANES`. They must have the same
+            structure, see `RunStructure`, and no obstacle, see `find_obstacle`.
+        record_rows: Number of latest records kept per site, a power of two.
 
     Attributes:
-        runs: The runs that are in the lanes. `advance_to` writes the results into them.
+        runs: The runs in the lanes. `advance_to` writes the results to them.
         clock: Type of the ticks, see `_list_argument_types`.
     """
 
@@ -564,14 +561,13 @@ class LaneRun:
         return np.array(addresses, dtype=np.int64)
 
     def advance_to(self, until_s: float) -> None:
-        """Continues all runs until they are as long as a run with a duration of `until_s` s.
+        """Continues all runs to the end of a run with a duration of `until_s` seconds.
 
-        A run ends earlier if an arm leaves its limits. The results, and the records (results of
-        control periods) of the latest ticks (control periods) if they are kept, are written
-        into the `CompiledRun` objects.
+        A run ends earlier if an arm leaves its limits. The results are written to the
+        `CompiledRun` objects, together with the latest records if these are kept.
 
         Args:
-            until_s: The time, s, later than that of the previous call.
+            until_s: The time, s, later than in the previous call.
         """
         lanes = [lane for lane in range(len(self.runs)) if self._ended.ticks[lane] < 0]
         if not lanes:
@@ -729,13 +725,13 @@ class LaneRun:
             self._states = states
 
     def keep(self, chosen: Sequence[int]) -> None:
-        """Continues with some of the runs only, so that no time is spent on the others.
+        """Drops all but some of the runs, to spend no more time on the others.
 
         A search, for example, drops runs that can no longer be the best.
 
         Args:
-            chosen: Indices in `runs` of the runs that continue, in ascending order. No run
-                among them may have ended.
+            chosen: Indices in `runs` of the runs that continue, in ascending order. None of
+                them may have ended.
         """
         assert all(self._ended.ticks[lane] < 0 for lane in chosen)
         lanes = list(chosen)
@@ -904,8 +900,8 @@ def _find_recorded_hands(
 def view_rows(table: NDArray[np.float64]) -> NDArray[Any]:
     """Returns an array of floats as structured records with named fields.
 
-    The array has the shape (N, rows, columns) for N sites. The records share its memory, so
-    that assigning to a field changes the array.
+    The array has shape (N, rows, columns) for N sites. The records share its memory, so
+    assigning to a field changes the array.
     """
     return table.reshape(len(table), -1).view([("row", "f8", (table[0].size,))])
 
@@ -932,7 +928,7 @@ def put_rows(rows: NDArray[Any], numbers: Words) -> None:
     """Overwrites structured records with values given as integers with the same bits.
 
     Args:
-        rows: The rows; written.
+        rows: Rows to overwrite.
         numbers: The values, shape (rows, words per row).
     """
     new_rows = np.ascontiguousarray(numbers).view(rows.dtype)
@@ -959,9 +955,9 @@ def _write_progress(progress: Any, ticks: IntArray, rates_hz: IntArray) -> None:
 
 
 def find_words(layout: np.dtype[Any], name: str) -> range:
-    """Returns the positions of the numbers of a field, such as "q", in a record.
+    """Returns the positions of a field's values in a record, for example those of "q".
 
-    The positions are indices among all numbers of the record (row).
+    The positions are indices among all values of the record (row).
 
     Args:
         layout: Data type of the row.

@@ -1,19 +1,19 @@
 # mypy: disallow-untyped-calls=False, disallow-untyped-decorators=False
 # mypy: disable-error-code="no-any-return, override"
-"""Lets a function for one run compute eight runs, by a vector type for its numbers.
+"""Lets a function written for one run compute eight runs, using a vector type for its values.
 
-A loop over runs becomes vector instructions if the loop over runs is the innermost one. In the
-dynamics of a chain of joints, the innermost loops go from joint to joint. The compiler would
-vectorise these, although their numbers are not adjacent in memory. Therefore this module
-defines a type of Numba for a value that consists of eight numbers, one for each run. In a
-function that is compiled for this type, `a + b` adds eight pairs of numbers by one instruction.
-The source of the function is not changed.
+A loop over runs becomes vector instructions only if it is the innermost loop. In the dynamics
+of a chain of joints, the innermost loops go from joint to joint. The compiler would vectorise
+those, although their values are not adjacent in memory. This module therefore defines a Numba
+type for a value that consists of eight numbers, one per run. In a function compiled for this
+type, a single instruction computes `a + b` for all eight runs. The source of the function is
+not changed.
 
-A function that branches on such a value is rejected when it is compiled, because the eight runs
-may need different branches. The function must use `choose` instead.
+A function that branches on such a value is rejected at compile time, because the eight runs may
+need different branches. The function must use `choose` instead.
 
 Invariant:
-    - Each number of a result is computed by the same operations from the same numbers as in a
+    - Each element of a result is computed by the same operations from the same operands as in a
       run that is computed alone.
 """
 
@@ -53,12 +53,12 @@ _LLVM_KINDS = {
 
 
 class LaneVector(types.Type):
-    """Numba type of eight numbers, one for each of eight runs, in one vector register.
+    """Numba type of eight numbers in one vector register, one for each of eight runs.
 
-    One SIMD instruction then computes a number of all eight runs.
+    One SIMD instruction then computes a value for all eight runs.
 
     Args:
-        kind: Kind of the number: "f8" for a float, "i8" for an integer, "b1" for a condition.
+        kind: Element type: "f8" for a float, "i8" for an integer, "b1" for a condition.
     """
 
     in_lanes = True
@@ -69,23 +69,23 @@ class LaneVector(types.Type):
 
     @property
     def mangling_args(self) -> tuple[str, tuple[str]]:
-        """Name of this type in the names of compiled functions, which Numba needs."""
+        """Form of this type that Numba uses in the names of compiled functions."""
         return "LaneVector", (self.kind,)
 
     def can_convert_from(self, _context: Any, other: Any) -> Any:
-        """Tells Numba that one number may be used where a vector of eight floats is needed.
+        """Tells Numba that a scalar may be used where a vector of eight floats is needed.
 
-        The number is then repeated eight times. Returns None, which forbids the conversion, for
+        The scalar is then repeated eight times. Returns None, which forbids the conversion, for
         vectors of integers or conditions, and for values that are not numbers.
         """
         is_number = isinstance(other, types.Float | types.Integer)
         return Conversion.safe if is_number and self.kind == "f8" else None
 
     def unify(self, _context: Any, other: Any) -> Any:
-        """Returns the type of a variable that is a vector or a number, depending on the branch.
+        """Returns the type of a variable that is a vector in one branch, a scalar in another.
 
-        Numba requires a single type per variable. It is this vector type, so that the number is
-        repeated for all eight runs. Returns None, which is an error of compilation, if the
+        Numba requires a single type per variable. This is the vector type, in which the scalar
+        is repeated for all eight runs. Returns None, which is a compilation error, if the
         vector does not contain floats or if the other value is not a number.
         """
         is_number = isinstance(other, types.Float | types.Integer)
@@ -330,7 +330,7 @@ class _GroupType(types.Type):
 
     @property
     def mangling_args(self) -> tuple[str, tuple[str]]:
-        """Name of this type in the names of compiled functions, which Numba needs."""
+        """Form of this type that Numba uses in the names of compiled functions."""
         digest = hashlib.sha256(self.name.encode()).hexdigest()
         return type(self).__name__, (f"g{digest[:16]}",)
 
