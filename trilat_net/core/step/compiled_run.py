@@ -45,8 +45,8 @@ class _HandActor(Protocol):
     """Interface of a live operator in a compiled run.
 
     A live operator is a person or program that moves an arm while the run is in progress. The
-    compiled loop asks for the operator's actions in advance, for as many ticks (control
-    periods) as possible, so that it rarely has to leave compiled code.
+    compiled loop requests the operator's actions for as many ticks in advance as possible,
+    because leaving compiled code is slow.
     """
 
     def compute_actions(self, k: int, end: int, arrays: SiteArrays) -> Array:
@@ -69,7 +69,7 @@ class _Plant(Protocol):
     """Interface of a user's own program that computes the motion of an arm.
 
     Attributes:
-        state: State of the arm in the next tick (control period).
+        state: State of the arm in the next tick.
     """
 
     state: PlantState
@@ -184,18 +184,17 @@ class CompiledRun:
         self._selected: dict[int, SiteArrays] = {}
 
     def _allocate_records(self, keep: int) -> RecentRecords:
-        """Allocates memory for the recent records of every site (arm controller).
+        """Allocates memory for the recent records of every site.
 
-        A record is the stored result of one tick (period of the control loop). It must be
-        stored until `pop_records` returns it, until the slowest peer has received it, and, in a
-        repeated run, until the latest sample (sent state) has arrived.
+        A record must be kept until `pop_records` returns it, until the slowest peer has
+        received it, and, in a repeated run, until the latest sample has arrived.
 
         Args:
-            keep: Number of recent records of each site that `pop_records` must find.
+            keep: Number of recent records per site that `pop_records` must be able to return.
 
         Returns:
-            Ring buffers for at least as many records per site as are needed. Their length is a
-            power of two, so that the compiled loop finds the position of a tick with a bit
+            Ring buffers for at least the required number of records per site. Their length is a
+            power of two, so that the compiled loop can find the position of a tick with a bit
             mask.
         """
         site_count = len(self.layouts)
@@ -216,13 +215,13 @@ class CompiledRun:
     def _plug_laws(self, setups: Sequence[SiteSetup]) -> None:
         """Creates the users' control laws, and connects them to the arrays of the run.
 
-        A law that can be compiled is called within the compiled loop. A law in plain Python is
-        called between the stages of a tick (control period). The laws are stored in
-        `self._laws`, and the arrays that the compiled loop needs in `self._law_arrays`, which
-        stays None without users' laws.
+        A law that can be compiled is called inside the compiled loop. A law in plain Python is
+        called between the stages of a tick. The laws are stored in `self._laws`, and the arrays
+        needed by the compiled loop in `self._law_arrays`, which stays None if there are no user
+        laws.
 
         Args:
-            setups: Setups of the sites (arm controllers), in the order of the scenario.
+            setups: Setups of the sites, in scenario order.
         """
         self._laws: dict[int, PlainLaw | CompiledLaw] = {}
         self._law_arrays: LawArrays | None = None
@@ -274,7 +273,7 @@ class CompiledRun:
         )
 
     def _update_links(self) -> None:
-        """Updates the state of the links, if the run was advanced together with other runs."""
+        """Brings the link state up to date if the run was advanced together with other runs."""
         deliver = self.pending_deliveries
         self.pending_deliveries = None
         if deliver is not None:
@@ -305,16 +304,15 @@ class CompiledRun:
             self._step_until(last_ns)
 
     def _step_until(self, last_ns: int) -> None:
-        """Executes the planned ticks up to a time, and calls users' programs in between.
+        """Executes the planned ticks up to a given time, calling users' programs in between.
 
         The programs act as operators, or compute the motion of an arm (plants). A program needs
-        the state of the arm at a certain time, so the compiled loop pauses before the tick
-        (control period) of this time to call the program. Between two pauses, the loop executes
-        many ticks at once.
+        the state of the arm at a certain time, so the compiled loop pauses before the tick at
+        that time. Between pauses, it executes many ticks at once.
 
         Args:
-            last_ns: Time of the last tick to be executed, in ns after the epoch, the common
-                start time of the sites.
+            last_ns: Time of the last tick to execute, in ns since the epoch (the common start
+                time of the sites).
         """
         while self.has_programs and self.diverged_s is None:
             # Both methods call a program if it is due, and return when it is due again.
@@ -333,15 +331,15 @@ class CompiledRun:
     def _move_plant(self, i: int) -> int:
         """Calls a user's program to compute the motion of an arm in one control period.
 
-        Such a program is called a plant, and a control period a tick. The plant moves once per
-        tick, by the control torque of the last executed tick. The new state of the arm is
-        copied to the arrays of the run, from which the next tick reads it.
+        The program, called a plant, moves the arm once per tick, driven by the control torque
+        of the last executed tick. The new state of the arm is copied to the arrays of the run,
+        from which the next tick reads it.
 
         Args:
             i: Index of the site.
 
         Returns:
-            Time before which the plant must move again, in ns after the epoch. `NEVER_NS` after
+            Time before which the plant must move again, in ns since the epoch. `NEVER_NS` after
             the last tick.
         """
         next_tick = int(self._progress[i]["tick"])
@@ -368,16 +366,16 @@ class CompiledRun:
         return tick_ns(next_tick + 1, self.rates_hz[i])
 
     def _request_actions(self, i: int) -> int:
-        """Requests the next actions of an operator, if the previous actions were executed.
+        """Requests the next actions of an operator once the previous ones have been executed.
 
-        The operator is a program that answers with its actions for some ticks (periods of the
-        control loop) in advance. They are written to the inputs of the compiled loop.
+        The operator is a program that returns its actions for several ticks in advance. They
+        are written to the inputs of the compiled loop.
 
         Args:
             i: Index of the site.
 
         Returns:
-            Time at which the operator needs the state of the arm again, in ns after the epoch.
+            Time at which the operator needs the state of the arm again, in ns since the epoch.
             `NEVER_NS` after the last tick.
         """
         progress = self._progress[i]
@@ -392,15 +390,14 @@ class CompiledRun:
         return tick_ns(self._action_ends[i], self.rates_hz[i])
 
     def _step_piece(self, last_ns: int) -> None:
-        """Executes the planned ticks up to a time for which no user's program is needed.
+        """Executes the planned ticks up to a time until which no operator or plant is needed.
 
-        Such programs are operators and plants (simulated arms). Control laws are called. If a
-        user's law is plain Python, the loop over the ticks (control periods) runs in Python
-        too. Otherwise the whole loop is compiled.
+        Control laws are still called. If a user's law is in plain Python, the loop over the
+        ticks also runs in Python. Otherwise, the entire loop is compiled.
 
         Args:
-            last_ns: Time of the last tick to be executed, in ns after the epoch, the common
-                start time of the sites.
+            last_ns: Time of the last tick to execute, in ns since the epoch (the common start
+                time of the sites).
 
         Raises:
             LawFailed: A user's control law failed.
@@ -436,11 +433,11 @@ class CompiledRun:
     def _run_plain_until(self, last_ns: int) -> None:
         """Executes ticks in a Python loop, because a control law is not compiled.
 
-        The loop does the same as the compiled function `run_until`. Within each tick, the law
+        The loop is equivalent to the compiled function `run_until`. Within each tick, the law
         is called after the measurements (`sense_site`) and before the motion (`finish_site`).
 
         Args:
-            last_ns: Time of the last tick, in ns after the epoch.
+            last_ns: Time of the last tick, in ns since the epoch.
         """
         progress = self._progress
         tables = self._tables
@@ -523,7 +520,7 @@ class CompiledRun:
 
     @cached_property
     def _state(self) -> RunState:
-        """State of the run, with which it can be copied to another run."""
+        """State of the run, in a form that can be copied to another run."""
         tables = self._tables
         arrays = [self._progress, self._next_samples, *self._sent, self._sums]
         arrays += [array for array in tables if isinstance(array, np.ndarray)]
@@ -842,16 +839,16 @@ class CompiledRun:
 
 
 def _max_over_joints(buckets: Array) -> Array:
-    """Returns the largest position error and joint speed of an arm in each interval of time.
+    """Returns the largest position error and joint speed of an arm in each time interval.
 
-    The largest values are kept per joint during the simulation, and combined here for a figure
-    or table.
+    During the simulation, the largest values are kept per joint. They are combined here for a
+    figure or table.
 
     Args:
-        buckets: Statistics of an arm with n joints in K intervals of time, which are called
-            buckets, shape (K, 3 n). `run_until` writes them. Each row consists of three groups
-            of n columns, one column per joint: the largest position error |e| in rad, the
-            largest joint speed |qd| in rad/s, and the last joint angle q in rad.
+        buckets: Statistics of an arm with n joints in K time intervals (buckets), as written by
+            `run_until`, shape (K, 3 n). Each row consists of three groups of n columns, one
+            column per joint: the largest position error |e| in rad, the largest joint speed
+            |qd| in rad/s, and the last joint angle q in rad.
 
     Returns:
         The largest |e| in rad and the largest |qd| in rad/s over all joints, shape (K, 2).

@@ -29,7 +29,7 @@ from .jit import leaf
 from .vectors import Five, Pair, Vector
 
 ROBUST_RESIDUE = ((5.0**0.5 - 1.0) / 2.0) ** 2.5
-"""The largest value of x - x^2 / sqrt(1 + x^2) for x >= 0."""
+"""Maximum of x - x^2 / sqrt(1 + x^2) for x >= 0."""
 
 
 @leaf
@@ -170,7 +170,7 @@ def robust_torque(rho: float, width: float, r: float) -> float:
 
 @leaf
 def _clip(value: float, low: float, high: float) -> float:
-    """Returns a value, limited to the range from low to high. NaN stays NaN."""
+    """Clips a value to the range from low to high. NaN stays NaN."""
     if value < low:
         return low
     return high if value > high else value

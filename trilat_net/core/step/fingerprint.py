@@ -30,23 +30,23 @@ _LINK = LinkModel(kind=DelayKind.GAMMA, extra=2.7, scale=900.0, playout_us=2_000
 
 @leaf
 def _compute_sines(angles: Array, results: Array) -> None:
-    """Computes the sine and the cosine of many angles, whose bits the fingerprint covers.
+    """Computes the sines and cosines that go into the fingerprint.
 
-    These are the operations in which platforms are most likely to differ.
+    Of all operations, these are the most likely to differ between platforms.
 
     Args:
         angles: The angles, shape (n,), rad.
-        results: Array of the shape (2, n). Its first row receives the sines, its second the
-            cosines.
+        results: Output array of shape (2, n), for the sines in the first row and the cosines in
+            the second.
     """
     for n in range(angles.shape[0]):
         results[0, n], results[1, n] = sincos(angles[n])
 
 
 def _build_setup(name: str, peer: str, q0: tuple[float, float]) -> SiteSetup:
-    """Returns the setup of one of the two arms in the simulation of the fingerprint.
+    """Returns the setup of one of the two arms simulated for the fingerprint.
 
-    The numbers are arbitrary, but must never change: the fingerprint depends on them.
+    The values are arbitrary, but must never change, because the fingerprint depends on them.
 
     Args:
         name: Name of the site.

@@ -30,10 +30,10 @@ from .ticks import BUCKETS_PER_S, Mode, tick_ns
 from .vectors import Array, IntArray, Row, RowArray
 
 NEVER_NS = 2**63 - 1
-"""Replaces the time of the next control period once an arm has completed its run, ns."""
+"""Used as the time of the next control period once an arm has completed its run, ns."""
 
 PROGRESS_DTYPE = row_dtype("progress", {})
-"""The layout of a site's progress, see `ProgressRow`."""
+"""Memory layout of a site's progress, see `ProgressRow`."""
 
 
 class RecentRecords(NamedTuple):
@@ -101,27 +101,26 @@ class ReplayedInputs(NamedTuple):
 def _accept_record(
     k: int, rate_hz: int, peer: SiteRow, sample: int, sent: RecentRecords, link: LinkArrays
 ) -> None:
-    """Lets a simulated arm receive the state (sample) of another arm, without a network.
+    """Delivers a sample from one simulated arm to another, without a network.
 
-    The sample is read from the record of the other arm, the peer. A record contains the results
-    of one tick, a period of the control loop. With n joints, m coordinates that the arms share
-    and P parameters, its floating-point numbers are
+    The sample is read from the peer's record. With n joints, m coordinates shared between arms
+    and P parameters, the floating-point values of a record are
 
         q (n), qd (n), q_des (m), qd_des (m), tau (n), tau_x (n), theta_hat (P),
         x (m), xd (m), wrench (m),                                  only in task space
-        the numbers that the control law of the peer sends
+        the values sent by the peer's control law
 
-    Arms that share joint angles send q, qd and tau_x. Arms in task space send the pose x, its
-    velocity xd and the external wrench on the end effector instead.
+    Arms that share joint angles send q, qd and tau_x. Arms in task space instead send the pose
+    x, its velocity xd and the external wrench on the end effector.
 
     Args:
-        k: Present tick of the receiver.
+        k: Current tick of the receiver.
         rate_hz: Tick rate of the receiver, Hz.
         peer: State of the peer.
         sample: Tick in which the peer sent the sample.
-        sent: Latest records of the peer, a ring buffer: the record of tick i is at i modulo the
-            length.
-        link: Arrays of the link from the peer; the sample is stored in them.
+        sent: Latest records of the peer, in a ring buffer: the record of tick i is at index i
+            modulo the length.
+        link: Arrays of the link from the peer, in which the sample is stored.
     """
     n = peer.joints
     m = peer.shared
@@ -161,25 +160,24 @@ def _accept_prompt_records(
     sent: RecentRecords,
     link: LinkArrays,
 ) -> int:
-    """Lets an arm receive all states that another arm (peer) sent before time t, without delay.
+    """Delivers all samples that a peer sent before time t, without network delay.
 
-    The states are in the records of the peer. A record contains the results of one tick, a
-    period of the control loop. A received state is stored until the simulated delay of the link
-    has passed.
+    The samples are read from the peer's records, and stored until the simulated delay of the
+    link has passed.
 
     Args:
-        k: The tick of the receiver.
-        t_ns: Time t of this tick, ns since the epoch, the common start of the session.
+        k: Current tick of the receiver.
+        t_ns: Time t of this tick, ns since the epoch (the common start of the session).
         rate_hz: Tick rate of the receiver, Hz.
         peer: State of the peer.
         records: Number of records that the peer has written.
         next_sample: Tick of the peer's first record that has not been accepted yet.
-        sent: The last records of the peer, in a ring buffer: record n is at n modulo its
+        sent: Latest records of the peer, in a ring buffer: record n is at index n modulo its
             length.
-        link: The link from the peer.
+        link: Arrays of the link from the peer.
 
     Returns:
-        The tick of the peer's first record that is still not accepted.
+        The tick of the peer's first record that remains to be accepted.
     """
     # The length of the ring is a power of two, so a modulo is a mask of the lower bits.
     ring_mask = sent.t_ns.shape[0] - 1
@@ -195,20 +193,21 @@ def _accept_prompt_records(
 def _apply_recorded_hand(
     i: int, k: int, actors: TorqueSourceRows, feed: ReplayedInputs
 ) -> None:
-    """Repeats the action of a person on an arm in one control period of a recorded run.
+    """Repeats a live operator's action on an arm in one control period of a recorded run.
 
-    A person or program that moves the arm during the run is called a live hand. It is simulated
-    by a spring, which pulls the arm to a target. The grip (a factor of the force), the target,
-    and the target one second later are written into the data of the live hand. Nothing happens
-    without a live hand, or after the end of the recorded run.
+    A live operator (hand) is simulated by a spring that pulls the arm to a target. The grip (a
+    factor of the force), the target, and the target one second later are written to the row of
+    the live hand. Nothing happens if there is no live hand, or after the end of the recorded
+    run.
 
     Args:
         i: Index of the site.
-        k: The tick, a period of the site's control loop.
+        k: Current tick.
         actors: Operators and environments of the site. The fields `a` and `b` of a live hand
             are its target and its target one second later, m or rad.
-        feed: Inputs of the recorded run. `feed.hands` contains for each site and tick the grip,
-            0 to 1, the coordinates of the target, and those of the target one second later.
+        feed: Inputs of the recorded run. For each site and tick, `feed.hands` contains the
+            grip, 0 to 1, the coordinates of the target, and those of the target one second
+            later.
     """
     index = feed.hand_indices[i]
     has_live_hand = index >= 0
@@ -277,14 +276,14 @@ def update_peaks(
 
 @leaf
 def _advance_bucket(progress: ProgressRow) -> None:
-    """Advances to the next interval of time (bucket) for which largest values are kept.
+    """Advances to the next time interval (bucket) for which the largest values are kept.
 
-    This happens once an arm has completed all control periods of the present interval. Periods
-    are counted in fractions of the interval, because an interval need not be a multiple of a
+    Called when an arm has completed all control periods of the current interval. Periods are
+    counted in fractions of the interval, because an interval need not be a multiple of a
     period.
 
     Args:
-        progress: Progress of the site (the process that runs the arm); changed.
+        progress: Progress of the site; updated in place.
     """
     progress.part += BUCKETS_PER_S
     while progress.part >= progress.rate_hz:
@@ -294,13 +293,13 @@ def _advance_bucket(progress: ProgressRow) -> None:
 
 @leaf
 def _put_gravity_torque(s: SiteRow, chain: RowArray | None, row: Array, torque: Array) -> None:
-    """Computes the gravity torque of an arm at the pose in one of its records.
+    """Computes the gravity torque of an arm in the pose of a given record.
 
     Args:
-        s: State of the site (the process that runs the arm).
+        s: State of the site.
         chain: Data of the joints, one row per joint. None for the planar two-link arm.
-        row: Floating-point numbers of the record. They begin with the joint angles.
-        torque: Receives the torque, shape (n,), N m.
+        row: Floating-point values of the record, which start with the joint angles.
+        torque: Output array for the torque, shape (n,), N m.
     """
     if chain is None:
         two_link_stages.put_gravity_torque(s, torque)
@@ -319,20 +318,18 @@ def _put_source_torque(
     sampled: int,
     torque: Array,
 ) -> None:
-    """Computes the torque of operators and environments for the motion in an arm's record.
-
-    An operator is a model of a person who moves the arm, and an environment a wall or a damper.
+    """Computes the torque of operators and environments for the motion in a given record.
 
     Args:
         t_s: Time since the start of the session, s.
-        s: State of the site (the process that runs the arm).
+        s: State of the site.
         chain: Data of the joints, one row per joint. None for the planar two-link arm.
-        row: Floating-point numbers of the record. They begin with joint angles and velocities.
-        actors: Operators and environments, one row for each.
+        row: Floating-point values of the record, which start with joint angles and velocities.
+        actors: Operators and environments, one row each.
         table: Numerical data of all operators and environments, for example recorded torques.
-        sampled: 1 for those with a torque that is constant during a control period, 0 for all
-            others.
-        torque: Receives the torque, shape (n,), N m.
+        sampled: 1 to select those whose torque is constant during a control period, 0 to select
+            all others.
+        torque: Output array for the torque, shape (n,), N m.
     """
     if chain is None:
         two_link_stages.put_source_torque(
@@ -451,19 +448,19 @@ def _compute_torque(
     chain: RowArray | None,
     laws: LawArrays | None,
 ) -> None:
-    """Computes the torque of an arm's control law in the present control period (tick).
+    """Computes the torque of an arm's control law in the current tick.
 
-    A law is built in, or a user wrote it. `torque_stage` computes the torque of built-in laws,
-    and does nothing for users' laws. `law_stage` calls a user's law that was compiled. A user's
-    law in plain Python has been called by the driver of the simulation before.
+    `torque_stage` computes the torque of built-in laws, and does nothing for user-written laws.
+    A compiled user law is called by `law_stage`. A user law in plain Python has already been
+    called by the driver of the simulation.
 
     Args:
-        i: Index of the site, the process that runs one arm.
-        progress: Progress of the site, with the tick and its nominal time.
+        i: Index of the site.
+        progress: Progress of the site, including the tick and its nominal time.
         arrays: Arrays of all sites.
         chain: Data of the joints, one row per joint. None for the planar two-link arm.
-        laws: The users' compiled laws. None if no site has such a law. The address of a law is
-            0 for a site that has no compiled law.
+        laws: Compiled user laws, or None if no site has one. The address is 0 for a site
+            without a compiled law.
     """
     if laws is None:
         torque_stage(arrays.site[i], chain)
@@ -490,15 +487,15 @@ def _compute_torque(
 
 @leaf
 def _record_sent(s: SiteRow, i: int, row: Array, laws: LawArrays | None) -> None:
-    """Writes the numbers that a control law sends to other arms into the record of its arm.
+    """Writes the values that a control law sends to other arms to the record of its arm.
 
-    The other arms of the simulation read the values from this record.
+    The other arms in the simulation read the values from this record.
 
     Args:
-        s: State of the site (the process that runs the arm).
+        s: State of the site.
         i: Index of the site.
-        row: Floating-point numbers of the record; changed.
-        laws: Compiled control laws that users wrote. None if there are no such laws.
+        row: Floating-point values of the record; updated in place.
+        laws: Compiled user-written control laws, or None if there are none.
     """
     if laws is not None:
         first = first_sent_column(s)

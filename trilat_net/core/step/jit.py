@@ -62,16 +62,16 @@ with suppress(OSError, IndexError):  # only Linux has the file
 
 
 _CORE = Path(__file__).parents[1]
-"""Folder of the core, to which this package belongs."""
+"""Folder of the core, which contains this package."""
 _CORE_PACKAGE = __package__.rpartition(".")[0]
-"""Name of the package of the core."""
+"""Name of the core package."""
 
 
 def _cache_root() -> Path:
-    """Returns the directory in which programs of this user may keep files for faster starts.
+    """Returns the user's cache directory, in which programs may keep files for faster starts.
 
-    It is ~/.cache on Linux, unless XDG_CACHE_HOME names another directory, and the
-    corresponding directory on other platforms.
+    This is ~/.cache on Linux, unless XDG_CACHE_HOME names another directory, and the equivalent
+    directory on other platforms.
     """
     if sys.platform == "win32":
         return Path(os.environ.get("LOCALAPPDATA", Path.home() / "AppData" / "Local"))
@@ -83,8 +83,8 @@ def _cache_root() -> Path:
 def _core_digest() -> str:
     """Returns a hash that shows whether machine code on disk was compiled from these sources.
 
-    It covers Numba's version, the files of the core, and `records`, whose constants the core
-    contains.
+    It covers Numba's version, the files of the core, and `records`, whose constants are
+    compiled into the core.
     """
     digest = hashlib.sha256(numba.__version__.encode())
     for source in (*sorted(_CORE.rglob("*.py")), _CORE.with_name("records.py")):
@@ -93,10 +93,10 @@ def _core_digest() -> str:
 
 
 def _writable_cache() -> Path | None:
-    """Returns the directory in which compiled functions are stored, and creates it if needed.
+    """Returns the directory in which compiled functions are stored, creating it if necessary.
 
-    The result is None if the directory is not writable. Compiled functions are then kept in
-    memory only.
+    Returns None if the directory is not writable. Compiled functions are then kept in memory
+    only.
     """
     try:
         directory = _cache_root() / "trilat-net" / _core_digest()
@@ -136,14 +136,14 @@ COMPILING = (
 
 
 class _CompilingNotice(event.Listener):
-    """Reports once that the core is compiled, which makes a first run take longer.
+    """Prints a one-time notice that the core is being compiled, which delays a first run.
 
-    Numba calls this object at the start and the end of each compilation. During a compilation,
-    signals such as Ctrl-C end the process at once.
+    Numba calls this object at the start and end of each compilation. During a compilation,
+    signals such as Ctrl-C end the process immediately.
 
     Attributes:
-        is_reported: True if the notice was reported, or must not be reported.
-        report: Writes the notice; by default to standard error.
+        is_reported: True if the notice has been printed, or must not be.
+        report: Function that prints the notice, by default to standard error.
     """
 
     def __init__(self) -> None:
@@ -182,12 +182,12 @@ _register("numba:compile", compiling_notice)
 
 
 def _mangle_record(record: types.Record) -> tuple[str, tuple[str]]:
-    """Returns a unique name for a record type, for the symbols of compiled functions.
+    """Returns a unique name for a record type, used in the symbols of compiled functions.
 
     A record type describes the rows of a structured array. Numba itself numbers these types in
-    the order in which a process uses them. Two processes could then compile functions for
+    the order in which a process uses them. Two processes could therefore compile functions for
     different types under the same symbol, and a third process that loads both from the cache
-    would mix them up. The name here is a hash of the type's fields.
+    would mix them up. To prevent this, the name returned here is a hash of the type's fields.
     """
     digest = hashlib.sha256(record.name.encode()).hexdigest()
     return "Record", (f"r{digest[:16]}",)
@@ -197,8 +197,8 @@ _record: Any = types.Record
 _record.mangling_args = property(_mangle_record)
 
 _OPTIONS: Any = {"_nrt": False}
-"""Options of leaves: no leaf allocates an array, so Numba need not count references, which
-would cost more than the arithmetic.
+"""Numba options of leaves. Reference counting would cost more than the arithmetic, and is not
+needed because leaves allocate no arrays.
 """
 _LEAF_OPTIONS: Any = {
     "nopython": True,
@@ -209,17 +209,17 @@ _LEAF_OPTIONS: Any = {
     **_OPTIONS,
 }
 _INNER = "within"
-"""Marks stored code as the code of an inner leaf."""
+"""Marks stored code as that of an inner leaf."""
 _NO_LLVM_CODE = parse_assembly("").as_bitcode()
 """An empty LLVM module."""
 
 
 @cache
 def _hash_folder(folder: Path) -> str:
-    """Returns a hash of all Python files of a folder, to detect outdated machine code.
+    """Returns a hash of all Python files in a folder, to detect outdated machine code.
 
-    It is used for functions outside the core. If a file changes, so does the hash, and machine
-    code that was stored with the old hash is no longer used.
+    Used for functions outside the core. If a file changes, the hash changes, and machine code
+    stored under the old hash is no longer used.
     """
     digest = hashlib.sha256()
     for source in sorted(folder.glob("*.py")):
@@ -230,9 +230,9 @@ def _hash_folder(folder: Path) -> str:
 class _LeafLocator:
     """Tells Numba where the machine code of a function is stored, and when it is out of date.
 
-    By default, Numba compares the time of the function's file. With this class, it compares a
-    hash of all files in the folder of the function, because the function may call functions of
-    these files.
+    By default, Numba checks the modification time of the function's file. This class compares a
+    hash of all files in the folder of the function instead, because the function may call
+    functions in these files.
     """
 
     def __init__(self, function: Callable[..., Any], file: str) -> None:
@@ -259,8 +259,8 @@ class _LeafLocator:
 class _LeafCacheImpl(CompileResultCacheImpl):
     """Converts compiled functions to the content of cache files, and back.
 
-    A function that only other compiled functions call (an inner leaf) is stored as LLVM code.
-    All others are stored as machine code.
+    A function that is only called by other compiled functions (an inner leaf) is stored as LLVM
+    code, all others as machine code.
     """
 
     _locator_classes = cast(Any, [_LeafLocator])
@@ -317,10 +317,10 @@ class _LeafCacheImpl(CompileResultCacheImpl):
 
 
 class _CompressedFiles(IndexDataCacheFile):
-    """The cache files of one compiled function, compressed to a quarter of their size.
+    """Cache files of one compiled function, compressed to a quarter of their size.
 
-    Numba numbers the files. Therefore two processes may write different code into one file. In
-    this class, the name of a file contains a hash of its key instead.
+    Numba would number the files, so two processes could write different code to the same file.
+    In this class, the name of a file contains a hash of its key instead.
     """
 
     def save(self, key: Any, code: Any) -> None:
@@ -357,8 +357,8 @@ class _CompressedFiles(IndexDataCacheFile):
 class _LeafCache(FunctionCache):
     """Stores the machine code of one compiled function on disk, and loads it.
 
-    Code is read from the user's cache directory, or else from the installed wheel. New code is
-    written into the user's cache directory.
+    Code is read from the user's cache directory, or failing that, from the installed wheel. New
+    code is written to the user's cache directory.
     """
 
     _impl_class = _LeafCacheImpl
@@ -441,11 +441,11 @@ class _LeafCache(FunctionCache):
 
 
 class _LeafLibrary(JITCodeLibrary):
-    """Code of one compiled function, as LLVM code or as machine code.
+    """Code of one compiled function, either as LLVM code or as machine code.
 
-    A function that only other compiled functions call (an inner leaf) is optimised once, as a
-    part of its caller. Numba would also optimise it alone, and add a wrapper for calls from
-    Python. This class skips both steps, which halves the time of compilation.
+    A function that is only called by other compiled functions (an inner leaf) is optimised only
+    once, as part of its caller. Numba would also optimise it separately, and add a wrapper for
+    calls from Python. Skipping both steps halves the compilation time.
     """
 
     is_inner = False
@@ -471,9 +471,9 @@ class _LeafLibrary(JITCodeLibrary):
 
 
 def _as_inner(result: Any) -> Any:
-    """Makes a function that exists only as LLVM code known to its compiled callers.
+    """Makes a function that exists only as LLVM code available to compiled callers.
 
-    Numba finds a called function by its entry point, the Python object of its machine code.
+    Numba looks up a called function by its entry point, the Python object of its machine code.
     LLVM code has no entry point, so a new object takes its place.
     """
     result = result._replace(entry_point=object())
@@ -483,14 +483,14 @@ def _as_inner(result: Any) -> Any:
 
 
 class _LeafCompiler(Compiler):
-    """Compiles a numerical function with Numba, for calls from Python or from compiled code.
+    """Compiles a numerical function (leaf) with Numba, for calls from Python or compiled code.
 
-    The functions are called leaves. A leaf that is compiled because another leaf calls it is an
-    inner leaf, and becomes a part of its caller.
+    A leaf that is compiled because another leaf calls it is an inner leaf, and becomes part of
+    its caller.
 
     Attributes:
-        depth: Number of nested callers whose compilation is in progress and needs leaves.
-        library_class: Class of the code of a leaf that is not an inner leaf.
+        depth: Number of nested callers that are currently being compiled and need leaves.
+        library_class: Code class of a leaf that is not an inner leaf.
         has_distinct_arguments: True if the arguments of a leaf that is not an inner leaf never
             overlap in memory.
     """
@@ -541,7 +541,7 @@ class _LeafCompiler(Compiler):
 
 @contextmanager
 def _compiling_caller() -> Iterator[None]:
-    """Treats each leaf that Numba compiles or looks up within the context as an inner leaf."""
+    """Treats each leaf that Numba compiles or looks up inside the context as an inner leaf."""
     _LeafCompiler.depth += 1
     try:
         yield
@@ -550,12 +550,13 @@ def _compiling_caller() -> Iterator[None]:
 
 
 def _prefer_wide_vectors(llvm_code: str) -> str:
-    """Asks LLVM to use vector instructions of 512 bits in the loops of a module.
+    """Makes LLVM use 512-bit vector instructions in the loops of a module.
 
-    By default LLVM chooses 256 bits even if a processor has longer registers, because some
-    processors lower their clock rate for these. The arithmetic of this program gains more from
+    By default, LLVM uses 256 bits even on processors with longer registers, because some
+    processors lower their clock rate for these. In this program, the arithmetic gains more from
     the longer registers than it loses. Processors without such registers are not affected. The
-    text is changed, because llvmlite cannot set an attribute that has a value.
+    source text of the module is edited, because llvmlite cannot set an attribute that has a
+    value.
 
     Args:
         llvm_code: The module as text.
@@ -572,8 +573,8 @@ def _prefer_wide_vectors(llvm_code: str) -> str:
 class _LaneLibrary(_LeafLibrary):
     """Machine code of a function with a long loop, with all functions that it calls inlined.
 
-    The compiler turns a loop into SIMD instructions only if the loop contains no calls. Such a
-    loop computes many control periods, or several simulations side by side (lanes).
+    The compiler only vectorises loops that contain no calls. Such a loop computes many control
+    periods, or several simulations side by side (lanes).
     """
 
     def _optimize_final_module(self) -> None:
@@ -586,20 +587,20 @@ class _LaneLibrary(_LeafLibrary):
 
 
 class _LoopCompiler(_LeafCompiler):
-    """Compiles a function with a long loop together with all functions that it calls.
+    """Compiles a function with a long loop, inlining all functions that it calls.
 
-    Calls within the loop would take much of its time. The technique is called inlining.
+    Calls inside the loop would otherwise take up much of its run time.
     """
 
     library_class = _LaneLibrary
 
 
 class _LaneCompiler(_LeafCompiler):
-    """Compiles a function that computes several simulations side by side, with SIMD.
+    """Compiles a function that computes several simulations side by side, using SIMD.
 
-    SIMD instructions process vectors. Each simulation has a lane, a position in the vectors.
-    The compiler may assume that the arguments do not overlap in memory. Without this
-    assumption, it would not use vector instructions.
+    Each simulation has a lane, which is a position in the vector registers. The compiler may
+    assume that the arguments do not overlap in memory, without which it would not use vector
+    instructions.
     """
 
     library_class = _LaneLibrary
@@ -607,12 +608,10 @@ class _LaneCompiler(_LeafCompiler):
 
 
 def _is_in_lanes(numba_type: Any) -> bool:
-    """Returns True if a value has numbers of several simulations side by side (lanes).
-
-    A lane is one position in the vector registers of the processor (SIMD).
+    """Returns True if a value holds data of several simulations side by side (lanes).
 
     Args:
-        numba_type: Numba's type of the value. A type of rows in lanes has the attribute
+        numba_type: Numba type of the value. Types of rows in lanes have the attribute
             `in_lanes`.
     """
     if isinstance(numba_type, types.Array):
@@ -624,14 +623,14 @@ def _is_in_lanes(numba_type: Any) -> bool:
 
 
 class _Leaf(CPUDispatcher):
-    """Replaces a numerical function (leaf) in all calls, and compiles it when it is called.
+    """Stands in for a numerical function (leaf), and compiles it when it is called.
 
-    The function is compiled for the types of its arguments (as Numba's dispatchers do). If it
-    was compiled as a part of another leaf, it is compiled again for calls from Python.
+    Like Numba's dispatchers, it compiles the function for the types of its arguments. A
+    function that was compiled as part of another leaf is compiled again for calls from Python.
 
     Attributes:
         choose_lane_form: Returns the implementation of the leaf for rows in lanes, see
-            `set_lane_form`. None if the implementation is the leaf itself.
+            `set_lane_form`. None if the leaf itself is the implementation.
     """
 
     _cache: Any
@@ -643,11 +642,11 @@ class _Leaf(CPUDispatcher):
         self._compiler._get_implementation = self._choose_implementation
 
     def _choose_implementation(self, arguments: tuple[Any, ...], _keywords: Any) -> Any:
-        """Returns the Python function to compile for given types of arguments.
+        """Returns the Python function to compile for given argument types.
 
         This is the function (leaf) itself, unless the arguments belong to several simulations
-        side by side (lanes) and the function has another implementation for these, see
-        `set_lane_form`. Numba calls this method.
+        side by side (lanes) and a different implementation was registered for these, see
+        `set_lane_form`. Called by Numba.
         """
         if self.choose_lane_form is not None and any(map(_is_in_lanes, arguments)):
             return self.choose_lane_form(arguments)
@@ -721,10 +720,10 @@ class _Leaf(CPUDispatcher):
             return compiled.entry_point
 
     def _load_or_compile_inner(self, argument_types: Any, return_type: Any) -> Any:
-        """Returns the function as LLVM code, which becomes a part of a compiled caller.
+        """Returns the function as LLVM code that becomes part of a compiled caller.
 
-        The code is loaded from the cache on disk if the cache contains it. Otherwise the
-        function is compiled, and its code is stored.
+        The code is loaded from the disk cache if possible. Otherwise, the function is compiled
+        and its code is stored.
         """
         # The code of a leaf for several runs side by side (lanes) is not stored. It contains
         # the functions that `set_lane_form` chose for one structure of runs. The types of the
@@ -775,11 +774,11 @@ def leaf(function: Callable[P, R]) -> Callable[P, R]:
 
 
 def _make_leaf(function: Callable[P, R], compiler: type[_LeafCompiler]) -> Callable[P, R]:
-    """Wraps a numerical function in an object that compiles it at its first call.
+    """Wraps a numerical function in an object that compiles it on its first call.
 
     Args:
         function: The Python function.
-        compiler: Class that compiles it.
+        compiler: Compiler class to use.
     """
     dispatcher = cast(Any, _Leaf)(
         function, targetoptions=dict(_LEAF_OPTIONS), pipeline_class=compiler
@@ -810,7 +809,7 @@ def lane_leaf(function: Callable[P, R]) -> Callable[P, R]:
 
 @cache
 def _make_unstored(function: Callable[..., Any]) -> Any:
-    """Wraps a function for several simulations side by side whose code is not stored on disk.
+    """Wraps a function for several simulations side by side, without caching its code on disk.
 
     It is compiled again in each process.
     """
@@ -888,11 +887,10 @@ def set_lane_form(
 
 
 class _NamedCache(_LeafCache):
-    """Stores the machine code of a closure on disk, under a name that the caller chooses.
+    """Caches the machine code of a closure on disk, under a name chosen by the caller.
 
-    A closure is a function that uses variables of an outer function. Numba would identify the
-    closure by the values of these variables. In this class, the name identifies everything that
-    the code depends on.
+    Numba would identify the closure by the values of the variables that it captures. In this
+    class, the name identifies everything that the code depends on.
     """
 
     def _index_key(self, signature: Any, codegen: Any) -> tuple[Any, Any]:

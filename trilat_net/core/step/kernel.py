@@ -54,14 +54,14 @@ _USER = int(Law.USER)
 def _place_arm(
     s: SiteRow, chain: RowArray | None, links: RowArray, updates_reference: bool
 ) -> None:
-    """Computes the positions of an arm's links, before its tracking errors are computed.
+    """Computes the positions of an arm's links, which the tracking errors require.
 
-    If `updates_reference` is True, the orientation that the end effector should follow is
-    computed too. The planar arm needs neither, because its equations contain the positions of
-    its links.
+    If `updates_reference` is True, this also computes the orientation that the end effector
+    should follow. The planar arm needs neither, because its equations contain the link
+    positions.
 
     Args:
-        s: State of the site (the process that runs the arm).
+        s: State of the site.
         chain: Data of the joints, one row per joint. None for the planar two-link arm.
         links: State of each link from another site, one row per link.
         updates_reference: True in a tick, False if the reference was restored from a record.
@@ -77,11 +77,11 @@ def _place_arm(
 def _update_errors(s: SiteRow, chain: RowArray | None) -> None:
     """Computes the tracking errors e, ed and r of an arm, and the dynamics that its law needs.
 
-    The error e is the position minus the reference, ed its derivative, and r the filtered
-    error. This is stage 4 of a control period.
+    e is the position minus the reference, ed its derivative, and r the filtered error. This is
+    stage 4 of a control period.
 
     Args:
-        s: State of the site (the process that runs the arm); changed.
+        s: State of the site; updated in place.
         chain: Data of the joints, one row per joint. None for the planar two-link arm.
     """
     if chain is None:
@@ -94,14 +94,14 @@ def _update_errors(s: SiteRow, chain: RowArray | None) -> None:
 def _advance_estimate(s: SiteRow, chain: RowArray | None, gain_s: float, Yr: Vector) -> None:
     """Advances the estimated parameters to theta_hat - gain_s Gamma Yr, within their bounds.
 
-    Gamma is the adaptation gain, and Yr the product Y' r of the regressor and the filtered
+    Gamma is the adaptation gain, and Yr is the product Y' r of the regressor and the filtered
     error.
 
     Args:
-        s: State of the site (the process that runs the arm).
+        s: State of the site.
         chain: Data of the joints, one row per joint. None for the planar two-link arm.
         gain_s: Duration of the step, s.
-        Yr: Y' r of Eq. (15), one number per parameter.
+        Yr: Y' r of Eq. (15), one entry per parameter.
     """
     if chain is None:
         two_link_stages.advance_estimate(s, gain_s, Yr)
@@ -124,19 +124,18 @@ def _update_estimate(k: int, s: SiteRow, chain: RowArray | None) -> None:
     """Updates the estimate of the arm's dynamic parameters (stage 5 of a tick).
 
     The estimate theta obeys Eq. (15) of the paper, dtheta/dt = -Gamma Y' r, where Gamma is the
-    matrix of the adaptation gains, Y the regressor and r the filtered error. The trapezoid rule
-    with the period h gives
+    matrix of adaptation gains, Y the regressor and r the filtered error. The trapezoidal rule
+    with period h gives
 
         theta_k = theta_{k-1} - h/2 Gamma (Y'r_{k-1} + Y'r_k)
 
     The rule is explicit, because Y' r does not depend on the estimate. The scheme DIGITAL
-    advances the estimate by the Euler rule at the end of the tick instead, in stage 8.
+    instead advances the estimate with the Euler method at the end of the tick, in stage 8.
 
     Args:
-        k: Number of the tick (control period).
-        s: State of the site (the process that runs the arm). `Yr` is Y' r of tick k.
-            `Yr_before` is that of tick k - 1, and is overwritten with the sum of both; stage 8
-            sets it anew.
+        k: Current tick.
+        s: State of the site. `Yr` is Y' r of tick k. `Yr_before` is that of tick k - 1, and is
+            overwritten with the sum of both until stage 8 sets it again.
         chain: Data of the joints, one row per joint. None for the planar two-link arm.
     """
     # `adapts` is evaluated last, because it is the costly condition.
@@ -188,15 +187,15 @@ def torque_stage(site: RowArray, chain: RowArray | None) -> None:
 
 @leaf
 def _put_known_gravity(s: SiteRow, chain: RowArray | None, torque: Array) -> None:
-    """Computes the torque that holds the arm, from its known or estimated parameters.
+    """Computes the torque that holds the arm, using its known or estimated parameters.
 
-    This torque holds an arm at rest if the control law cannot do so. The estimate is used for
+    This torque holds an arm at rest if the control law cannot. The estimate is used for
     adaptive laws, and for arms with unknown parameters.
 
     Args:
-        s: State of the site (the process that runs the arm).
+        s: State of the site.
         chain: Data of the joints, one row per joint. None for the planar two-link arm.
-        torque: Receives the torque, shape (n,), N m.
+        torque: Output array for the torque, shape (n,), N m.
     """
     is_model_unknown = s.law == _USER and s.theta_known == 0
     uses_estimate = s.law == _ADAPTIVE or is_model_unknown
@@ -248,15 +247,15 @@ def guard_torque(k: int, t_ns: int, s: SiteRow, chain: RowArray | None) -> None:
 
 @leaf
 def _write_record(s: SiteRow, row: Array) -> None:
-    """Writes the results of a control period as one vector of numbers, for the log.
+    """Writes the results of a control period as a single vector of floats, for the log.
 
-    The order is that of `Layout.columns`: motion, reference, torques, parameter estimate, and
-    the motion of the end effector if arms follow each other's end effectors. A number that is
-    not finite becomes 0, and the arm enters the mode DIVERGED.
+    The order is that of `Layout.columns`: motion, reference, torques, parameter estimate, and,
+    if arms follow each other's end effectors, the motion of the end effector. If a value is not
+    finite, it is replaced with 0, and the arm enters the mode DIVERGED.
 
     Args:
-        s: State of the site (the process that runs the arm).
-        row: Receives the numbers.
+        s: State of the site.
+        row: Output array for the values.
     """
     joints = s.joints
     shared = s.shared
@@ -295,15 +294,13 @@ def _write_record(s: SiteRow, row: Array) -> None:
 def _update_external_torque(
     t_s: float, s: SiteRow, chain: RowArray | None, actors: TorqueSourceRows, table: TorqueTable
 ) -> None:
-    """Computes the torque that operators and environments exert on the arm at a time.
-
-    An operator is a model of a person who moves the arm, and an environment a wall or a damper.
+    """Computes the torque that operators and environments exert on the arm at a given time.
 
     Args:
         t_s: Time since the start of the session, s.
-        s: State of the site (the process that runs the arm).
+        s: State of the site.
         chain: Data of the joints, one row per joint. None for the planar two-link arm.
-        actors: Operators and environments of the arm, one row for each.
+        actors: Operators and environments of the arm, one row each.
         table: Numerical data of all operators and environments, for example recorded torques.
     """
     if chain is None:
@@ -323,18 +320,18 @@ def _advance_arm(
     actors: TorqueSourceRows,
     table: TorqueTable,
 ) -> bool:
-    """Simulates the motion of the arm, joint angles and velocities, over one control period.
+    """Simulates the joint angles and velocities of the arm over one control period.
 
     Args:
-        t_s: Time at the beginning of the period, s since the start of the session.
-        h_s: The period, s.
-        s: State of the site (the process that runs the arm).
+        t_s: Time at the start of the period, s since the start of the session.
+        h_s: Length of the period, s.
+        s: State of the site.
         chain: Data of the joints, one row per joint. None for the planar two-link arm.
-        actors: Operators and environments of the arm, one row for each.
+        actors: Operators and environments of the arm, one row each.
         table: Numerical data of all operators and environments, for example recorded torques.
 
     Returns:
-        False, without a change, if the result is not finite.
+        True on success. False if the result is not finite, in which case nothing is changed.
     """
     if chain is None:
         return two_link_stages.advance_arm(t_s=t_s, h_s=h_s, s=s, actors=actors, table=table)
@@ -403,11 +400,11 @@ def _advance(
     """Simulates the arm until the next control period, and stores what that period needs.
 
     Args:
-        k: Number of the tick (control period).
+        k: Current tick.
         t_ns: Nominal time of the tick, ns since the start of the session.
-        s: State of the site (the process that runs the arm).
+        s: State of the site.
         chain: Data of the joints, one row per joint. None for the planar two-link arm.
-        actors: Operators and environments of the arm, one row for each.
+        actors: Operators and environments of the arm, one row each.
         table: Numerical data of all operators and environments, for example recorded torques.
     """
     h_s = 1.0 / s.rate_hz
@@ -444,11 +441,11 @@ def channel_of(channel: ChannelArrays | None, peer: int) -> ChannelArrays | None
 
 @leaf
 def _link_arrays(arrays: SiteArrays, peer: int) -> LinkArrays:
-    """Returns the arrays of the network link from one other arm, as views without copying.
+    """Returns the arrays of the network link from one peer, as views without copying.
 
-    `LinkArrays` describes the arrays of a link. Nearly all of them are rows of this arm's
-    arrays, one row per other arm (peer). `state` is a slice, because it must stay an array, of
-    shape (1,). `points` is the table of all links, in which each link has rows of its own.
+    The arrays are described in `LinkArrays`. Nearly all of them are rows of this arm's arrays,
+    one row per peer. `state` is a slice of shape (1,), because it must remain an array.
+    `points` is the table of all links, in which each link has its own rows.
 
     Args:
         arrays: Arrays of the site.
