@@ -45,24 +45,24 @@ _GLIDE = int(StaleAction.GLIDE)
 
 
 def _place_nothing(_chain: Any, _q: Any) -> None:
-    """Does nothing. This is the version of `place_joints` for one lane.
+    """Does nothing. This is the version of `place_joints` for a single lane.
 
-    The frames of the joints of all runs have been computed before, eight runs at a time.
+    The joint frames of all runs have already been computed, eight runs at a time.
     """
 
 
 def _put_no_gravity(_s: Any, _chain: Any, _q: Any, _torque: Any) -> None:
-    """Does nothing. This is the version of `put_gravity_torque` for one lane.
+    """Does nothing. This is the version of `put_gravity_torque` for a single lane.
 
-    The torques of all runs have been computed before, eight runs at a time.
+    The torques of all runs have already been computed, eight runs at a time.
     """
 
 
 def _choose_place(argument_types: tuple[Any, ...]) -> Callable[..., None]:
     """Returns the version of `place_joints` for a single simulation or for eight at once.
 
-    `place_joints` computes the positions of the joints of an arm. Numba calls this function
-    with the types of the arguments, which tell the number of simulations.
+    `place_joints` computes the positions of an arm's joints. Numba calls this function with the
+    argument types, which depend on the number of simulations.
     """
     dispatcher: Any = place_joints
     is_one_lane = isinstance(argument_types[0], RowsInLane)
@@ -72,7 +72,7 @@ def _choose_place(argument_types: tuple[Any, ...]) -> Callable[..., None]:
 def _choose_gravity(argument_types: tuple[Any, ...]) -> Callable[..., None]:
     """Returns the version of `put_gravity_torque` for a single simulation or for eight at once.
 
-    Numba calls this function with the types of the arguments, which tell the number of
+    Numba calls this function with the argument types, which depend on the number of
     simulations.
     """
     dispatcher: Any = chain_stages.put_gravity_torque
@@ -81,11 +81,11 @@ def _choose_gravity(argument_types: tuple[Any, ...]) -> Callable[..., None]:
 
 
 def _skip(_s: Any) -> None:
-    """Version of a function with one argument that does nothing."""
+    """Version of a one-argument function that does nothing."""
 
 
 def _skip_two(_s: Any, _rows: Any) -> None:
-    """Version of a function with two arguments that does nothing."""
+    """Version of a two-argument function that does nothing."""
 
 
 def _skip_task_torque(_s: Any, _gains: Any, _values: Any, _factor: float, _torque: Any) -> None:
@@ -93,13 +93,13 @@ def _skip_task_torque(_s: Any, _gains: Any, _values: Any, _factor: float, _torqu
 
 
 def _skip_without_task(function: Any, skipped: Callable[..., None]) -> None:
-    """Lets Numba leave out a function of task space if the runs have no task space.
+    """Makes Numba omit a task-space function if the runs do not use task space.
 
-    Without this, Numba would compile the function, because it compiles all branches. Functions
-    of task space are called for eight runs only.
+    Otherwise, Numba would compile the function, because it compiles all branches. Task-space
+    functions are only called for eight runs at once.
 
     Args:
-        function: The function, whose first argument is the state of a site (arm controller).
+        function: The function, whose first argument is the state of a site.
         skipped: A function with the same arguments that does nothing.
     """
 
@@ -114,8 +114,8 @@ def _skip_without_task(function: Any, skipped: Callable[..., None]) -> None:
 def _choose_model(argument_types: tuple[Any, ...]) -> Callable[..., None]:
     """Returns the compiled version of `update_model`, which computes the dynamics of an arm.
 
-    Only users' control laws need the model. It is computed for eight simulated runs at a time,
-    by vector instructions, so that the version for a single run does nothing.
+    The model is only needed by users' control laws. It is computed for eight runs at a time,
+    with vector instructions, so the version for a single run does nothing.
     """
     dispatcher: Any = chain_stages.update_model
     site = argument_types[0]

@@ -56,9 +56,9 @@ _UNIFORM = int(DelayKind.UNIFORM)
 class _DelayNumbers(NamedTuple):
     """Parameters of a distribution of network delays, for the function `draw_delay_us`.
 
-    The delays of successive samples (sent states) are independent. The kind of the distribution
-    may be a constant that the compiler knows. The compiler then removes the branches for other
-    kinds. See `DelayKind` for the meaning of the parameters.
+    The delays of successive samples are independent. The type of distribution may be a constant
+    known to the compiler, which then removes the branches for other types. See `DelayKind` for
+    the meaning of the parameters.
     """
 
     kind: int
@@ -156,8 +156,8 @@ class LinkStates(NamedTuple):
 def _constant_delay_ns(model: Row) -> int:
     """Returns the delay of a simulated link with a constant delay, in ns.
 
-    The delay is the time from the stamp of a sample (sent state) to its use. It is at least 1
-    ns, because a sample is never used at the time at which it was sent.
+    The delay is the time from sending a sample to its use. It is at least 1 ns, because a
+    sample is never used at the time at which it was sent.
     """
     return int(max(max(clamp_delay_us(model.location), model.playout_us) * 1000, 1))
 
@@ -177,19 +177,19 @@ def _is_constant(link: LinkRow, model: Row) -> bool:
 def _use_after_constant_delay(
     first: int, count: int, rate_hz: int, model: Row, used: IntArray
 ) -> int:
-    """Finds the received state that an arm uses in each tick, if the delay is constant.
+    """Finds which received sample an arm uses in each tick, if the delay is constant.
 
-    Sample m is the state that the sender computed in tick (control period) m. It is used from
-    tick m + w on. The number w of ticks is the same for all samples if the period of the
-    control loop is a whole number of nanoseconds. This function must only be called in this
-    case.
+    Sample m, computed by the sender in tick m, is used from tick m + w on. The number of ticks
+    w is the same for all samples if the period of the control loop is an integer number of
+    nanoseconds. This function must only be called in that case.
 
     Args:
         first: First tick of a block of ticks.
         count: Number of ticks in the block.
         rate_hz: Tick rate of both sites, Hz.
         model: Model of the link.
-        used: Receives the sample in use, one entry per tick. -1 before the first sample.
+        used: Output array for the sample in use, one entry per tick. -1 before the first
+            sample.
 
     Returns:
         The sample in use at the end of the block.
@@ -204,7 +204,7 @@ def _use_after_constant_delay(
 def _draw_uniform_delays(
     first: int, count: int, key: DrawKey, location: float, scale: float, delays_us: IntArray
 ) -> None:
-    """Draws uniformly distributed network delays for several consecutive samples (sent states).
+    """Draws uniformly distributed network delays for several consecutive samples.
 
     Args:
         first: Index of the first sample.
@@ -212,7 +212,7 @@ def _draw_uniform_delays(
         key: Key of the link, which makes its random numbers differ from those of other links.
         location: Mean delay, us.
         scale: Largest deviation from the mean, us.
-        delays_us: Receives the delays, us, shape (count,).
+        delays_us: Output array for the delays, us, shape (count,).
     """
     numbers = _DelayNumbers(_UNIFORM, location, scale, 0.0, 0.0)
     for index in range(count):
@@ -225,10 +225,11 @@ def _draw_losses(first: int, count: int, key: DrawKey, uniform_numbers: Array) -
     """Draws random numbers that decide which of several messages a simulated network loses.
 
     Args:
-        first: Index of the first sample (sent state).
+        first: Index of the first sample.
         count: Number of samples.
         key: Key of the link, which makes its random numbers differ from those of other links.
-        uniform_numbers: Receives two numbers between 0 and 1 per sample, shape (2, count).
+        uniform_numbers: Output array for two numbers between 0 and 1 per sample, shape (2,
+            count).
     """
     for index in range(count):
         u, v = uniforms(key, first + index, LOSS, 0)
@@ -281,10 +282,9 @@ def _release_samples(
     states: LinkStates,
     draws: DrawAddresses,
 ) -> None:
-    """Computes the ticks at which messages may be used, for one delay model of a link.
+    """Computes in which ticks samples may first be used, for one delay model of a link.
 
-    The random numbers of all messages (samples) are drawn first, in loops that use vector
-    instructions. A tick is a control period of the receiver.
+    The random numbers of all samples are drawn first, in loops that use vector instructions.
 
     Args:
         first: Index of the first sample.
@@ -292,11 +292,11 @@ def _release_samples(
         rate_hz: Tick rate of the receiver, Hz.
         least_release: First tick that can still use a sample.
         fresh: True if the first sample is also the first sample of the model.
-        stamps_ns: Stamps of the samples, ns since the epoch.
-        link: Row of the link; changed.
+        stamps_ns: Sending times of the samples, ns since the epoch.
+        link: Row of the link; updated in place.
         model: Model of the link.
         points: Traces and outages.
-        releases: Newest sample that each tick releases, a ring buffer; changed.
+        releases: Newest sample that each tick releases, a ring buffer; updated in place.
         states: Provides buffers for the random numbers.
         draws: Functions that draw them.
     """
@@ -370,21 +370,20 @@ def _release_all_samples(
     states: LinkStates,
     draws: DrawAddresses,
 ) -> None:
-    """Computes the ticks at which the messages of a simulated network link may be used.
+    """Computes in which ticks the samples of a simulated network link may first be used.
 
-    Each message (sample) is delayed by the delay model in force at the time of sending. A tick
-    is a control period of the receiver.
+    Each sample is delayed by the delay model in force when it was sent.
 
     Args:
-        first_sample: Index of the first sample, whose stamp is `states.stamps_ns[0]`.
+        first_sample: Index of the first sample, whose sending time is `states.stamps_ns[0]`.
         end_sample: Index after that of the last sample.
         rate_hz: Tick rate of the receiver, Hz.
         least_release: First tick that can still use a sample.
-        link: Row of the link; changed.
+        link: Row of the link; updated in place.
         models: Models of the link.
         points: Traces and outages.
-        releases: Newest sample that each tick releases, a ring buffer; changed.
-        states: Contains the stamps, and provides buffers for random numbers.
+        releases: Newest sample that each tick releases, a ring buffer; updated in place.
+        states: Contains the sending times, and provides buffers for random numbers.
         draws: Functions that draw random numbers.
     """
     sample = first_sample
@@ -419,16 +418,17 @@ def _release_all_samples(
 def _use_released_samples(
     first: int, count: int, newest: int, releases: IntArray, used: IntArray
 ) -> int:
-    """Finds the newest received state that may be used in each control period of a block.
+    """Finds the newest received sample that may be used in each tick of a block.
 
-    The states (samples) have been released before, each for a control period (tick).
+    The samples have already been released, each for a certain tick.
 
     Args:
         first: First tick of the block.
         count: Number of ticks.
         newest: Sample in use before the block, or -1.
-        releases: Newest sample that each tick releases, a ring buffer; the ticks are emptied.
-        used: Receives the sample in use, one entry per tick.
+        releases: Newest sample that each tick releases, a ring buffer. The entries of these
+            ticks are cleared.
+        used: Output array for the sample in use, one entry per tick.
 
     Returns:
         The sample in use at the end of the block.
@@ -456,23 +456,20 @@ def _use_samples_of_link(
     draws: DrawAddresses,
     used: IntArray,
 ) -> int:
-    """Finds the received state (sample) that an arm uses in each tick, on a link of any kind.
-
-    The link is a simulated network connection with delays and losses. A tick is a control
-    period.
+    """Finds which received sample an arm uses in each tick, on a link with any delay model.
 
     Args:
         first: First tick of the block.
         count: Number of ticks.
         rate_hz: Tick rate of both sites, Hz.
-        link: Row of the link; changed.
+        link: Row of the link; updated in place.
         models: Models of the link.
         points: Traces and outages.
-        releases: Newest sample that each tick releases, a ring buffer; changed.
+        releases: Newest sample that each tick releases, a ring buffer; updated in place.
         newest: Sample in use before the block, or -1.
         states: Provides buffers for random numbers.
         draws: Functions that draw random numbers.
-        used: Receives the sample in use, one entry per tick.
+        used: Output array for the sample in use, one entry per tick.
 
     Returns:
         The sample in use at the end of the block.
@@ -562,18 +559,18 @@ def use_samples(
 def _use_after_delay(
     count: int, delay_ns: int, rate_hz: int, newest: int, states: LinkStates, used: IntArray
 ) -> int:
-    """Finds the received state that an arm uses if its peer has another control rate.
+    """Finds which received sample an arm uses in each tick if its peer has another tick rate.
 
     The delay of the network link is constant.
 
     Args:
         count: Number of ticks.
-        delay_ns: Time from the stamp of a sample to its use, ns.
+        delay_ns: Time from sending a sample to its use, ns.
         rate_hz: Tick rate of the peer, Hz.
         newest: Sample in use before the block, or -1.
-        states: Contains for each tick its time and the number of samples that the peer has
+        states: Contains the time of each tick, and the number of samples that the peer has
             sent.
-        used: Receives the sample in use, one entry per tick.
+        used: Output array for the sample in use, one entry per tick.
 
     Returns:
         The sample in use at the end of the block.

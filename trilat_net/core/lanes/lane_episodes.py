@@ -45,9 +45,9 @@ def _use_samples_of_lanes(
     draws: DrawAddresses,
     used: IntArray,
 ) -> int:
-    """Finds the received states that the arms of all runs use in their next control periods.
+    """Finds which received samples the arms of all runs use in their next control periods.
 
-    The runs are simulated side by side (in lanes), and each run is at its own control period.
+    The runs are simulated side by side (in lanes), each at its own tick.
 
     Args:
         runs: Number of runs.
@@ -55,9 +55,9 @@ def _use_samples_of_lanes(
         count: Number of ticks.
         rate_hz: Tick rate of all sites, Hz.
         skipped: -1 for lanes that are advanced, shape (LANES,).
-        states: State of the links of the runs; changed.
+        states: State of the links of the runs; updated in place.
         draws: Functions that draw random numbers.
-        used: Written, see `use_samples`.
+        used: Output array, see `use_samples`.
 
     Returns:
         The largest age of a sample in use, ticks.
@@ -96,14 +96,14 @@ def _put_actions(
 ) -> None:
     """Copies the actions of all programs in a tick to the simulated operators of the arms.
 
-    In each of several runs, one program moves an arm, like an operator. The runs are stored
-    side by side, each in a lane.
+    In each of several runs, one program moves an arm in place of an operator. The runs are
+    stored side by side, one per lane.
 
     Args:
-        actions: Five numbers per action (grip and target), shape (5, LANES).
+        actions: Five values per action (grip and target), shape (5, LANES).
         hand_row: Index of the operator's row in `actors`.
-        columns: Index of each number of an action within this row, shape (5,).
-        actors: Rows of operators and environments, viewed as floats, shape (rows, numbers of a
+        columns: Index of each value of an action within this row, shape (5,).
+        actors: Rows of operators and environments, viewed as floats, shape (rows, values per
             row, LANES).
         runs: Number of runs.
     """
@@ -148,7 +148,7 @@ def _run_span(
         rate_hz: Tick rate of all sites, Hz.
         runs: Number of runs.
         settled_rad: Position error below which an arm counts as settled, rad.
-        pages: Number of latest states of each site, a power of two.
+        pages: Number of latest states stored per site, a power of two.
         mode_word: Index of the mode among the words of a site's row.
         addresses: Addresses of the code, see `run_block`.
         tables: Addresses of the tables, see `run_block`.
@@ -157,15 +157,15 @@ def _run_span(
         actions: Actions of the programs, shape (ticks, 5, LANES).
         hand_row: Row of the operator that the programs replace.
         columns: Words of an action in this row.
-        actors: Rows of operators and environments; changed.
+        actors: Rows of operators and environments; updated in place.
         states: The latest states of all sites, see `advance_site`.
         used: Samples in use, see `use_samples`.
         received_columns: Indices of the values that laws receive, shape (N, P, C).
         table: Tables of the operators and environments.
         latest: Zeros, shape (3, N), see `keep_ended_runs`: there is one bucket and one record.
         peaks: Buffer for the peaks of all sites in one bucket, which are not used.
-        present: The numbers of all runs.
-        ended: Numbers of the runs in which an arm left its limits; changed.
+        present: Current values of all runs.
+        ended: Values of the runs in which an arm left its limits; updated in place.
 
     Returns:
         The number of runs in which no arm has left its limits.
@@ -246,8 +246,7 @@ class LaneEpisodes(LaneRun):
         """Allocates the arrays for several episodes that are simulated side by side.
 
         An episode is one simulated run in which a program, for example a learning policy, moves
-        an arm. All places (lanes) initially hold copies of the same run, until `load` replaces
-        them.
+        an arm. All lanes initially hold copies of the same run, until `load` replaces them.
         """
         super().__init__([run] * count)
         self.structure = self.find_structure(run)
@@ -346,12 +345,12 @@ class LaneEpisodes(LaneRun):
     def _load_links(self, lane: int, run: CompiledRun) -> None:
         """Copies the state of a run's simulated network links into a lane.
 
-        A lane is the place of one of the runs that are simulated together. The arrays that all
-        lanes share are enlarged if they are too small for the delay models of this run.
+        The arrays shared by all lanes are enlarged if they are too small for the delay models
+        of this run.
 
         Args:
             lane: Index of the lane.
-            run: The run before its first tick (control period).
+            run: The run before its first tick.
         """
         tables = run.memory.tables
         links = self._deliveries
@@ -433,7 +432,7 @@ class LaneEpisodes(LaneRun):
         self._step_span(count, idle)
 
     def _step_span(self, count: int, idle: IntArray) -> None:
-        """Simulates all runs for several control periods, with the actions of their programs.
+        """Simulates all runs for several control periods, applying their programs' actions.
 
         Args:
             count: Number of ticks.
@@ -485,10 +484,9 @@ class LaneEpisodes(LaneRun):
         self.ticks[idle == 0] += count
 
     def _keep_states(self, ticks: int) -> None:
-        """Enlarges the memory for past states of the sites (arm controllers), if necessary.
+        """Enlarges the memory for past states of the sites, if necessary.
 
-        Each lane (position of a run among the runs that are simulated together) has a present
-        tick (control period) of its own.
+        Each lane has its own current tick.
         """
         while self._pages <= ticks:
             old_pages = self._pages
@@ -539,13 +537,13 @@ class LaneEpisodes(LaneRun):
         name: str,
         dtype: np.dtype[Any],
     ) -> NDArray[Any]:
-        """Returns one field of the state of all sites (arm controllers) or links, for each run.
+        """Returns one field of the state of all sites or links, for each run.
 
-        Several runs are stored side by side, each in a lane. The state of a run that has ended
-        is read from `ended`, because its lane no longer contains valid numbers.
+        For a run that has ended, the field is read from `ended`, because its lane no longer
+        contains valid values.
 
         Args:
-            present: Present rows of all lanes, shape (rows, values per row, LANES).
+            present: Current rows of all lanes, shape (rows, values per row, LANES).
             ended: The same rows at the end of each run that has ended.
             layout: Data type of a row.
             name: Name of the field.

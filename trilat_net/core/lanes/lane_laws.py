@@ -36,7 +36,7 @@ from .lane_rows import Constants, LaneTable, RowsInLane, offset_rows
 
 _DIVERGED = int(Mode.DIVERGED)
 NO_LAW = "none"
-"""Name of the law of a site whose law is a part of the kernel."""
+"""Law name of a site whose law is part of the kernel."""
 
 
 class LaneLaw(NamedTuple):
@@ -100,7 +100,7 @@ class _LawMethod(NamedTuple):
 
 
 _METHODS: dict[str, _LawMethod] = {}
-"""Methods of laws by the names of the laws."""
+"""Methods of laws, keyed by the name of the law."""
 _user_law_numbers = count()
 
 
@@ -108,8 +108,8 @@ _user_law_numbers = count()
 def _name_law(torque: Callable[..., Any], form: LawForm) -> tuple[str, bool]:
     """Returns a name that identifies the code of a law, and whether it may be stored on disk.
 
-    Compiled code is stored under the name. Code of users is not stored, because it may use
-    other files, whose changes would not be noticed.
+    Compiled code is stored under this name. User code is not stored, because it may use other
+    files, and changes to these would go unnoticed.
     """
     sources = digest_sibling_sources(torque)
     text = f"{sources} {torque.__module__} {torque.__qualname__} {form}"
@@ -146,7 +146,7 @@ class LawCode(types.Type):
 
 @register_model(LawCode)
 class _CodeModel(models.PrimitiveModel):
-    """Represents a `LawCode` in machine code by a pointer that is not used."""
+    """Represents a `LawCode` in machine code as an unused pointer."""
 
     def __init__(self, manager: Any, numba_type: Any) -> None:
         super().__init__(manager, numba_type, ir.IntType(8).as_pointer())
@@ -155,16 +155,16 @@ class _CodeModel(models.PrimitiveModel):
 def _make_view(
     dtype: np.dtype[Any] | None, rows: int, first_word: int, constants: Constants = ()
 ) -> Any:
-    """Returns a compiled function that views a vector of plain numbers as named fields.
+    """Returns a compiled function that views an unstructured vector as named fields.
 
-    A control law declares the names of its gains and of the numbers that it sends. The arrays
-    of the simulation store them as plain numbers. The function converts no numbers. It only
-    views the same memory with another type.
+    A control law declares the names of its gains and of the values that it sends, while the
+    arrays of the simulation store them without names. The function converts nothing; it only
+    views the same memory as another type.
 
     Args:
-        dtype: Names and types of the fields. None if there are no such numbers.
+        dtype: Names and types of the fields. None if there are no such values.
         rows: Number of rows, each of which has these fields.
-        first_word: Index of the number at which the first row begins.
+        first_word: Index of the value at which the first row starts.
         constants: Names and values of fields that are equal in all runs.
     """
     if dtype is None:
@@ -257,8 +257,8 @@ def _compute_nothing(
 def _choose_law(argument_types: tuple[Any, ...]) -> Callable[..., None]:
     """Returns the version of `compute_law` that calls the control law of a site.
 
-    The compiler calls this function with the types of the arguments, the first of which names
-    the law.
+    The compiler calls this function with the argument types, the first of which identifies the
+    law.
     """
     code = argument_types[0]
     if code.law_name == NO_LAW:

@@ -39,13 +39,13 @@ from numba.np import arrayobj
 from numpy.typing import NDArray
 
 LANES = 64
-"""Number of lanes, the largest number of runs that are computed together.
+"""Number of lanes, which is the largest number of runs that are computed together.
 
-A vector register holds at most eight numbers. With several registers per quantity, the
-processor computes one while it waits for the others.
+A vector register holds at most eight values. With several registers per quantity, the processor
+can compute one while waiting for the others.
 """
 _WORD = 8
-"""Size of each number of a row, bytes."""
+"""Size of each value in a row, bytes."""
 _ALIGNMENT = 64
 """Size of a vector register and of a cache line, bytes."""
 _NUMBA_KINDS = {"i8": types.int64, "f8": types.float64, "u8": types.uint64}
@@ -119,7 +119,7 @@ class LaneTable(types.Type):
 
 
 class _PartOfTable(LaneTable):
-    """Numba's type of some rows of a `LaneTable` in one lane."""
+    """Numba type of some rows of a `LaneTable` in one lane."""
 
     def __init__(self, table: LaneTable, constants: tuple[Constants, ...]) -> None:
         self.fields = table.fields
@@ -193,7 +193,7 @@ class LaneNumbers(types.Type):
 @register_model(LaneNumbers)
 @register_model(LaneTable)
 class _TableModel(models.PrimitiveModel):
-    """Represents a `LaneTable` in machine code by a pointer."""
+    """Represents a `LaneTable` in machine code as a pointer."""
 
     def __init__(self, manager: Any, numba_type: Any) -> None:
         super().__init__(manager, numba_type, ir.IntType(8).as_pointer())
@@ -202,7 +202,7 @@ class _TableModel(models.PrimitiveModel):
 @register_model(RowsInLane)
 @register_model(LaneRow)
 class _RowModel(models.StructModel):
-    """Represents rows in a lane in machine code by a pointer and the lane's index."""
+    """Represents rows in a lane in machine code as a pointer and the index of the lane."""
 
     def __init__(self, manager: Any, numba_type: Any) -> None:
         members = [("pointer", types.voidptr), ("lane", types.intp)]
@@ -210,7 +210,7 @@ class _RowModel(models.StructModel):
 
 
 def _offset_pointer(builder: Any, pointer: Any, offset: Any) -> Any:
-    """Generates LLVM code for an address that is a number of bytes after a pointer."""
+    """Generates LLVM code that adds a byte offset to a pointer."""
     return builder.gep(pointer, [offset], source_etype=ir.IntType(8))
 
 
@@ -258,7 +258,7 @@ class _RowsAttributes(AttributeTemplate):
 def _find_number(
     context: Any, builder: Any, row_type: LaneRow, row_value: Any, field: LaneField
 ) -> Any:
-    """Generates LLVM code for the address of a field's first number in a lane."""
+    """Generates LLVM code for the address of a field's first value in a lane."""
     row = cgutils.create_struct_proxy(row_type)(context, builder, value=row_value)
     word = row.lane.type
     in_lane = builder.mul(row.lane, ir.Constant(word, _WORD))
@@ -315,14 +315,14 @@ def _read_field(context: Any, builder: Any, row_type: LaneRow, row: Any, name: s
     """Generates LLVM code that reads a field of a record of one simulation, as `row.field`.
 
     Numba calls this function when it compiles such an expression. Several runs are simulated
-    side by side, each in one lane. The result is a constant if the field is equal in all lanes,
-    a number if the field is a single number, and otherwise an array whose numbers are `LANES`
-    numbers apart in memory.
+    side by side, with one run per lane. The result is a constant if the field is equal in all
+    lanes, otherwise a scalar for a scalar field, and an array for any other field. The elements
+    of this array are `LANES` values apart in memory.
 
     Args:
-        context: Numba's context of the compilation.
-        builder: Appends LLVM instructions.
-        row_type: Numba's type of the row.
+        context: Numba's compilation context.
+        builder: Builder that appends LLVM instructions.
+        row_type: Numba type of the row.
         row: The row, as an LLVM value.
         name: Name of the field.
     """
@@ -341,7 +341,7 @@ def _read_field(context: Any, builder: Any, row_type: LaneRow, row: Any, name: s
 
 @lower_setattr_generic(LaneRow)
 def _write_field(context: Any, builder: Any, sig: Any, args: Any, name: str) -> None:
-    """Generates LLVM code for writing a number to `row.field`."""
+    """Generates LLVM code that writes a value to `row.field`."""
     row_type, value_type = sig.args
     row, value = args
     field = row_type.find_field(name)
@@ -368,12 +368,12 @@ def _find_row(
     """Generates LLVM code for `rows[index]`: one record of one of several simulations.
 
     Args:
-        context: Numba's context of the compilation.
-        builder: Appends LLVM instructions.
-        rows_type: Numba's type of the rows.
+        context: Numba's compilation context.
+        builder: Builder that appends LLVM instructions.
+        rows_type: Numba type of the rows.
         rows_value: The rows, as an LLVM value.
         index: The index, as an LLVM value.
-        row_type: Numba's type of the row.
+        row_type: Numba type of the row.
     """
     rows = cgutils.create_struct_proxy(rows_type)(context, builder, value=rows_value)
     row = cgutils.create_struct_proxy(row_type)(context, builder)
@@ -385,7 +385,7 @@ def _find_row(
 
 @infer_global(operator.getitem)
 class _RowsItem(AbstractTemplate):
-    """Tells Numba the type of `rows[index]`, if all rows have the same constants."""
+    """Tells Numba the type of `rows[index]` if all rows have the same constants."""
 
     def generic(self, args: Any, _keywords: Any) -> Any:
         rows, index = args
@@ -436,7 +436,7 @@ def _select_row(_context: Any, rows: Any, index: Any) -> Any:
     """Generates LLVM code for `rows[index]` with a constant index.
 
     With a constant index, the compiler knows the constant fields of this record (row), such as
-    the kind of an operator, and can remove the branches for other kinds.
+    the type of an operator, and can remove the branches for other types.
     """
     if not isinstance(index, types.IntegerLiteral):
         return None
@@ -452,10 +452,10 @@ def _select_row(_context: Any, rows: Any, index: Any) -> Any:
 
 @intrinsic
 def _number_of(_context: Any, numbers: Any, _lane: Any) -> Any:
-    """Generates LLVM code for an integer of one lane, such as its present tick.
+    """Generates LLVM code for an integer of one lane, such as its current tick.
 
-    The first argument is an array with one integer per lane, or a single integer that is equal
-    in all lanes.
+    The first argument is either an array with one integer per lane, or a single integer shared
+    by all lanes.
     """
 
     def generate(context: Any, builder: Any, sig: Any, args: Any) -> Any:
@@ -474,7 +474,7 @@ def _number_of(_context: Any, numbers: Any, _lane: Any) -> Any:
 
 @intrinsic
 def _pointer_to(_context: Any, address: Any) -> Any:
-    """Generates LLVM code for the conversion of an address to a pointer."""
+    """Generates LLVM code that converts an address to a pointer."""
 
     def generate(_target: Any, builder: Any, _signature: Any, args: Any) -> Any:
         return builder.inttoptr(args[0], ir.IntType(8).as_pointer())
@@ -486,10 +486,12 @@ def _pointer_to(_context: Any, address: Any) -> Any:
 in_lane: Any = _in_lane
 """Returns the rows of a table in one lane: `in_lane(table, lane)`."""
 select_row: Any = _select_row
-"""Returns a row with its own constants: `select_row(rows, index)`. The index is a constant."""
+"""Returns a row with its own constants: `select_row(rows, index)`, for a constant index."""
 number_of: Any = _number_of
-"""Returns the integer of a lane: `number_of(numbers, lane)`. The numbers are `LaneNumbers`, an
-array with one entry per lane, or one integer that all lanes share.
+"""Returns the integer of a lane: `number_of(numbers, lane)`.
+
+`numbers` is either a `LaneNumbers` array with one entry per lane, or an integer shared by all
+lanes.
 """
 pointer_to: Any = _pointer_to
 """Converts the address of a table to a pointer, which represents the table in calls."""

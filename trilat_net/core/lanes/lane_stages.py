@@ -66,16 +66,16 @@ def _no_torque(
     _table: TorqueTable,
     _sampled: int,
 ) -> SourceTorque:
-    """Returns no torque: `torque_on_arm` of an arm without operators and environments."""
+    """Returns zero torque: `torque_on_arm` of an arm without operators and environments."""
     return NO_TORQUE
 
 
 def _unroll_sources(count: int) -> Callable[..., SourceTorque]:
     """Returns a function that adds the torques of a fixed number of operators and environments.
 
-    It replaces the loop in `torque_on_arm`. The compiler knows the kind of each operator and
-    environment only if its index is a constant and not the variable of a loop. Therefore the
-    loop is unrolled: the function for n torque sources calls the function for n - 1 torque
+    It replaces the loop in `torque_on_arm`. The compiler knows the type of each operator and
+    environment only if its index is a constant instead of a loop variable. The loop is
+    therefore unrolled: the function for n torque sources calls the function for n - 1 torque
     sources.
 
     Args:
@@ -105,7 +105,7 @@ def _unroll_sources(count: int) -> Callable[..., SourceTorque]:
 def _choose_form(argument_types: tuple[Any, ...]) -> Callable[..., SourceTorque]:
     """Returns the version of `torque_on_arm` for the number of operators and environments.
 
-    The compiler calls this function with the types of the arguments.
+    The compiler calls this function with the argument types.
     """
     actors = argument_types[4]
     return _unroll_sources(actors.count)
@@ -126,16 +126,16 @@ def _advance_stage(
 ) -> Any:
     """Evaluates one stage of the Runge-Kutta step of a planar arm in one of several runs.
 
-    The function calls `two_link_stages.advance_stage` with the numbers of the run.
+    Calls `two_link_stages.advance_stage` with the values of the run.
 
     Args:
-        t_s: Time at the beginning of the period, s.
-        ahead_s: Time of the stage after the beginning of the period, s.
-        s: State of the site, the arm with its controller.
+        t_s: Time at the start of the period, s.
+        ahead_s: Time of the stage after the start of the period, s.
+        s: State of the site.
         qd_before: Joint velocities at the previous stage, rad/s.
         qdd_before: Joint accelerations at the previous stage, rad/s^2.
         actors: Rows of the operators and environments that act on the arm.
-        table: Tables of numbers to which these rows refer.
+        table: Data tables to which these rows refer.
     """
     return two_link_stages.advance_stage(
         t_s=t_s,
@@ -644,10 +644,10 @@ def _apply_recorded_hand(
 
     Args:
         i: Index of the site.
-        k: The tick.
+        k: Current tick.
         lanes: Number of lanes.
         hands: Actions of the operators.
-        actors: Rows of operators and environments, seen as floats; written.
+        actors: Rows of operators and environments, viewed as floats; updated in place.
     """
     if hands.rows[i] < 0 or k >= hands.actions.shape[1]:
         return

@@ -27,9 +27,9 @@ SITE_CONSTANTS: tuple[str, ...] = (
 )
 """Fields of a site's row that are equal in runs of one structure and constant in each run."""
 _CHANGED_BY_GLIDE = ("reason", "regrouped")
-"""Fields among them that are not constant under the rule `glide`."""
+"""Those of these fields that are not constant under the rule `glide`."""
 _ACTOR_CONSTANTS = ("kind", "sampled", "table_first", "table_count")
-"""Fields of the row of an operator or environment that are equal in runs of one structure."""
+"""Fields in the row of an operator or environment that are equal in runs of one structure."""
 
 
 class SiteStructure(NamedTuple):
@@ -112,12 +112,12 @@ class RunStructure(NamedTuple):
 
 
 def _read_constants(row: np.void, names: tuple[str, ...]) -> Constants:
-    """Returns the values of integer fields of a row, with their names."""
+    """Returns integer fields of a row as pairs of name and value."""
     return tuple((name, int(row[name])) for name in names)
 
 
 def _list_actors(actors: Any) -> list[Any]:
-    """Returns the rows of a site's torque sources, without rows that only fill the array."""
+    """Returns the rows of a site's torque sources, excluding rows that only pad the array."""
     return [row for row in actors if row["sampled"] in (0, 1)]
 
 

@@ -19,14 +19,14 @@ from .lane_run import LaneRun, explain_uncompilable, has_lane_code
 from .lane_structure import RunStructure, find_obstacle
 
 LEAST_RUNS = 4
-"""Number of runs from which lanes are faster than one run after the other."""
+"""Number of runs from which lanes are faster than running them one by one."""
 
 
 LANE_SITE_TICKS = 100_000_000
 """Number of site ticks from which a study compiles the code for several runs side by side.
 
-The compilation takes about ten seconds per kind of site. The code then saves about 0.4 us per
-site tick.
+Compilation takes about ten seconds per type of site. The code then saves about 0.4 us per site
+tick.
 """
 
 

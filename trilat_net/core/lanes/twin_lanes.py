@@ -79,8 +79,8 @@ class TwinLanes(LaneRun):
     ) -> None:
         """Copies the initial state of a run into the arrays of the run and its twins.
 
-        The twins are copies that are later displaced slightly, to measure whether the
-        difference grows, as it does in an unstable system.
+        The twins will later be displaced slightly. If the system is unstable, their difference
+        from the run grows.
         """
         super().__init__([run], 1 << kept.bit_length())
         self._count = count
@@ -123,7 +123,7 @@ class TwinLanes(LaneRun):
         return [_LaneTwin(self, lane) for lane in range(self._count)]
 
     def _use_samples(self, end: IntArray) -> int:
-        """Computes the samples in use in a block of ticks, which are equal for all runs."""
+        """Computes the samples in use in a block of ticks, which are the same for all runs."""
         if self._feed.first.shape[2] == 0:
             age = super()._use_samples(end)
         else:
@@ -176,8 +176,8 @@ class TwinLanes(LaneRun):
 class _LaneTwin:
     """A run or a slightly displaced copy of it (twin), simulated side by side with others.
 
-    The class has the methods of `CompiledRun` that are needed to measure the growth of the
-    displacement, so callers need not know how the runs are simulated.
+    It provides the methods of `CompiledRun` that are needed to measure how the displacement
+    grows. Callers therefore do not need to know how the runs are simulated.
 
     Args:
         lanes: The run and its twins.
@@ -237,23 +237,23 @@ class _LaneTwin:
         return float(np.abs(difference).max())
 
     def _find_columns(self, field: str) -> slice:
-        """Returns the indices of a field's numbers among all numbers of a site's row."""
+        """Returns the indices of a field's values among all values of a site's row."""
         fields: Any = self._lanes._layout.site.fields
         dtype, offset, *_ = fields[field]
         return slice(offset // 8, (offset + dtype.itemsize) // 8)
 
 
 def _scale(mine: Words, others: Words, is_float: NDArray[np.bool_], factor: float) -> None:
-    """Moves the numbers of one run closer to those of another run, or away from them.
+    """Moves the state of one run closer to that of another run, or away from it.
 
-    Every floating-point number x becomes x_other + factor (x - x_other). All other numbers are
+    Every floating-point value x becomes x_other + factor (x - x_other). All other values are
     copied from the other run.
 
     Args:
-        mine: Numbers of the run that is changed, as integers with the same bits.
-        others: The same numbers of the other run.
-        is_float: True for the floating-point numbers.
-        factor: The factor.
+        mine: Values of the run to change, as integers with the same bits.
+        others: The same values from the other run.
+        is_float: True for the floating-point values.
+        factor: Scale factor.
     """
     bits = mine.copy()
     mine[:] = others

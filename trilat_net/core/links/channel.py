@@ -28,7 +28,7 @@ from .delay import (
 from .philox import uniforms
 
 LOST = -1
-"""Used in place of a due time for a sample that the network loses."""
+"""Used as the due time of a sample that the network loses."""
 
 _AR1 = int(DelayKind.AR1)
 
@@ -37,11 +37,13 @@ _AR1 = int(DelayKind.AR1)
 def _in_outage(stamp_ns: int, link: LinkRow, points: Points) -> bool:
     """Returns True if a message was sent during an outage, in which the link delivers nothing.
 
-    Outages are intervals that the scenario lists. Each includes its start and excludes its end.
+    Outages are time intervals listed in the scenario. Each includes its start and excludes its
+    end.
 
     Args:
-        stamp_ns: Stamp of the sample, ns since the epoch, the common start of the session.
-        link: State of the link, which gives the rows of its outages in `points`.
+        stamp_ns: Time at which the sample was sent, ns since the epoch (the common start of the
+            session).
+        link: State of the link, which tells the rows of its outages in `points`.
         points: Table of points. The row of an outage contains its start and its end, ns.
     """
     for n in range(link.outage_first, link.outage_first + link.outage_count):
@@ -90,13 +92,13 @@ def advance_losses(u: float, v: float, fresh: bool, link: LinkRow, model: Row) -
 def _draw_loss(sample: int, fresh: bool, link: LinkRow, model: Row) -> bool:
     """Decides at random whether the simulated network loses a message.
 
-    Losses are independent or come in bursts, as the model says. The same seed, link and message
-    number always give the same decision, so that a run can be repeated.
+    Depending on the model, losses are independent or come in bursts. The same seed, link and
+    message number always lead to the same decision, so a run can be repeated.
 
     Args:
         sample: Index of the sample.
         fresh: True for the first sample of the model.
-        link: State of the link; changed.
+        link: State of the link; updated in place.
         model: Model in force.
     """
     if not loses_samples(model):
@@ -182,20 +184,19 @@ def find_due_ns(
 def _due_ns(
     sample: int, stamp_ns: int, fresh: bool, link: LinkRow, model: Row, points: Points
 ) -> int:
-    """Computes when a network link delivers a message, or whether it loses the message.
+    """Computes when a network link delivers a message, or whether the message is lost.
 
-    The function must be called once for each message (sample), in order, because bursts of loss
-    and correlated delays depend on the previous message. For the same reason, loss and delay
-    are drawn even for a message that is lost for another reason.
+    Must be called exactly once per sample, in order, because loss bursts and correlated delays
+    depend on the previous message. For the same reason, loss and delay are drawn even for a
+    message that is lost for another reason.
 
     Args:
-        sample: Index of the sample, the state that the sender sent in the tick (period of its
-            control loop) of this number.
-        stamp_ns: Time at which the sample was sent, ns since the epoch, the common start of the
-            session.
-        fresh: True for the first sample of the model, with which the model's state starts.
-        link: State of the link; changed, see `find_due_ns`.
-        model: Model of delay and loss in force, a row of LINK_MODEL_DTYPE.
+        sample: Index of the sample, which is the tick in which it was sent.
+        stamp_ns: Time at which the sample was sent, ns since the epoch (the common start of the
+            session).
+        fresh: True for the first sample of the model, which initialises the model's state.
+        link: State of the link; updated in place, see `find_due_ns`.
+        model: Delay and loss model in force, a row of LINK_MODEL_DTYPE.
         points: Delay traces and outages of all links of the receiver.
 
     Returns:

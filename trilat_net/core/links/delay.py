@@ -26,7 +26,7 @@ from ..step.vectors import Points, Row, count_started
 from .philox import DrawKey, standard_gamma, standard_normal, uniforms
 
 MAX_DELAY_US = 10_000_000
-"""Largest delay. Longer delays from a random distribution are cut off at this value."""
+"""Largest delay. Longer delays drawn from a distribution are clipped to this value."""
 
 
 class DelayKind(IntEnum):
@@ -153,23 +153,24 @@ _LARGEST_NORMAL = 8.6
 _LARGEST_EXPONENTIAL = 36.8
 """Largest magnitudes of random numbers.
 
-They occur at the smallest uniform number 2^-53 (see
-`unit_interval`): sqrt(-2 log 2^-53) by the method of Box and Muller, and -log 2^-53.
+They occur at the smallest uniform number 2^-53 (see `unit_interval`): sqrt(-2 log 2^-53) with
+the Box-Muller method, and -log 2^-53.
 """
 
 
 def _longest_us(model: LinkModel, trace: Points | None) -> float:
     """Returns the longest delay that a delay model can produce, or an upper bound on it, us.
 
-    The bound follows from the bounds of the model's random numbers: the largest normal number
-    is `_LARGEST_NORMAL`, and the largest exponential number of mean 1 is
-    `_LARGEST_EXPONENTIAL`. The limit MAX_DELAY_US is not applied, except to the log-normal
-    delay, whose exponential might overflow.
+    The bound is derived from those of the model's random numbers: the largest normal number is
+    `_LARGEST_NORMAL`, and the largest exponential number with mean 1 is `_LARGEST_EXPONENTIAL`.
+    The limit MAX_DELAY_US is only applied to the log-normal delay, whose exponential might
+    overflow.
 
     Args:
-        model: The model. `DelayKind` states what its numbers `location`, `scale`, `extra` and
-            `weight` mean for each kind of delay.
-        trace: Points of its trace, rows of time and delay, see `Points`; None for other kinds.
+        model: The model. See `DelayKind` for the meaning of `location`, `scale`, `extra` and
+            `weight` for each type of delay.
+        trace: Points of its trace, as rows of time and delay, see `Points`. None for other
+            types.
     """
     location = model.location
     scale = model.scale
@@ -234,8 +235,7 @@ DELAY = 2
 COPY = 5
 """Purposes of random draws.
 
-DELAY and COPY also reserve the two numbers that follow them, see
-`standard_gamma`.
+DELAY and COPY also reserve the two numbers after them, see `standard_gamma`.
 """
 
 _UNIFORM = int(DelayKind.UNIFORM)
@@ -297,14 +297,14 @@ def _next_ar1_value(
 
         x_m = c x_{m-1} + sqrt(1 - c^2) n_m,  n_m standard normal
 
-    Delays that vary slowly from message to message follow such an AR(1) sequence. Each of its
-    numbers has the mean 0 and the deviation 1.
+    Used for delays that vary slowly from message to message. Each element of this AR(1)
+    sequence has mean 0 and standard deviation 1.
 
     Args:
-        key: Key of the link, from which all its random numbers follow.
+        key: Key of the link, which determines all its random numbers.
         sample: Index m of the sample.
         correlation: Correlation c of neighbours.
-        before: Number x_{m-1} of the previous sample.
+        before: Value x_{m-1} for the previous sample.
         fresh: True if the sequence starts here, with x_m = n_m.
     """
     draw = standard_normal(key, sample, DELAY, 0)
@@ -315,15 +315,15 @@ def _next_ar1_value(
 
 @leaf
 def _sine_delay_us(stamp_ns: int, model: Row) -> float:
-    """Computes the delay of a sample (message) on a link whose delay is a sine of time.
+    """Computes the delay of a sample on a link whose delay varies sinusoidally with time.
 
         delay(t) = mean + amplitude sin(2 pi t / period + phase)
 
     Args:
-        stamp_ns: Stamp of the sample, the time t at which it was sent, ns since the epoch, the
-            common start of the session.
-        model: Model of the delay, a row of LINK_MODEL_DTYPE. The mean is `location`, the
-            amplitude `scale` and the period `extra`, all in us. The phase is `weight`, in rad.
+        stamp_ns: Time t at which the sample was sent, ns since the epoch (the common start of
+            the session).
+        model: Delay model, a row of LINK_MODEL_DTYPE. The mean is `location`, the amplitude
+            `scale` and the period `extra`, all in us. The phase is `weight`, in rad.
 
     Returns:
         The delay, us, not rounded.
@@ -383,19 +383,19 @@ def draw_pair(now: Row, index: int, attempt: int) -> tuple[float, float]:
 def _custom_delay_us(
     key: DrawKey, sample: int, stamp_ns: int, model: Row, points: Points
 ) -> float:
-    """Computes the delay of a message by the compiled function of a user's model, us.
+    """Computes the delay of a message with the compiled function of a user's model, us.
 
-    The delay is limited to the maximum that the user's model declares. The function has two
+    The delay is limited to the maximum that the user's model declares. The function takes two
     arguments: the parameters of the user's model, and the data of the delay model. From the
-    latter, it reads the fields `key`, `sample` and `stamp_ns`, and writes the delay into the
+    latter, it reads the fields `key`, `sample` and `stamp_ns`, and it writes the delay to the
     field `drawn_us`, see `plugged`.
 
     Args:
         key: Seed of all random numbers of the link.
         sample: Index of the sample.
         stamp_ns: Time at which the sample was sent, ns since the start of the session.
-        model: The delay model, a row of LINK_MODEL_DTYPE. The field `call` is the address of
-            the function. The field `location` is the maximum delay, us.
+        model: Delay model, a row of LINK_MODEL_DTYPE. The field `call` is the address of the
+            function, and `location` is the maximum delay, us.
         points: Table with the parameters of all models: floats stored in an array of integers,
             two per row.
 

@@ -198,10 +198,9 @@ end, ns, followed by the dominance factor of each peer at its end.
 def _interpolate(
     t_ns: float, start_ns: float, end_ns: float, before: float, after: float
 ) -> float:
-    """Returns a weight at time t during its linear change from `before` to `after`.
+    """Returns a dominance factor at time t during its linear change from `before` to `after`.
 
-    The weight (dominance factor) states how much an arm follows another. It is `after` once the
-    change has ended.
+    The factor stays at `after` once the change has ended.
 
     Args:
         t_ns: Time t, ns since the start of the session.
@@ -319,10 +318,10 @@ _ACT_BRAKE = int(StaleAction.BRAKE)
 
 @leaf
 def _any_peer_stale(t_ns: int, age_ns: int, links: RowArray) -> bool:
-    """Returns True if this arm has no recent state from an arm that it follows.
+    """Returns True if this arm has no recent sample from an arm that it follows.
 
-    That is, the message in use from the other arm was sent too long ago. If no message has
-    arrived yet, the time counts from the common start of the session.
+    This means that the sample in use was sent too long ago. If no sample has arrived yet, its
+    age is counted from the common start of the session.
 
     Args:
         t_ns: Time, ns since the epoch.

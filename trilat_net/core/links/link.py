@@ -113,8 +113,9 @@ _MEASURED = int(DelayKind.MEASURED)
 
 
 _FILED = LOST - 1
-"""Marks samples that have arrived: due times are never negative, so `_FILED - due` is at most
-this, and LOST is above it.
+"""Marks samples that have arrived.
+
+Due times are never negative, so `_FILED - due` never exceeds this value, and LOST is above it.
 """
 
 
@@ -199,7 +200,7 @@ def _is_far_ahead(k: int, rate_hz: int, tick: int, peer_rate_hz: int) -> bool:
     be wrong.
 
     Args:
-        k: Present tick of the receiver.
+        k: Current tick of the receiver.
         rate_hz: Tick rate of the receiver, Hz.
         tick: Tick of the sender in which it sent the sample.
         peer_rate_hz: Tick rate of the sender, Hz.
@@ -212,15 +213,15 @@ def _is_far_ahead(k: int, rate_hz: int, tick: int, peer_rate_hz: int) -> bool:
 
 @leaf
 def _file_sent(channel: ChannelArrays | None, page: int, sent: Array) -> None:
-    """Stores the values that the control law of another arm has sent, until they may be used.
+    """Stores the values sent by another arm's control law until they may be used.
 
-    The values, for example an energy, arrived in the same message as the state of the other
+    The values (for example, an energy) arrived in the same message as the state of the other
     arm. They wait with that state until the simulated delay of the message has passed.
 
     Args:
-        channel: Arrays of these numbers; None if the receiver's law ignores them.
-        page: Index of the entry of the ring buffer in which the sample waits.
-        sent: The values that arrived, in the order of the sender.
+        channel: Arrays of these values; None if the receiver's law ignores them.
+        page: Index of the ring buffer entry in which the sample waits.
+        sent: The values that arrived, in the order used by the sender.
     """
     if channel is None:
         return
@@ -231,14 +232,14 @@ def _file_sent(channel: ChannelArrays | None, page: int, sent: Array) -> None:
 
 @leaf
 def _use_sent(channel: ChannelArrays | None, page: int) -> None:
-    """Gives the control law of this arm the values that the law of another arm has sent.
+    """Passes the values sent by another arm's control law to the control law of this arm.
 
-    The values, for example an energy, arrived in the same message as the state of the other
-    arm. The function is called when the simulated delay of this message has passed.
+    The values (for example, an energy) arrived in the same message as the state of the other
+    arm. This function is called when the simulated delay of that message has passed.
 
     Args:
-        channel: Arrays of these numbers; None if the receiver's law ignores them.
-        page: Index of the entry of the ring buffer in which the sample waited.
+        channel: Arrays of these values; None if the receiver's law ignores them.
+        page: Index of the ring buffer entry in which the sample waited.
     """
     if channel is not None:
         put(channel.received, channel.waiting[page])

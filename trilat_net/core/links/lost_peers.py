@@ -26,7 +26,7 @@ from ..step.ticks import LifeReason
 from ..step.vectors import RowArray
 
 BACK_NS = 250_000_000
-"""Time for which samples of a dropped peer must arrive before it gets its share again, ns."""
+"""How long samples from a dropped peer must arrive before it regains its share, ns."""
 
 _DROPPED = int(LifeReason.DROPPED)
 _RESTORED = int(LifeReason.RESTORED)
@@ -36,22 +36,21 @@ _RESTORED = int(LifeReason.RESTORED)
 def _can_drop(lost: int, t_ns: int, site: SiteRow, links: RowArray) -> bool:
     """Returns True if the site may continue without a peer that is lost.
 
-    A site is the process that runs one arm. Its peers are the other sites, from which it
-    receives samples. The remaining sites are this site and the peers whose samples still
-    arrive. This site must still follow at least one of them, and they must all reach each
-    other. A site reaches the sites that it follows, directly or through others.
+    The remaining sites are this site and the peers whose samples still arrive. This site must
+    still follow at least one of them, and they must all reach each other. A site reaches the
+    sites that it follows, directly or through others.
 
-    The remaining sites all reach each other if two sets contain all of them: the sites that
-    this site reaches, and the sites that reach this site. The sets grow from this site until
-    nothing can be added. A set of sites is an integer with one bit per site.
+    The remaining sites all reach each other if each of them is in both of two sets: the sites
+    that this site reaches, and the sites that reach this site. The sets are grown from this
+    site until nothing can be added. A set of sites is an integer with one bit per site.
 
     Args:
-        lost: Index of the peer that is lost.
-        t_ns: Time, ns since the epoch, the common start of the session.
+        lost: Index of the lost peer.
+        t_ns: Time, ns since the epoch (the common start of the session).
         site: State of the site.
         links: State of each link, one row per peer. `bit` is the bit of the peer, `followed`
-            the set of the sites that the peer follows, and `alpha` the weight with which this
-            site follows the peer.
+            the set of sites that the peer follows, and `alpha` the weight with which this site
+            follows the peer.
     """
     remaining = site.bit
     followed = 0  # the remaining sites that this site follows
@@ -81,26 +80,25 @@ def _can_drop(lost: int, t_ns: int, site: SiteRow, links: RowArray) -> bool:
 def _is_orientation_near(back: int, site: SiteRow, links: RowArray) -> bool:
     """Returns True if a returning peer turns the reference by at most the alignment limit.
 
-    The reference, the orientation that the arm follows, is a weighted mean of the orientations
-    of the other arms, its peers. With the rotation vector u_j from the orientation of peer j to
-    that of this arm, and the weight alpha_j, the mean over the present peers is
+    The reference orientation is a weighted mean of the peers' orientations. With the rotation
+    vector u_j from the orientation of peer j to that of this arm, and the weight alpha_j, the
+    mean over the present peers is
 
         mean = sum_j alpha_j u_j / sum_j alpha_j
 
-    The returning peer with the rotation vector u and the weight alpha changes it by
+    A returning peer with rotation vector u and weight alpha changes it by
 
         |u - mean| alpha / (sum_j alpha_j + alpha)
 
-    The turn between two orientations is at most as long as the difference of their rotation
-    vectors from the site's own orientation.
+    The angle between two orientations never exceeds the length of the difference of their
+    rotation vectors relative to the site's own orientation.
 
     Args:
         back: Index of the returning peer.
-        site: State of the site (the process that runs the arm), with its own pose x. The last
-            three coordinates of a pose are the rotation vector of its orientation, rad.
-            `align_limit` is the limit.
-        links: State of each link, one row per peer, with the pose q of the peer. `gone` is 0
-            for a present peer. The weights of the present peers must not all be 0.
+        site: State of the site, including its own pose x. The last three coordinates of a pose
+            are the rotation vector of its orientation, rad. `align_limit` is the limit.
+        links: State of each link, one row per peer, including the pose q of the peer. `gone` is
+            0 for a present peer. The weights of the present peers must not all be 0.
     """
     orientation = rotation_matrix(read_three(site.x[3:]))
     total = 0.0  # the sum of the weights of the present peers
@@ -127,16 +125,15 @@ def _is_orientation_near(back: int, site: SiteRow, links: RowArray) -> bool:
 def _is_near(back: int, site: SiteRow, links: RowArray) -> bool:
     """Returns True if a returning arm would move the reference only slightly.
 
-    The reference, the position that this arm follows, is the mean of the positions of the other
-    arms with their weights alpha. The limit of the alignment applies to each linear coordinate,
-    a position or a joint angle, and to the orientation as a whole.
+    The reference is the mean of the peers' positions, weighted by alpha. The alignment limit
+    applies to each linear coordinate (a position or a joint angle), and to the orientation as a
+    whole.
 
     Args:
         back: Index of the returning peer.
-        site: State of the site (the process that runs the arm), with the limit `align_limit`, m
-            or rad.
-        links: State of each link, one row per peer, with the position q of the peer. `gone` is
-            0 for a present peer. The weights of the present peers must not all be 0.
+        site: State of the site, including the limit `align_limit`, m or rad.
+        links: State of each link, one row per peer, including the position q of the peer.
+            `gone` is 0 for a present peer. The weights of the present peers must not all be 0.
     """
     if has_orientation(site) and not _is_orientation_near(back, site, links):
         return False
@@ -163,16 +160,16 @@ def _is_near(back: int, site: SiteRow, links: RowArray) -> bool:
 
 @leaf
 def _redistribute_shares(links: RowArray) -> bool:
-    """Divides the weights of lost arms among the other arms that this arm follows.
+    """Distributes the dominance factors of lost peers among the remaining peers.
 
-    The weight of a followed arm (peer) is its dominance factor alpha. The present peers get the
-    factors of the lost peers in proportion to their own factors, so that the sum is 1 again:
+    The present peers get the factors of the lost peers in proportion to their own factors
+    alpha, which makes the sum 1 again:
 
         alpha_j / sum alpha,  with the derivative by the quotient rule; 0 for a lost peer
 
     Returns:
-        True if the factors were redistributed. False if all other peers have the factor 0; the
-        factors are not changed then.
+        True if the factors were redistributed. False if all other peers have the factor 0, in
+        which case nothing is changed.
     """
     total = 0.0  # the sum of the factors of the present peers, and its derivative
     total_rate = 0.0

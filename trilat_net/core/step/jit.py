@@ -197,8 +197,10 @@ _record: Any = types.Record
 _record.mangling_args = property(_mangle_record)
 
 _OPTIONS: Any = {"_nrt": False}
-"""Numba options of leaves. Reference counting would cost more than the arithmetic, and is not
-needed because leaves allocate no arrays.
+"""Numba options of leaves.
+
+Reference counting would cost more than the arithmetic, and is not needed because leaves
+allocate no arrays.
 """
 _LEAF_OPTIONS: Any = {
     "nopython": True,

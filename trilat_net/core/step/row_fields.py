@@ -425,7 +425,7 @@ _KINDS = {int: "i8", float: "f8", np.uint64: "u8", Array: "f8"}
 def _read_fields(row: type) -> dict[str, Field]:
     """Reads the fields of a structured array from the class that describes them.
 
-    The fields have the order of the attributes of the class.
+    The fields are in the order of the class attributes.
 
     Args:
         row: The class, for example `SiteRow`.
@@ -445,7 +445,7 @@ FIELDS: dict[str, dict[str, Field]] = {
     "progress": _read_fields(ProgressRow),
     "sums": _read_fields(SumsRow),
 }
-"""The fields of each row, by the row's name and the field's name."""
+"""The fields of each row type, keyed by row name and field name."""
 
 
 def field_shape(field: Field, lengths: Mapping[str, int]) -> tuple[int, ...]:

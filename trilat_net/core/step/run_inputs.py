@@ -15,7 +15,7 @@ from .ticks import CoreChange
 from .vectors import Array
 
 _TARGET_COLUMN = 3
-"""First column of the target in an action. It follows grip, number and source."""
+"""First column of the target in an action, after grip, number and source."""
 
 
 class RunInputs(NamedTuple):
@@ -119,10 +119,10 @@ class RunInputs(NamedTuple):
 
 
 def _count_coordinates(numbers: int) -> int:
-    """Returns how many coordinates a person or program may command to move an arm.
+    """Returns the number of coordinates that a person or program commands to move an arm.
 
     Args:
-        numbers: Count of the numbers of an action: grip, number and source, followed by the
-            target and the velocity of each coordinate, see `HandInForce`.
+        numbers: Length of an action: grip, number and source, followed by the target and the
+            velocity of each coordinate, see `HandInForce`.
     """
     return (numbers - _TARGET_COLUMN) // 2

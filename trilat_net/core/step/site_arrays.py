@@ -43,7 +43,7 @@ from .vectors import Array, IntArray, Points, Row, RowArray
 
 _OTHER_GAINS = ("law", "theta_hat0", "absolute")
 _GAINS = tuple(name for name in Gains._fields if name not in _OTHER_GAINS)
-"""Constant gains, with the names of the site's fields. theta_hat0 is stored as `theta_hat`."""
+"""Constant gains, named like the fields of the site. theta_hat0 is stored as `theta_hat`."""
 
 
 @cache
@@ -412,11 +412,11 @@ def _count_kept_dues(setup: SiteSetup) -> int:
     """Returns the number of messages whose delivery times a link stores.
 
     A delivery time (due time) is stored for as long as its message may still arrive, late or as
-    a duplicate. The longest possible delay, and the largest time by which the sender's clock
-    may be ahead of the receiver's, bound this time.
+    a duplicate. This time is bounded by the longest possible delay and by how far the sender's
+    clock may be ahead of the receiver's.
 
     Args:
-        setup: Setup of the site. The fastest loop on either end determines the number.
+        setup: Setup of the site. The number depends on the fastest loop at either end.
     """
     peer_rates_hz = [link.rate_hz for link in setup.links]
     fastest_hz = max(setup.rate_hz, *peer_rates_hz)
@@ -530,13 +530,12 @@ class CalendarSizer:
 
 
 def _add_ramp(arrays: SiteArrays, ramp: DominanceRamp) -> None:
-    """Adds a planned change of the weights with which an arm follows the other arms.
+    """Adds a planned change of the dominance factors of an arm.
 
-    The changes are stored in a table, which is sorted by their start times.
+    The changes are stored in a table sorted by start time.
 
     Args:
-        arrays: Arrays of the site (the process that runs the arm). Their table must have a free
-            row.
+        arrays: Arrays of the site, whose table must have a free row.
         ramp: The change, a ramp in time.
     """
     site: Row = arrays.site[0]
@@ -554,13 +553,12 @@ def _add_ramp(arrays: SiteArrays, ramp: DominanceRamp) -> None:
 def _add_model(arrays: SiteArrays, peer: int, model: LinkModel) -> None:
     """Adds a planned change of a network link's delay and loss.
 
-    The changes are stored in a table, which is sorted by the time from which each applies.
+    The changes are stored in a table sorted by start time.
 
     Args:
-        arrays: Arrays of the site (the process that runs the arm). Their table must have a free
-            row.
+        arrays: Arrays of the site, whose table must have a free row.
         peer: Index of the site at the other end of the link.
-        model: Model of delay and loss, with the time from which it applies.
+        model: Delay and loss model, including its start time.
     """
     link: Row = arrays.links[peer]
     models = arrays.models[peer]
@@ -581,18 +579,17 @@ def _add_model(arrays: SiteArrays, peer: int, model: LinkModel) -> None:
 MAX_CHANGES = 4096
 """Largest number of changes of one link in addition to those in the scenario."""
 MAX_RAMPS = 256
-"""Largest number of waiting changes of the dominance factors that are not in the scenario.
+"""Largest number of pending changes of the dominance factors that are not in the scenario.
 
-A run may have any number of changes, because changes that have begun are removed, see
-`fold_ramps`.
+A run may have any number of changes in total, because changes that have started are removed,
+see `fold_ramps`.
 """
 
 
 _NEAR_NS = NS_PER_S // 4
-"""Time by which senders may be ahead of a slightly late receiver without a larger buffer, ns.
-"""
+"""How far senders may be ahead of a slightly late receiver without a larger buffer, ns."""
 MAX_LINKS_BYTES = 64 << 20
-"""Largest memory of a site's links beyond what their delays need, bytes."""
+"""Largest memory of a site's links in addition to what their delays require, bytes."""
 _SLACK = 4
 """Reserve in ticks, because a sample is scheduled up to two ticks before it is stored."""
 _NEVER_SAMPLED = 2
@@ -600,11 +597,11 @@ _NEVER_SAMPLED = 2
 
 
 def _share_tables(sites: Sequence[SiteArrays]) -> None:
-    """Shifts the indices of table rows, because the tables of all sites are joined into one.
+    """Shifts table row indices to prepare for joining the tables of all sites into one.
 
-    Each site (one arm) has a table with the points of delay traces and outages, and one with
-    the recorded torques of operators. `SiteArrays.stack` joins them for a simulation of all
-    sites, so that the rows of the second site begin after those of the first.
+    Each site has a table with the points of delay traces and outages, and one with the recorded
+    torques of operators. `SiteArrays.stack` joins them for a simulation of all sites, placing
+    the rows of the second site after those of the first.
 
     Args:
         sites: Arrays of the sites, in the order of the joined tables. Their indices are
@@ -625,24 +622,23 @@ def _stack_channels(
 ) -> ChannelArrays:
     """Stacks the arrays for the values that control laws send, for several sites.
 
-    A site is the process that runs one arm, and its peers are the other sites. The law of a
-    peer sends A values to all sites, and E values to each of them. A single site receives only
-    the A + E values that are meant for it. In a simulation of all sites, it reads the record of
-    the peer, which contains the values for all of its receivers:
+    The law of a peer sends A values to all sites, and E values to each of them individually. A
+    single site receives only the A + E values intended for it. In a simulation of all sites, it
+    reads the record of the peer, which contains the values for all of its receivers:
 
         a single site:  A to all | E to this site
         record:         A to all | E to receiver 0 | E to receiver 1 | ...
 
-    Therefore, for values that are sent to each site separately, the column increases by E for
-    each receiver before this site.
+    The column of a value sent to each site individually therefore increases by E for each
+    receiver that precedes this site.
 
     Args:
         setups: Setups of the sites.
-        channels: Arrays of each site. `columns` contains for each peer the index of each number
+        channels: Arrays of each site. For each peer, `columns` contains the index of each value
             that the law of the site reads, or -1. It is changed in place.
 
     Returns:
-        The arrays with a first axis for the site, filled up to equal lengths.
+        The arrays with a leading axis for the site, padded to equal length.
     """
     for setup, channel in zip(setups, channels, strict=True):
         for link, columns in zip(setup.links, channel.columns, strict=True):
@@ -663,9 +659,9 @@ def _stack_channels(
 
 
 def _stack_padded(arrays: Sequence[NDArray[Any]]) -> NDArray[Any]:
-    """Stacks arrays of different lengths along a new first axis, filled up with zeros.
+    """Stacks arrays of different lengths along a new leading axis, padded with zeros.
 
-    Example: arrays of the shapes (3,) and (5,) become one array of shape (2, 5).
+    Example: arrays of shapes (3,) and (5,) become one array of shape (2, 5).
     """
     shapes = [array.shape for array in arrays]
     largest_shape = [max(lengths) for lengths in zip(*shapes, strict=True)]
@@ -680,12 +676,12 @@ def _stack_padded(arrays: Sequence[NDArray[Any]]) -> NDArray[Any]:
 
 
 def _build_site(setup: SiteSetup, layout: Layout) -> RowArray:
-    """Creates the state of an arm's process (site) before its first control period.
+    """Creates the state of a site before its first control period.
 
     Args:
         setup: Setup of the site.
-        layout: Lengths of the vectors of the result. They may be longer than the site needs;
-            the further numbers stay zero.
+        layout: Lengths of the vectors in the result. They may be longer than the site needs, in
+            which case the extra entries stay zero.
     """
     site = np.zeros(1, site_dtype(layout))
     s: Row = site[0]
@@ -735,7 +731,7 @@ def _build_site(setup: SiteSetup, layout: Layout) -> RowArray:
 
 @cache
 def _find_places(layout: Layout, site_layout: Layout) -> dict[str, slice]:
-    """Returns the position of each vector among all numbers of a site's row, by its name.
+    """Returns the position of each vector among the values of a site's row, keyed by name.
 
     Args:
         layout: Layout of the row.
@@ -754,10 +750,10 @@ def _find_places(layout: Layout, site_layout: Layout) -> dict[str, slice]:
 
 
 def _list_vectors(setup: SiteSetup) -> dict[str, Any]:
-    """Returns gains, limits, and the start of the motion, by the names of their fields.
+    """Returns gains, limits and the initial motion, keyed by field name.
 
     The estimate of the arm's parameters starts with the known parameters if the control law
-    assumes that they are known. Otherwise it starts with the estimate of the setup.
+    assumes that they are known. Otherwise, it starts with the estimate in the setup.
     """
     gains = setup.gains
     vectors: dict[str, Any] = {name: getattr(gains, name) for name in _GAINS}
@@ -777,10 +773,10 @@ def _list_vectors(setup: SiteSetup) -> dict[str, Any]:
 
 
 def _build_channel(setup: SiteSetup, pages: int) -> ChannelArrays:
-    """Creates the arrays for the values that the control laws of other arms send.
+    """Creates the arrays for the values sent by the control laws of other arms.
 
-    Some control laws send values besides the motion of the arm, for example energies. The
-    arrays are empty for all other laws.
+    Some control laws send values in addition to the motion of the arm, for example energies.
+    For all other laws, the arrays are empty.
 
     Args:
         setup: Setup of the site that receives the values.
@@ -805,13 +801,13 @@ def _build_links(
 
     Args:
         links: Setups of the links.
-        spare: Number of free rows for later changes of the delay model of each link.
-        shared: Number of coordinates of a sample, the state that another arm sends.
+        spare: Number of free rows per link for later changes of its delay model.
+        shared: Number of coordinates in a sample.
 
     Returns:
-        The state of each link, shape (P,). The models of delay and loss, shape (P, M). The
-        points of all delay traces and then of all outages, to which the models and the links
-        refer by the index of their first row.
+        The state of each link, shape (P,), the delay and loss models, shape (P, M), and the
+        points of all delay traces followed by those of all outages. Models and links refer to
+        the points by the index of their first row.
     """
     most_models = max(len(link.models) for link in links)
     model_rows = most_models + spare

@@ -65,18 +65,18 @@ _NO_SHARED: tuple[tuple[float, ...], ...] = ((), (), ())
 
 
 class _TickParts(NamedTuple):
-    """Internal parts of a `Site` that compute many recorded control periods in one call.
+    """Internals of a `Site` that are used to compute many recorded control periods in one call.
 
     Attributes:
         buffers: Input and output of a tick.
-        calendar_sizer: Enlarges the calendars, in which samples wait.
-        has_user_law: True if a user wrote the control law.
-        reflects: True if the law uses the external torques on the other arms (peers).
+        calendar_sizer: Enlarges the calendars in which samples wait.
+        has_user_law: True if the control law is user-written.
+        reflects: True if the law uses the external torques on the peers' arms.
         keeps_forces: True if the site stores these torques.
         glides: True if the arm comes to rest while a peer is silent (the rule `glide`).
         degrades: True if the site continues without lost peers.
         hand_index: Index of the person or program that moves the arm among the operators and
-            environments. -1 if nobody moves the arm.
+            environments, or -1 if nobody moves the arm.
     """
 
     buffers: TickBuffers
@@ -165,17 +165,17 @@ class Site:
         self._keeps_forces = self._reflects or self._hand is not None
 
     def _find_hand(self, index: int) -> tuple[Array, Array, Array]:
-        """Returns the inputs of the spring by which a person or program pulls the arm.
+        """Returns the inputs of the spring through which a person or program pulls the arm.
 
-        The inputs are the grip, which multiplies the force, and the target of the spring. They
-        change in each control period.
+        The inputs are the grip, which scales the force, and the target of the spring. They
+        change in every control period.
 
         Args:
             index: Index of the live hand among the operators and environments.
 
         Returns:
-            The grip, shape (1,), the target, and the target one second later. They are views:
-            writing into them moves the live hand.
+            The grip, shape (1,), the target, and the target one second later. They are views,
+            so writing to them moves the live hand.
         """
         actors = self._arrays.actors
         # The field `hand` of a record has grip, number, source, target and rate of the target.
@@ -187,17 +187,17 @@ class Site:
         return grip, target, target_ahead
 
     def _plug_law(self, setup: SiteSetup) -> None:
-        """Creates the control law that a user wrote, and compiles the other stages of a tick.
+        """Creates the user's control law, and compiles the other stages of a tick.
 
-        A tick is a period of the control loop. A user's law is called between two compiled
-        functions: `_sense` computes the stages of a tick before the torque, and `_act` those
-        after it. Without such a law, nothing is compiled here.
+        A user's law is called between two compiled functions: `_sense` computes the stages of a
+        tick before the torque, and `_act` those after it. If there is no such law, nothing is
+        compiled here.
 
         `_user_law` is the user's object. `_law` calls this object with the arrays of this site,
-        and may be a compiled form of the object. Both are None without a user's law.
+        and may be a compiled form of the object. Both are None if there is no user law.
 
         Args:
-            setup: Setup of the site, which may contain a factory of the law.
+            setup: Setup of the site, which may contain a factory for the law.
         """
         self._user_law = None
         if setup.law_factory is not None:
@@ -334,19 +334,19 @@ class Site:
         )
 
     def _compute_tick(self, k: int, t_ns: int, count: int) -> list[float]:
-        """Computes a whole control period: from received messages to the results and motion.
+        """Computes a complete control period, from received messages to the results and motion.
 
-        Without a user's control law, one compiled function computes all eight stages (`kernel`
-        lists them). A user's law is called between two compiled functions, one for the stages
+        Without a user's control law, one compiled function computes all eight stages (listed in
+        `kernel`). A user's law is called between two compiled functions, one for the stages
         before the torque and one for those after it.
 
         Args:
-            k: Number of the tick (control period).
+            k: Current tick.
             t_ns: Nominal time of the tick, ns since the start of the session.
             count: Number of arrivals in the buffers.
 
         Returns:
-            The memory of the user's law. Empty without such a law.
+            The memory of the user's law. Empty if there is no such law.
         """
         if self._law is None:
             if self._tick is None:
@@ -376,8 +376,8 @@ class Site:
         """Stores the measured motion of a real arm, in place of a simulated motion.
 
         Args:
-            measured: Angles, rad, and velocities, rad/s, of the joints, and the external torque
-                tau_x, N m. An empty torque counts as zero.
+            measured: Joint angles, rad, joint velocities, rad/s, and the external torque tau_x,
+                N m. An empty torque is treated as zero.
         """
         s: Row = self._site[0]
         s.q = measured.q
@@ -386,18 +386,18 @@ class Site:
         s.sensed = [-torque for torque in measured.tau_x] or 0.0
 
     def _compute_law(self, k: int, t_ns: int) -> list[float]:
-        """Computes the torque of a control period by the control law that a user wrote.
+        """Computes the torque of a control period with a user-written control law.
 
-        The law writes the torque into the state of the site. The result of this method is the
-        memory of the law, the numbers that it keeps from period to period.
+        The law writes the torque to the state of the site. The return value is the memory of
+        the law, which it keeps from one period to the next.
 
         The rule `glide` brings the arm to rest when something fails. Under this rule, a law
-        that fails gives NaN as torque. `act_stages` then enters the mode FAULT with the reason
-        NOT_FINITE. The law is not called again until the fault is reset, and then continues
-        from the memory that it had before the failure.
+        that fails produces NaN as its torque. `act_stages` then enters the mode FAULT with the
+        reason NOT_FINITE. The law is not called again until the fault is reset, when it
+        continues with the memory that it had before the failure.
 
         Args:
-            k: Number of the tick (control period).
+            k: Current tick.
             t_ns: Nominal time of the tick, ns since the start of the session.
 
         Raises:
@@ -471,12 +471,11 @@ class Site:
         return angles
 
     def _apply_hand(self, vector: Sequence[float]) -> Sequence[float]:
-        """Applies how a person or program pulls the arm in this control period.
+        """Applies the pull of a person or program on the arm in this control period.
 
         Args:
-            vector: The action in the form of `HandInForce`: how firmly the arm is gripped, to
-                which target it is pulled, and the velocity of the target. Empty if nobody
-                holds the arm.
+            vector: The action in the form of `HandInForce`: grip firmness, target, and velocity
+                of the target. Empty if nobody holds the arm.
 
         Returns:
             The action for the record of the tick. Empty if the site has no live hand.
@@ -495,12 +494,12 @@ class Site:
         return action
 
     def _compute_crc(self, packed_bytes: int, arrivals: int) -> int:
-        """Returns the checksum of the samples (states of other arms) that arrived, for the log.
+        """Returns the checksum of the samples that arrived, for the log.
 
-        A later verification of the log compares the checksum, which covers only what this site
-        uses: sender, tick and motion of each sample, then the forces if the site reflects
-        forces to its user, then the values that the other control laws send if the law of this
-        site reads such values.
+        The checksum is compared when the log is verified. It only covers what this site uses:
+        the sender, tick and motion of each sample, then the forces if the site reflects forces
+        to its user, then the values sent by the other control laws if this site's law reads
+        such values.
 
         Args:
             packed_bytes: Number of bytes of the packed arrivals: peers, ticks and motions.
@@ -521,22 +520,22 @@ class Site:
         return crc
 
     def _held_memory(self) -> list[float]:
-        """Lists the numbers of the site that the next tick needs and no other field records.
+        """Lists the state variables that the next tick needs and no other field records.
 
-        With them in the field `mem` of its record, a run can be continued from any tick. A site
-        that is not under the rule `glide`, which brings arms to rest, has only the first two:
+        The field `mem` of a record stores them, which makes it possible to continue a run from
+        any tick. Only a site under the rule `glide`, which brings arms to rest, has more than
+        the first two:
 
-        - `q_held`: the reference (position that the arm follows) that is held, or the start
-          value of an offset that falls to zero,
-        - `return_from_ns`: the time at which the present rest, return or run began, ns,
-        - `qd_held`: the rate of `q_held`,
-        - `reason`: why the mode changed last, a `LifeReason`,
-        - `used_ns`: for each peer the time at which its last sample came into use, ns,
+        - `q_held`: the held reference, or the initial value of an offset that decays to zero,
+        - `return_from_ns`: the time at which the current rest, return or run started, ns,
+        - `qd_held`: the rate of change of `q_held`,
+        - `reason`: why the mode last changed, a `LifeReason`,
+        - `used_ns`: for each peer, the time at which its last sample came into use, ns,
         - `tau_held`: the torque of each joint that carries a constant load at rest, N m,
         - `q_rest`, `qd_rest`: the reference that brings the joints to rest, only in task space,
         - `gone`: the state of each peer, only if the site continues without lost peers.
 
-        `restore_state` reads the same numbers in the same order.
+        `restore_state` reads the same values in the same order.
         """
         return_from_ns = float(self._return_from_ns.item())
         memory = [*self._q_held.tolist(), return_from_ns]
@@ -645,23 +644,23 @@ class Site:
     def _restore_life(self, memory: list[float]) -> list[float]:
         """Restores the memory of the rule `glide` from the field `mem` of a record.
 
-        Under this rule, an arm comes to rest while a peer (another arm) is silent, see
-        `session_life`. The numbers are read in the order in which `_held_memory` writes them:
+        Under this rule, an arm comes to rest while a peer is silent, see `session_life`. The
+        values are read in the order in which `_held_memory` writes them:
 
-        - `qd_held`: the rate of the held reference, one number per shared coordinate,
-        - `reason`: why the mode changed last, a `LifeReason`,
+        - `qd_held`: the rate of change of the held reference, one value per shared coordinate,
+        - `reason`: why the mode last changed, a `LifeReason`,
         - `used_ns`: the time at which the last sample of a peer came into use, per peer, ns,
         - `tau_held`: the torque that carries a constant load at rest, per joint, N m,
-        - only in task space `q_rest` and `qd_rest`: the reference that brings the joints to
-          rest, two numbers per joint,
-        - only if the site continues without lost peers `gone`: the state of each peer.
+        - `q_rest` and `qd_rest`, only in task space: the reference that brings the joints to
+          rest, two values per joint,
+        - `gone`, only if the site continues without lost peers: the state of each peer.
 
         Args:
-            memory: Numbers of the record, after the held reference and the time from which it
-                is held.
+            memory: Contents of `mem`, after the held reference and the time since when it is
+                held.
 
         Returns:
-            The remaining numbers, which belong to the user's law.
+            The remaining values, which belong to the user's law.
         """
         s: Row = self._site[0]
         shared = self.layout.shared
@@ -731,13 +730,12 @@ class Site:
         accept_stage(k, len(waiting), self._arrays, self._buffers)
 
     def _restore_received(self, peer: int, sample: Arrival | None) -> None:
-        """Restores the values that the control law of a peer sent with the sample in use.
+        """Restores the values that a peer's control law sent with the sample in use.
 
-        Control laws that users wrote can send values to each other, besides the motion of the
-        arms. The values are in the field `ch` of a sample, the state that a peer (another arm's
-        process) sends. The law of this site reads the values in an order of its own. For each
-        value that it reads, the array `columns` contains the index in `ch`, or -1 if the law of
-        the peer does not send this value, which is 0 then.
+        User-written control laws can send values to each other in addition to the motion of the
+        arms. These are in the field `ch` of a sample. The law of this site reads the values in
+        its own order: for each value that it reads, the array `columns` contains the index in
+        `ch`, or -1 if the peer's law does not send this value, which is then 0.
 
         Args:
             peer: Index of the peer.
@@ -754,26 +752,24 @@ class Site:
         channel.received[peer] = sent_and_zero[channel.columns[peer]]
 
     def _pack(self, k: int, arrivals: Sequence[Arrival]) -> int:
-        """Writes the samples that arrived before a tick into the input buffers of the tick.
+        """Writes the samples that arrived before a tick to the input buffers of the tick.
 
-        A tick is a period of the control loop. A sample is the state that a peer (another arm's
-        process) sends. The buffers have three parts:
+        The buffers have three parts:
 
         - `arrivals`: peer, tick and motion of each sample,
         - `forces`: the external torques of the senders, if this site uses them,
-        - `sent`: the numbers that the laws of the senders sent, if the law of this site reads
-          such numbers.
+        - `sent`: the values sent by the senders' laws, if this site's law reads such values.
 
-        Later the tick moves the samples to the calendars, the ring buffers in which they wait
-        until their simulated delay has passed. If a sample does not fit there, the calendars
-        are replaced by larger ones.
+        The tick later moves the samples to the calendars, the ring buffers in which they wait
+        for their simulated delay to pass. If a sample does not fit there, the calendars are
+        replaced with larger ones.
 
         Args:
-            k: Number of the tick (control period).
+            k: Current tick.
             arrivals: Samples that arrived since the previous tick.
 
         Returns:
-            The number of bytes written into `arrivals`.
+            The number of bytes written to `arrivals`.
 
         Raises:
             ValueError: There are more than MAX_ARRIVALS arrivals.

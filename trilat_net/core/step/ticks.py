@@ -24,7 +24,7 @@ from ..links.delay import LinkModel
 from .jit import leaf
 
 BUCKETS_PER_S = 20
-"""Number of intervals per second for which a run without a log keeps its largest values."""
+"""Number of intervals per second for which a run without a log keeps the largest values."""
 
 
 @leaf
@@ -57,7 +57,7 @@ def first_tick_at(due_ns: int, rate_hz: int) -> int:
 
 
 MAX_ARRIVALS = 4096
-"""Largest number of arrivals in a tick. A driver keeps further arrivals for the next tick."""
+"""Largest number of arrivals per tick. Drivers hold back any others until the next tick."""
 
 
 class LifeReason(IntEnum):
@@ -91,7 +91,7 @@ class LifeReason(IntEnum):
 
 
 RELEASE_REASONS = (LifeReason.RELEASED, LifeReason.STOP_RELEASED)
-"""Reasons of a stop in which brakes hold the arm, because its dead-man switch was released."""
+"""Reasons for a stop in which brakes hold the arm because its dead-man switch was released."""
 
 
 class LifeOrder(IntEnum):
@@ -356,7 +356,7 @@ _REMEDIES = {
     LifeReason.ARM_SILENT: "let the program of the arm send again, then",
 }
 _ORDERS = {"fault": "reset", "stopped": "enable"}
-"""The order that ends a mode."""
+"""The order that ends each mode."""
 _ALARM_MODES = ("fault", "stopped", "hold")
 _ADVICE = {
     ("stopped", LifeReason.RELEASED): "hold the switch",
@@ -370,11 +370,11 @@ _DEFAULT_ADVICE = "it continues by itself once samples arrive from all its peers
 
 
 def _find_lost_alarm(lost: Sequence[str]) -> LifeAlarm | None:
-    """Returns the alarm of an arm that continues without lost arms, or None if no arm is lost.
+    """Returns the alarm of an arm that continues without lost peers, or None if none is lost.
 
-    The weight (share) of the lost arm is divided among the other arms (peers). The `word` of
-    the alarm is, for example, "WITHOUT m2". No order is needed, because a lost arm gets its
-    share back automatically when it returns.
+    The weight (share) of the lost peer is divided among the other peers. The `word` of the
+    alarm is, for example, "WITHOUT m2". No order is needed, because a lost peer regains its
+    share automatically when it returns.
 
     Args:
         lost: Names of the lost peers.

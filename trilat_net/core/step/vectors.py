@@ -20,11 +20,11 @@ from numpy.typing import NDArray
 from .jit import leaf
 
 Pair = tuple[float, float]
-"""One number per joint, or per axis of the plane."""
+"""One value per joint, or per axis of the plane."""
 Five = tuple[float, float, float, float, float]
-"""One number per parameter."""
+"""One value per parameter."""
 Vector = Sequence[float] | Any
-"""A vector to read by index: a tuple, or a row of an array."""
+"""A vector that is accessed by index: a tuple, or a row of an array."""
 
 
 @leaf
@@ -145,10 +145,10 @@ def count_started(table: Any, first: int, count: int, now: float) -> int:
 Array = NDArray[np.float64]
 
 Row = Any
-"""A row of a structured array without named fields; `row_fields` has types of most rows."""
+"""Row of a structured array without named fields; `row_fields` has types for most rows."""
 
 Points = NDArray[np.int64]
-"""A table of pairs, shape (n, 2), of traces and then of outages.
+"""A table of pairs, shape (n, 2), for traces followed by outages.
 
 A point of a trace consists of the time since the first point, us, and the delay, us, which is
 -1 if the sample is lost. An outage consists of its first stamp and its end, ns.
