@@ -137,7 +137,7 @@ class LinkStates(NamedTuple):
     def keep(self, lanes: Sequence[int]) -> "LinkStates":
         """Returns the link states of only those runs that continue.
 
-        A search drops runs that it no longer needs, to spend no more time on them.
+        A search drops runs that it no longer needs, because simulating them would take time.
 
         Args:
             lanes: Lane indices of the runs that continue.

@@ -717,9 +717,9 @@ class LaneRun:
             self._states = states
 
     def keep(self, chosen: Sequence[int]) -> None:
-        """Drops all but some of the runs, to spend no more time on the others.
+        """Drops all runs except the given ones.
 
-        A search, for example, drops runs that can no longer be the best.
+        A search, for example, saves time by dropping runs that can no longer be the best.
 
         Args:
             chosen: Indices in `runs` of the runs that continue, in ascending order. None of

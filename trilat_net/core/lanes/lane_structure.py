@@ -144,7 +144,7 @@ def find_obstacle(run: CompiledRun, *, hand_site: int = -1) -> str:
 
     kinds = {int(row["kind"]) for actors in tables.actors for row in _list_actors(actors)}
     if kinds.intersection(OWN_KINDS):
-        return "operators or environments that users wrote"
+        return "user-written operators or environments"
     return ""
 
 

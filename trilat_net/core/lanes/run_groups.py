@@ -82,9 +82,10 @@ class RunGroup:
             run.advance_to(until_s)
 
     def keep(self, chosen: Sequence[int]) -> None:
-        """Drops all but some of the runs, to spend no more time on the others.
+        """Drops all runs except the given ones.
 
-        A search for the best gains, for example, drops runs that are already worse than others.
+        A search for the best gains, for example, saves time by dropping runs that are already
+        worse than others.
 
         Args:
             chosen: Indices in `members` of the runs that continue, in ascending order. No arm

@@ -43,7 +43,7 @@ def _in_outage(stamp_ns: int, link: LinkRow, points: Points) -> bool:
     Args:
         stamp_ns: Time at which the sample was sent, ns since the epoch (the common start of the
             session).
-        link: State of the link, which tells the rows of its outages in `points`.
+        link: State of the link, including which rows of `points` hold its outages.
         points: Table of points. The row of an outage contains its start and its end, ns.
     """
     for n in range(link.outage_first, link.outage_first + link.outage_count):

@@ -6,7 +6,7 @@ is then given to the remaining peers. For example, a slave that followed two use
 
 Invariant:
     - All decisions depend only on the samples in use and the stored state of the site. They are
-      made anew in each control period.
+      re-evaluated in each control period.
     - A site continues without a peer only if the remaining sites can all reach each other
       without it, and if the site still follows another peer. Otherwise, the arm stops.
     - The reference never jumps. It moves smoothly to the position of the remaining peers, and

@@ -601,7 +601,7 @@ class _LaneCompiler(_LeafCompiler):
     """Compiles a function that computes several simulations side by side, using SIMD.
 
     Each simulation has a lane, which is a position in the vector registers. The compiler may
-    assume that the arguments do not overlap in memory, without which it would not use vector
+    assume that the arguments do not overlap in memory; otherwise, it would not use vector
     instructions.
     """
 
