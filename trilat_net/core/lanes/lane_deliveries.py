@@ -112,7 +112,7 @@ class LinkStates(NamedTuple):
         """
         sites, peers, _ = tables[0].calendars.shape
         pages = max(arrays.calendars.shape[2] for arrays in tables)
-        # A sample that is sent in a block waits at most as long as the calendar has pages.
+        # A sample sent in a block waits for at most as many ticks as the calendar has pages.
         kept = 1 << (pages + BLOCK_TICKS).bit_length()
         most_models = max(arrays.models.shape[2] for arrays in tables)
         most_points = max(len(arrays.points) for arrays in tables)
@@ -164,7 +164,7 @@ def _constant_delay_ns(model: Row) -> int:
 
 @leaf
 def _is_constant(link: LinkRow, model: Row) -> bool:
-    """Returns True if a link only delays all samples by the same time."""
+    """Returns True if all that a link does is delay every sample by the same time."""
     return bool(
         link.models == 1
         and link.outage_count == 0
@@ -320,7 +320,8 @@ def _release_samples(
     loses = loses_samples(model)
     if loses:
         call_address(draws.losses, (first, count, link.key, uniform_numbers))
-    # Without copies of samples and outages, the slower general function is not needed.
+    # If samples are never duplicated and there are no outages, the slower general function is
+    # not needed.
     is_plain = model.duplicate == 0.0 and link.outage_count == 0
     for index in range(count):
         sample = first + index

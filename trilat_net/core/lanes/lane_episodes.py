@@ -196,7 +196,7 @@ def _run_span(
                 columns=received_columns[i],
                 table=table,
             )
-        # The tick that follows.
+        # The next tick.
         for lane in range(LANES):
             clock[0, 0, lane] += 1
         running = keep_ended_runs(
@@ -294,9 +294,10 @@ class LaneEpisodes(LaneRun):
 
     @staticmethod
     def explain_run(run: CompiledRun, hand_site: int) -> str:
-        """Explains why a run cannot be simulated side by side with others. "" if it can.
+        """Explains why a run cannot be simulated side by side with others.
 
-        This compiles the simulation code to find out, which can take seconds.
+        Returns an empty string if it can. This compiles the simulation code to find out, which
+        can take seconds.
 
         Args:
             run: The run before its first tick.
@@ -355,8 +356,8 @@ class LaneEpisodes(LaneRun):
         tables = run.memory.tables
         links = self._deliveries
         pages = tables.calendars.shape[2]
-        # `releases` is a ring buffer over the ticks. A sample that is sent in a block of ticks
-        # waits at most as long as the calendar has pages.
+        # `releases` is a ring buffer over the ticks. A sample sent in a block of ticks waits
+        # for at most as many ticks as the calendar has pages.
         needed = 1 << (pages + BLOCK_TICKS).bit_length()
         old_room = links.releases.shape[3]
         if needed > old_room:
@@ -366,8 +367,8 @@ class LaneEpisodes(LaneRun):
                 releases[other, ..., due % needed] = links.releases[other, ..., due % old_room]
             links = links._replace(releases=releases)
 
-        # The run may have more delay models, or more points of recorded delays, than any run
-        # before.
+        # The run may have more delay models, or more points of recorded delays, than any
+        # previous run.
         models = tables.models.shape[2]
         if models > links.models.shape[3]:
             wider = np.zeros((*links.models.shape[:3], models), LINK_MODEL_DTYPE)

@@ -79,8 +79,7 @@ class LaneLaw(NamedTuple):
         row = law.row[:size].view(form.law)[0]
         constants = []
         for field, (dtype, *_) in (form.law.fields or {}).items():
-            # Other integers are not constants, because a study may vary them within one
-            # structure.
+            # Other integers are not constants, because a study may vary them for one structure.
             if dtype.kind == "i" and not dtype.shape and row[field] in (0, 1):
                 constants.append((field, int(row[field])))
         return cls(

@@ -175,7 +175,7 @@ def _list_argument_types(
     actors = site.actors
     chain = _type_numbers(0, 1)
     if layout.chain is not None:
-        # The actors and the joints of a chain are selected by the variable of a loop.
+        # The actors and joints of a chain are selected by a loop variable.
         actors = ((),) * len(actors)
         constants = () if any(site.prismatic) else (("prismatic", 0),)
         chain = LaneTable(layout.chain, (constants,) * len(site.prismatic))
@@ -250,7 +250,7 @@ def _find_addresses(run: CompiledRun, structure: RunStructure, clock: types.Type
 
 
 def explain_uncompilable(run: CompiledRun, clock: types.Type = types.int64) -> str:
-    """Explains why a control law cannot be compiled for several runs at once, for a message.
+    """Explains to the user why a control law cannot be compiled for several runs at once.
 
     Such a law may still be compilable for a single run. This compiles the code to find out.
 
@@ -294,7 +294,7 @@ def _copy_records(first: IntArray, kept: Array, records: Array) -> None:
             is in row k modulo the number of rows.
         records: Output array for the results, shape (runs, N, ticks, floats).
     """
-    # The numbers of all lanes in a record are in few cache lines.
+    # The values of all lanes in a record occupy only a few cache lines.
     for i in range(records.shape[1]):
         for tick in range(records.shape[2]):
             row = (first[i] + tick) & (kept.shape[1] - 1)
@@ -768,7 +768,7 @@ class LaneRun:
             first = int(self._ticks[i]) - records.shape[1]
             ticks = np.arange(max(first, end - sent.t_ns.shape[1], 0), end)
             pages = ticks % sent.t_ns.shape[1]
-            # The equation of `tick_ns`.
+            # Same equation as in `tick_ns`.
             sent.t_ns[i, pages] = ticks * NS_PER_S // self._rates_hz[i]
             sent.rows[i, pages] = records[i, ticks - first]
 
@@ -805,7 +805,7 @@ class LaneRun:
         rows = unsettled_ns.view(memory.progress.dtype).reshape(-1)
         memory.progress["unsettled_ns"] = rows["unsettled_ns"]
         _write_progress(memory.progress, ticks, self._rates_hz)
-        # The equation of `tick_ns`.
+        # Same equation as in `tick_ns`.
         last_ns = (ticks - 1) * NS_PER_S // self._rates_hz
         if has_ended:
             diverged = tables.site["mode"][:, 0] == Mode.DIVERGED
@@ -849,7 +849,7 @@ class LaneRun:
             end = int(self._ticks[i])
             ticks = np.arange(max(end - kept, 0), end)
             pages = ticks % sent.t_ns.shape[1]
-            # The equation of `tick_ns`.
+            # Same equation as in `tick_ns`.
             sent.t_ns[i, pages] = ticks * NS_PER_S // self._rates_hz[i]
             states = self._states[i, ticks % self._pages, lane]
             names = ("x", "xd", "wrench") if layout.task else ("q", "qd", "tau_x")
@@ -914,7 +914,7 @@ def _check_distinct(tables: _SiteTables) -> None:
 
 
 def put_rows(rows: NDArray[Any], numbers: Words) -> None:
-    """Overwrites structured records with values given as integers with the same bits.
+    """Overwrites structured records with values given as 64-bit words, see `read_words`.
 
     Args:
         rows: Rows to overwrite.
@@ -939,7 +939,7 @@ def _write_progress(progress: Any, ticks: IntArray, rates_hz: IntArray) -> None:
     progress["bucket"] = parts // rates_hz
     progress["part"] = parts % rates_hz
     has_finished = ticks >= progress["ticks"]
-    # The equation of `tick_ns`.
+    # Same equation as in `tick_ns`.
     progress["t_ns"] = np.where(has_finished, NEVER_NS, ticks * NS_PER_S // rates_hz)
 
 

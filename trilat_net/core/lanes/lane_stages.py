@@ -410,8 +410,8 @@ def advance_site(
         states=states,
     )
 
-    # 8 advance. Each stage of the integrator has its own loop: in a short loop, the processor
-    # begins with the next lanes while it waits for the results of the previous lanes.
+    # 8 advance. Each stage of the integrator has its own loop. In a short loop, the processor
+    # can start on the next lanes while waiting for the results of the previous ones.
     for lane in range(lanes):
         s = in_lane(site, lane)[0]
         if s.mode != _DIVERGED:
@@ -789,8 +789,8 @@ def run_block(
         The number of runs that have not ended.
     """
     running = runs
-    # Compute whole vector registers: the numbers of lanes without a run have no meaning. One or
-    # two additional lanes are faster without vectors.
+    # Compute complete vector registers, although the results in lanes without a run are
+    # meaningless. For one or two additional lanes, scalar code is faster.
     lanes = runs if 0 < runs % 8 <= 2 else (runs + 7) // 8 * 8
     for i in range(addresses.shape[0]):
         next_ns[i] = tick_ns(ticks[i], rates_hz[i]) if ticks[i] < end[i] else NEVER_NS

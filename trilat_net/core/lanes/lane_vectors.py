@@ -166,7 +166,7 @@ def _define_unary(function: Any, generate: Callable[..., Any]) -> None:
 
 
 def _call_llvm(name: str) -> Callable[..., Any]:
-    """Returns a function that generates a call of an LLVM function, such as sqrt."""
+    """Returns a function that generates a call to an LLVM function, such as sqrt."""
 
     def generate(builder: Any, number: Any) -> Any:
         floats = _LLVM_KINDS["f8"]

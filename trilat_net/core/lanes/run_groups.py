@@ -72,9 +72,9 @@ class RunGroup:
             try:
                 self._lanes.advance_to(until_s)
             except Exception:
-                # The law of one run failed, which ended the tick of all runs. Each run still
-                # has the state of the previous call. Computed one by one, only the run whose
-                # law fails ends.
+                # The law of one run failed, which aborted the tick for all runs. Each run still
+                # has its state from the previous call. When they are computed one by one, only
+                # the run whose law fails ends.
                 self._lanes = None
             else:
                 return
@@ -120,7 +120,7 @@ class RunGroup:
             else:
                 groups.setdefault(RunStructure.find(run), []).append(index)
 
-        # A group has at most as many runs as the vector code has lanes.
+        # A group contains at most as many runs as the vector code has lanes.
         for indices in groups.values():
             for first in range(0, len(indices), LANES):
                 members = indices[first : first + LANES]

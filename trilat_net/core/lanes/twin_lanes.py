@@ -85,7 +85,7 @@ class TwinLanes(LaneRun):
         super().__init__([run], 1 << kept.bit_length())
         self._count = count
         self._feed = feed
-        # The run and its twins have the same initial state, which all lanes contain already.
+        # The run and its twins have the same initial state, which all lanes already contain.
         self.runs = [run] * count
         self._states[:] = self._states[:, :, :1]
         run.plan(ticks)
@@ -142,7 +142,7 @@ class TwinLanes(LaneRun):
                 state=self._states[0, 0, 0],
                 used=self._used,
             )
-        # The number of runs is rounded up to whole vector registers of eight numbers.
+        # The number of runs is rounded up to complete vector registers of eight values.
         lanes = -(-self._count // 8) * 8
         self._used[:, :, 1:lanes] = self._used[:, :, :1]
         return age
@@ -152,7 +152,7 @@ class TwinLanes(LaneRun):
 
         The times are in ns since the common start of the sites.
         """
-        # The equation of `tick_ns`.
+        # Same equation as in `tick_ns`.
         ticks = np.arange(self._last_ticks[i], self._ticks[i])
         times_ns: IntArray = ticks * NS_PER_S // self._rates_hz[i]
         return times_ns

@@ -121,7 +121,7 @@ def delay_sample(stamp_ns: int, delay_us: int, link: LinkRow, model: Row) -> int
         link: State of the link. `due_before`, the latest delivery so far, is updated.
         model: Delay and loss model in force.
     """
-    # The play-out buffer of the receiver keeps each sample for at least `playout_us`.
+    # The receiver's play-out buffer holds each sample for at least `playout_us`.
     due_ns: int = stamp_ns + max(delay_us, model.playout_us) * 1000
     if model.in_order == 1:
         # A sample waits for all older samples.
@@ -169,9 +169,9 @@ def find_due_ns(
         is_duplicated = u < model.duplicate
         if is_duplicated:
             link.copies += 1
-            # The receiver uses whichever of the two arrives first. The kinds before AR1 are
-            # distributions, from which the copy gets a delay of its own. With all other kinds,
-            # the copy has the delay of the sample and changes nothing.
+            # The receiver uses whichever of the two arrives first. The types before AR1 are
+            # distributions, from which the copy draws its own delay. With all other types, the
+            # copy has the same delay as the sample and makes no difference.
             draws_delay_of_copy = model.kind < _AR1
             if draws_delay_of_copy:
                 copy_us = clamp_delay_us(draw_delay_us(link.key, sample, COPY, model))
@@ -234,7 +234,7 @@ def select_model(sample: int, stamp_ns: int, link: LinkRow, models: RowArray) ->
         True if the sample is the first one of the model.
     """
     fresh = sample == 0
-    # Move on while a later model has come into force before the sample was sent.
+    # Advance while a later model took effect before the sample was sent.
     while link.model + 1 < link.models and models[link.model + 1].from_ns <= stamp_ns:
         link.model += 1
         fresh = True

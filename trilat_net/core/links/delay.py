@@ -223,7 +223,7 @@ def max_delay_us(models: Sequence[LinkModel], traces: Sequence[Points | None]) -
     bounds_us = []
     for model, trace in zip(models, traces, strict=True):
         longest_us = min(_longest_us(model, trace), MAX_DELAY_US)
-        # One more, because delays are rounded to whole microseconds.
+        # Add one, because delays are rounded to whole microseconds.
         rounded_us = math.ceil(longest_us) + 1
         bounds_us.append(max(rounded_us, model.playout_us))
     return min(MAX_DELAY_US, max(bounds_us))
@@ -402,7 +402,7 @@ def _custom_delay_us(
     Returns:
         The delay in us, not rounded.
     """
-    # The key is an unsigned number, the field a signed one with the same bits.
+    # The key is unsigned, whereas the field is signed, with the same bits.
     model.key = np.int64(key)
     model.sample = sample
     model.stamp_ns = stamp_ns

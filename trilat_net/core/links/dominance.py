@@ -79,7 +79,7 @@ class DominanceMatrix:
         for site in range(len(reach)):
             is_mutual = reach[site] & reach[:, site]
             group = tuple(np.flatnonzero(is_mutual).tolist())
-            # The first site of a group stands for the group.
+            # The first site of a group represents the group.
             is_first = group[0] == site
             is_closed = reach[site].sum() == len(group)
             if is_first and is_closed:
@@ -105,7 +105,8 @@ class DominanceMatrix:
         for first in range(len(alpha)):
             if D[first]:
                 continue
-            # The first site of a group: the balance with its neighbours gives their weights.
+            # Start at the first site of a group: the balance with its neighbours determines
+            # their weights.
             D[first] = 1.0
             unvisited = [first]
             while unvisited:
@@ -286,7 +287,7 @@ def fold_ramps(t_ns: int, count: int, ramps: Array) -> int:
     if last_started < 2:
         return count  # no ramp is older than the last ramp that has started
 
-    # The factors at the start of the current ramp, from ramp to ramp.
+    # Compute the factors at the start of the current ramp, going from ramp to ramp.
     factors = ramps[0, RAMP_COLUMNS:].copy()
     current = 0
     for following in range(1, last_started + 1):
@@ -406,7 +407,7 @@ def update_reference(t_ns: int, site: SiteRow, links: RowArray, ramps: Array) ->
         links: State of each link from another site, one row per link.
         ramps: Changes of the dominance factors, see `apply_ramps`.
     """
-    # Row 0 of the ramps has the factors at the start, which apply if there is no other row.
+    # Row 0 of the ramps contains the initial factors, which apply if there is no other row.
     if site.ramps > 1 or site.degrades:
         apply_ramps(t_ns, site.ramps, ramps, links)
     if site.degrades:

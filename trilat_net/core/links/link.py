@@ -171,8 +171,7 @@ def release_tick(tick: int, rate_hz: int, link: LinkArrays) -> int:
     """
     row: LinkRow = link.state[0]
     dues = link.dues
-    # Compute the due times (times of delivery) up to this sample, unless they are known
-    # already.
+    # Compute the due times (delivery times) up to this sample, unless they are already known.
     schedule_deliveries(
         sample=tick, link=row, models=link.models, dues=dues, points=link.points
     )
@@ -277,7 +276,7 @@ def accept_sample(
     dues = link.dues
     calendar = link.calendar
     row.accepted += 1
-    # The times of delivery are computed up to the sample `row.scheduled`.
+    # Delivery times have been computed up to the sample `row.scheduled`.
     is_scheduled = tick <= row.scheduled
     if tick < 0 or (not is_scheduled and _is_far_ahead(k, rate_hz, tick, row.rate_hz)):
         row.refused += 1
@@ -298,8 +297,8 @@ def accept_sample(
         if model.kind != _MEASURED:  # on a measured link every sample is due before it arrives
             row.late += 1
         release = k
-    # The driver has enlarged the calendar as far as `CalendarSizer` permits. A sample for which
-    # there is still no room is rejected.
+    # The driver has enlarged the calendar as far as `CalendarSizer` permits. A sample that
+    # still does not fit is rejected.
     if release - k >= calendar.shape[0]:
         row.refused += 1
         return
@@ -340,7 +339,7 @@ def release_sample(k: int, rate_hz: int, link: LinkArrays) -> None:
     row: LinkRow = link.state[0]
     row.new = 0
     calendar = link.calendar
-    # The last tick of the peer that has begun by now.
+    # The last tick that the peer has started by now.
     peer_tick = k if row.rate_hz == rate_hz else k * row.rate_hz // rate_hz
     schedule_deliveries(
         sample=peer_tick, link=row, models=link.models, dues=link.dues, points=link.points

@@ -151,7 +151,7 @@ def _is_near(back: int, site: SiteRow, links: RowArray) -> bool:
         weighted_sum_with_peer = weighted_sum + link.alpha * link.q[i]
         reference_with_peer = weighted_sum_with_peer / (total + link.alpha)
         reference_without_peer = weighted_sum / total
-        # The comparison is false for NaN, which must not count as near.
+        # The comparison is false for NaN, so NaN is never near.
         is_within_limit = abs(reference_with_peer - reference_without_peer) <= site.align_limit
         if not is_within_limit:
             return False
@@ -246,7 +246,8 @@ def regroup(t_ns: int, site: SiteRow, links: RowArray) -> None:
             link.gone = 0.0
             site.regrouped = _RESTORED
 
-    # A change of the shares may give all of them to lost peers. Then no peer counts as lost.
+    # A change of the shares may give all of them to lost peers. In that case, no peer is
+    # treated as lost.
     if not _redistribute_shares(links):
         for j in range(links.shape[0]):
             link = links[j]

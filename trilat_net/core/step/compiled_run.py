@@ -159,7 +159,7 @@ class CompiledRun:
         self.layouts = [setup.layout for setup in setups]
         self.rates_hz = [setup.rate_hz for setup in setups]
         self._links = [setup.links for setup in setups]
-        # The samples that each site uses in all ticks, computed when they are read.
+        # The samples that each site uses in all ticks. They are computed on demand.
         self._used: dict[int, IntArray] = {}
         self._plug_laws(setups)
         self._progress: RowArray = np.zeros(count, PROGRESS_DTYPE)
@@ -225,7 +225,7 @@ class CompiledRun:
         """
         self._laws: dict[int, PlainLaw | CompiledLaw] = {}
         self._law_arrays: LawArrays | None = None
-        # The arrays for numbers that laws send exist only if a site has a user's law.
+        # The arrays for values sent by laws exist only if a site has a user's law.
         has_user_laws = self._tables.channel is not None
         if not has_user_laws:
             return
@@ -424,7 +424,7 @@ class CompiledRun:
         except LawFailed:
             raise
         except Exception as error:
-            # A compiled law may raise any error. Each law can tell whether it raised the error.
+            # A compiled law may raise any error. Each law knows whether it raised the error.
             failures = [law.find_failure(error) for law in compiled]
             law_failures = filter(None, failures)
             # An error that no law caused is raised unchanged.
@@ -471,7 +471,7 @@ class CompiledRun:
                     laws=self._law_arrays,
                 )
                 if mode == Mode.DIVERGED:
-                    # The other ticks of this time are still executed.
+                    # The other ticks at this time are still executed.
                     progress[i]["diverged_ns"] = t_ns
                     last_ns = t_ns
 

@@ -129,7 +129,7 @@ def _accept_record(
     qd_column = n
     tau_x_column = 3 * n + 2 * m
     if peer.task:
-        # x, xd and the wrench are the last vectors before the numbers that the law sends.
+        # x, xd and the wrench are the last vectors before the values sent by the law.
         q_column = first_sent - 3 * m
         qd_column = first_sent - 2 * m
         tau_x_column = first_sent - m
@@ -251,7 +251,7 @@ def update_peaks(
     joints = peaks.shape[0] // 3
     pose = first_sent_column(s) - 3 * s.shared if s.task else 0
     reference = 2 * s.joints
-    # A task may have fewer coordinates than the arm has joints, or more: the rest are zeros.
+    # A task may have fewer or more coordinates than the arm has joints. The rest are zeros.
     for i in range(joints):
         e = 0.0
         speed = 0.0
@@ -465,8 +465,8 @@ def _compute_torque(
     if laws is None:
         torque_stage(arrays.site[i], chain)
         return
-    # The channel contains the numbers that other sites' laws send to this law. A site with a
-    # compiled law has such a channel.
+    # The channel contains the values that other sites' laws send to this law. A site with a
+    # compiled law always has a channel.
     channel = channel_of(arrays.channel, i)
     is_compiled = laws.addresses[i] != 0
     if not is_compiled or channel is None:

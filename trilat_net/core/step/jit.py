@@ -248,7 +248,7 @@ class _LeafLocator:
         return str(root / self._py_file.parent.name)
 
     def get_source_stamp(self) -> str:
-        # Some leaves are outside of the core, whose hash names the directory.
+        # The directory is named after a hash of the core, but some leaves are outside the core.
         return _hash_folder(self._py_file.parent)
 
     def get_disambiguator(self) -> str:
@@ -286,7 +286,7 @@ class _LeafCacheImpl(CompileResultCacheImpl):
         name, kind, code = content[0]
         is_inner = kind == _INNER
         if not is_inner:
-            # Numba would take the names of the functions from the LLVM code.
+            # Numba would read the function names from the LLVM code.
             function = content[1]
             symbols = {function.llvm_func_name, function.llvm_cpython_wrapper_name}
             context.codegen()._engine._defined_symbols.update(symbols)
@@ -294,10 +294,10 @@ class _LeafCacheImpl(CompileResultCacheImpl):
 
         library = _LeafLibrary(context.codegen(), name)
         library.is_inner = True
-        # No machine code is needed, so the library counts as complete with its LLVM code.
+        # No machine code is needed, so the library is complete once it has LLVM code.
         library._finalized = True
         library._final_module = parse_bitcode(code)
-        # The order of `CompileResult._reduce`.
+        # In the order used by `CompileResult._reduce`.
         names = (
             "fndesc",
             "environment",
@@ -522,7 +522,7 @@ class _LeafCompiler(Compiler):
         state.library.is_inner = is_inner
         state.flags.noalias = self.has_distinct_arguments and not is_inner
         if is_inner:
-            # No machine code, and no wrappers by which Python or C could call it.
+            # Generates neither machine code nor wrappers for calls from Python or C.
             state.flags.no_compile = True
             state.flags.no_cpython_wrapper = True
             state.flags.no_cfunc_wrapper = True
@@ -666,7 +666,7 @@ class _Leaf(CPUDispatcher):
         """
         plain_arguments = tuple(map(types.unliteral, arguments))
         plain_keywords = {name: types.unliteral(kind) for name, kind in keywords.items()}
-        # The caller may be a plain function of Numba, such as a user's law. It also gets an
+        # The caller may be a plain Numba function, such as a user's law. It is also given an
         # inner leaf, because a reference to machine code would be missing when the caller is
         # loaded again.
         with _compiling_caller():
@@ -736,7 +736,7 @@ class _Leaf(CPUDispatcher):
             if loaded is not None:
                 return loaded
 
-        # Report the compilation, as Numba's own method does.
+        # Report the compilation like Numba's own method.
         data = {"dispatcher": self, "args": argument_types}
         with event.trigger_event("numba:compile", data=data):
             compiled = self._compiler.compile(argument_types, return_type)

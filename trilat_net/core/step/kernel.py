@@ -138,7 +138,7 @@ def _update_estimate(k: int, s: SiteRow, chain: RowArray | None) -> None:
             overwritten with the sum of both until stage 8 sets it again.
         chain: Data of the joints, one row per joint. None for the planar two-link arm.
     """
-    # `adapts` is evaluated last, because it is the costly condition.
+    # `adapts` is evaluated last, because it is the expensive condition.
     if updates_estimate(k, s) and adapts(s):
         sum_trapezoid(s)
         _advance_estimate(s, chain, 0.5 / s.rate_hz, s.Yr_before)
@@ -228,10 +228,10 @@ def guard_torque(k: int, t_ns: int, s: SiteRow, chain: RowArray | None) -> None:
     """
     resting = False
     if s.on_stale == _GLIDE:
-        # A site with the reason NOT_FINITE is in FAULT already, and does not enter it again.
+        # A site with the reason NOT_FINITE is already in FAULT, and does not enter it again.
         if s.reason != _NOT_FINITE and s.mode != _DIVERGED and not is_torque_finite(s):
             latch_mode(t_ns, s, _FAULT, _NOT_FINITE)
-        # The mode may have just become FAULT, in which the arm rests.
+        # The mode may just have changed to FAULT, in which the arm rests.
         resting = rests(s)
         if resting:
             if not rests_by_law(s):
@@ -260,7 +260,7 @@ def _write_record(s: SiteRow, row: Array) -> None:
     joints = s.joints
     shared = s.shared
     parameters = s.parameters
-    # `first` is the index of the first number of the next group.
+    # `first` is the index of the first value in the next group.
     first = 2 * joints
     for i in range(joints):
         row[i] = s.q[i]
@@ -271,8 +271,8 @@ def _write_record(s: SiteRow, row: Array) -> None:
     first += 2 * shared
     for i in range(joints):
         row[first + i] = s.tau[i]
-        # This is a subtraction, not a negation, so that the record has 0.0 and not -0.0 where
-        # nothing acts.
+        # A subtraction instead of a negation, so that the record contains 0.0 and not -0.0
+        # where nothing acts.
         row[first + joints + i] = 0.0 - s.on_arm[i]
     first += 2 * joints
     for p in range(parameters):

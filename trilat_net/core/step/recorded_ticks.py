@@ -226,7 +226,7 @@ def _put_arrivals(
     Returns:
         The CRC-32 of the arrivals, which must equal the checksum in the record.
     """
-    # A row of `samples` has positions, velocities and forces, `shared` numbers each.
+    # A row of `samples` contains positions, velocities and forces, with `shared` values each.
     shared = rules.shared
     first_force = 2 * shared
     crc = _ALL_BITS
@@ -321,7 +321,7 @@ def _equals_record(
         is_integer = views.memory[i, 2]
         computed_bits = views.links[index] if is_of_link else views.site[index]
         if is_integer:
-            # The record has the integer as a float, which is never -0.0.
+            # The record stores the integer as a float, which is never -0.0.
             logged = rows.memory[first + i]
             is_negative_zero = computed_bits == 0 and 1.0 / logged < 0.0
             if logged != float(computed_bits) or is_negative_zero:

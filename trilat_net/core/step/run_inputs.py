@@ -46,7 +46,7 @@ class RunInputs(NamedTuple):
             sites: Number of sites.
         """
         most_peers = max(sites - 1, 1)
-        # Arrays for 0 ticks tell the compiled loop that nothing was recorded, see
+        # To the compiled loop, arrays for 0 ticks mean that nothing was recorded, see
         # `ReplayedInputs`.
         feed = ReplayedInputs(
             first=np.zeros((sites, most_peers, 0), np.int64),

@@ -70,7 +70,7 @@ class RunState:
             if not array.size:
                 continue
             flat = array.reshape(-1).view(np.int64)
-            # If `reshape` had made a copy, changes would not reach the run.
+            # If `reshape` had made a copy, changing the views would not change the run.
             assert np.shares_memory(flat, array)
             self._bits.append(flat)
             self._floats.append(np.tile(self.mark_floats(array.dtype), array.size))
@@ -92,7 +92,7 @@ class RunState:
                 bits[:] = other_bits
                 continue
 
-            # Only numbers that differ are computed. Rounding would change the others.
+            # Only compute values that differ, because rounding would change the others.
             changed = np.flatnonzero((bits != other_bits) & is_float)
             x = bits.view(np.float64)[changed]
             y = other_bits.view(np.float64)[changed]

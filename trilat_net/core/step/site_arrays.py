@@ -518,7 +518,7 @@ class CalendarSizer:
         needed = ahead + longest_wait
         pages = arrays.calendars.shape[1]
         if needed > pages and pages < self.most_pages:
-            # The number of pages is a power of two, so that a modulo is a mask of bits.
+            # The number of pages is a power of two, so that a modulo is a bit mask.
             next_power_of_two = 1 << needed.bit_length()
             pages = min(next_power_of_two, self.most_pages)
             # Samples of missed ticks still wait in the pages of those ticks.
@@ -541,7 +541,7 @@ def _add_ramp(arrays: SiteArrays, ramp: DominanceRamp) -> None:
     site: Row = arrays.site[0]
     count = int(site.ramps)
     ramps = arrays.ramps
-    # Row 0 holds the weights before the first change, and stays first.
+    # Row 0 holds the factors before the first change, and stays first.
     starts_ns = ramps[1:count, 0]
     index = 1 + int(np.searchsorted(starts_ns, ramp.start_ns, side="right"))
     later_ramps = ramps[index:count].copy()
@@ -570,8 +570,7 @@ def _add_model(arrays: SiteArrays, peer: int, model: LinkModel) -> None:
     models[index + 1 : count + 1] = later_models
     models[index] = model
     link.models = count + 1
-    # The model in force moves down one row. Samples that are scheduled already keep their
-    # times.
+    # The model in force moves down one row. Samples already scheduled keep their times.
     if link.model >= index:
         link.model += 1
 
@@ -651,8 +650,7 @@ def _stack_channels(
     received = _stack_padded([channel.received for channel in channels])
     columns = _stack_padded([channel.columns for channel in channels])
     for channel, padded in zip(channels, columns, strict=True):
-        # Zeros would mean column 0, so the padding is -1, which stands for a value that is not
-        # sent.
+        # Zeros would mean column 0, so pad with -1, which stands for a value that is not sent.
         count = channel.columns.shape[1]
         padded[:, count:] = -1
     return ChannelArrays(waiting, received, columns)
@@ -721,7 +719,7 @@ def _build_site(setup: SiteSetup, layout: Layout) -> RowArray:
         s.singular_value = task.singular_value
         s.axes[: site_layout.shared] = task.axes
         s.posture[: site_layout.joints] = task.posture or setup.q0
-    # Creating a view of each field would take longer than copying the numbers.
+    # Creating a view of each field would take longer than copying the values.
     floats = site.view(np.float64)
     places = _find_places(layout, site_layout)
     for name, numbers in _list_vectors(setup).items():

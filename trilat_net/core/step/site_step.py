@@ -149,7 +149,7 @@ class Site:
         if self._law is not None and self._glides:
             self._law_memory = self._law.memory
         self._remembers = self._glides or self._user_law is not None
-        # Looking up a field of a structured array takes longer than reading its numbers.
+        # Looking up a field of a structured array takes longer than reading its values.
         s = self._site
         self._q_held = s["q_held"][0]
         self._return_from_ns = s["return_from_ns"]
@@ -178,7 +178,8 @@ class Site:
             so writing to them moves the live hand.
         """
         actors = self._arrays.actors
-        # The field `hand` of a record has grip, number, source, target and rate of the target.
+        # The field `hand` of a record contains grip, number, source, target and target
+        # velocity.
         coordinates = (self.layout.hand - 3) // 2
         # The field `a` of a live hand is its target, and `b` the target one second later.
         grip = actors["grip"][index : index + 1]
@@ -210,9 +211,8 @@ class Site:
         arrays = self._arrays
         buffers = self._buffers
         self._law = plug_law(self._user_law, setup, arrays, self._sent)
-        # Compile now, and not within the time that the law has for a tick. Only the types of
-        # the arguments matter: the zeros take the place of the tick, its time in ns, and the
-        # number of arrivals.
+        # Compile now, to avoid using up the law's time for a tick. Only the argument types
+        # matter: the zeros stand for the tick, its time in ns, and the number of arrivals.
         self._law.bind()
         self._sense = bind_leaf(sense_stages, 0, 0, 0, arrays, buffers)
         self._act = bind_leaf(
@@ -255,17 +255,17 @@ class Site:
         """
         links_may_be_ahead = k <= self._site["first"]
         if links_may_be_ahead:
-            # The links may be ahead of tick k: start them anew.
+            # The links may be ahead of tick k, so start them from scratch.
             self.restore_links(k, [None] * len(self.peers), ())
         self._site["first"] = k
         for n, link in enumerate(self._links):
             peer_hz = int(link["rate_hz"])
             last_sample = (k - 1) * peer_hz // self.rate_hz
             if last_sample >= 0:
-                # The result is not needed: the call advances the random models of the link to
-                # this sample.
+                # The result is not needed. The call advances the link's random models to this
+                # sample.
                 find_release(n, last_sample, self._arrays)
-        # Copies of samples that were sent before the site joined do not count.
+        # Copies of samples that were sent before the site joined are not counted.
         self._links["copies"] = 0
 
     def step(self, tick: TickInput) -> TickRecord:
@@ -382,7 +382,7 @@ class Site:
         s: Row = self._site[0]
         s.q = measured.q
         s.qd = measured.qd
-        # The record has the sign of Eq. (8); the row has the torque ON the arm.
+        # The record uses the sign of Eq. (8); the row contains the torque ON the arm.
         s.sensed = [-torque for torque in measured.tau_x] or 0.0
 
     def _compute_law(self, k: int, t_ns: int) -> list[float]:
@@ -482,7 +482,7 @@ class Site:
         """
         if self._hand is None:
             return ()
-        # Views of the row: the assignments change its numbers.
+        # These are views of the row, so assigning to them changes the row.
         grip, target, target_ahead = self._hand
         action = list(vector) or HandInForce.list_empty(len(target))
         hand = HandInForce.read(action)
@@ -638,7 +638,8 @@ class Site:
         if self._law is not None:
             self._law.restore(law_memory)
             self._law_memory = list(law_memory)
-        # Compute what is in no record: errors, external torques, and the motion after `last`.
+        # Compute what no record contains: errors, external torques, and the motion after
+        # `last`.
         resume_stages(last.tick, self._arrays)
 
     def _restore_life(self, memory: list[float]) -> list[float]:
@@ -670,7 +671,7 @@ class Site:
         s.reason = int(memory[shared])
         remaining = memory[shared + 1 :]
 
-        # Each number is removed from `remaining` once it is restored.
+        # Each value is removed from `remaining` once it has been restored.
         self._links["used_ns"] = remaining[:peers]
         remaining = remaining[peers:]
         s.tau_held = remaining[:joints]
@@ -747,7 +748,7 @@ class Site:
         if sample is None or not len(sample.ch):
             channel.received[peer] = 0.0
             return
-        # The index -1 selects the last number, the appended zero.
+        # The index -1 selects the last element, the appended zero.
         sent_and_zero = np.append(sample.ch, 0.0)
         channel.received[peer] = sent_and_zero[channel.columns[peer]]
 
@@ -788,7 +789,7 @@ class Site:
                 self._tick_arrays = (*self._arrays, *self._buffers)
             self._pack_arrival(self._arrival_bytes, packed_bytes, peer, tick, *q, *qd)
             packed_bytes += self._arrival_size
-        # A sample without forces or numbers has an empty vector, which counts as zeros.
+        # A sample without forces or sent values has an empty vector, which is read as zeros.
         if self._keeps_forces:
             for n, arrival in enumerate(arrivals):
                 self._buffers.forces[n] = arrival.tau_x or 0.0

@@ -432,7 +432,7 @@ def describe_mode(
     else:
         reason = None
         text = "a peer is stale"
-    # The error of the law says more than the reason that a number is not finite.
+    # The law's error is more informative than the reason that a number is not finite.
     if law_failure is not None and find_life_reason(output) is LifeReason.NOT_FINITE:
         text = str(law_failure)
 
