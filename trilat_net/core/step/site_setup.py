@@ -103,8 +103,8 @@ class StaleRule(NamedTuple):
 class MotionLimits(NamedTuple):
     """Limits of an arm's joint angles, and of how fast its reference and torque may change.
 
-    Each limit is either a scalar that applies to all joints or coordinates, or has one entry
-    per joint or coordinate.
+    Each limit has either a single entry for all joints or coordinates, or one entry for each of
+    them.
 
     Attributes:
         q_min: Smallest joint angles, rad.
