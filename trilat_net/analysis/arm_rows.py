@@ -4,15 +4,6 @@ A record is the state of an arm in one period of its control loop. There are two
 the planar arm with two joints, and chains of any number of joints. `PlanarArmRows` and
 `ChainArmRows` have the same methods. Row k of their arguments and results belongs to record k.
 
-A chain has ten inertial parameters per link, but its torques depend only on some linear
-combinations of them, the base parameters. Estimation errors are expressed in the base
-parameters, which are found with a QR decomposition: M. Gautier, "Numerical calculation of the
-base inertial parameters of robots", J. Robotic Systems 8 (1991).
-
-Whether a rigid body can have the parameters of a link is checked by its pseudo-inertia: P. M.
-Wensing, S. Kim, J.-J. Slotine, "Linear matrix inequalities for physically consistent inertial
-parameter identification", IEEE Robotics and Automation Letters 3 (2018).
-
 Invariant:
     - The planar arm is computed independently of the simulation that executed the run.
     - A chain is computed by the simulation's own functions, which the tests compare with
@@ -21,7 +12,6 @@ Invariant:
 
 import math
 from dataclasses import dataclass
-from functools import lru_cache
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -37,7 +27,7 @@ from ..core import (
     forward_kinematics,
 )
 from ..records import JOINTS
-from ..scenario import ArmModel, Scenario
+from ..scenario import Scenario
 
 HANGING_RAD = 0.3
 """Largest angle between a hanging link and the downward vertical, in rad."""
@@ -511,6 +501,43 @@ class PlanarArmRows(NamedTuple):
             J=J.transpose(2, 0, 1),
         )
 
+    def joint_positions_m(self, q: Array) -> Array:
+        """Returns the positions of the base, the joints and the end effector, for drawing.
+
+        Lines between successive points are the links of the arm.
+
+        Args:
+            q: Joint angles in K poses, shape (K, 2), in rad.
+
+        Returns:
+            Positions of these three points in m, shape (K, 3, 2).
+        """
+        points_per_pose = 1 + JOINTS
+        points = np.zeros((len(q), points_per_pose, 2))
+        for pose, angles in zip(points, q, strict=True):
+            pose[1:] = forward_kinematics(self.lengths_m, angles)
+        return points
+
+    @property
+    def upright_axes(self) -> None:
+        """Always `None`, because the planar arm is drawn in its own plane.
+
+        `ChainArmRows.upright_axes` contains the axes of a frame that stands upright.
+        """
+        return
+
+    @property
+    def least_inertia_kg_m2(self) -> float:
+        """A lower bound on the eigenvalues of the inertia matrix M(q) for all poses q.
+
+        The least eigenvalue occurs at cos q2 = 1 or -1.
+        """
+        poses = np.array([[0.0, 0.0], [0.0, np.pi]])
+        extreme_poses = PlacedArm(0.0, self.lengths_m, poses)
+        inertia_matrices = extreme_poses.inertia_matrix(self.theta).T
+        eigenvalues = np.linalg.eigvalsh(inertia_matrices)
+        return float(eigenvalues.min())
+
     def hanging_angle(self, q: Array) -> float:
         """Returns the largest angle between a link and the direction straight down, in rad.
 
@@ -794,6 +821,53 @@ class ChainArmRows(NamedTuple):
         rate: Array = turning + moving
         return rate.transpose(0, 2, 1)
 
+    def joint_positions_m(self, q: Array) -> Array:
+        """Returns the positions of the base, the joints and the end effector, for drawing.
+
+        Lines between successive points are the links of the arm.
+
+        Args:
+            q: Joint angles in K poses, shape (K, n), in rad.
+
+        Returns:
+            Positions of these L points in m, shape (K, L, 3).
+        """
+        return self._dynamics.place_points(q)
+
+    @property
+    def upright_axes(self) -> Array:
+        """The axes of a frame that stands upright, for drawings of the arm.
+
+        A URDF file may mount the base of a chain in any orientation. The direction of gravity
+        shows which way is up. Without gravity, the z axis of the base counts as up.
+
+        The rows are the unit vectors forward, sideways and up, in the frame of the base, shape
+        (3, 3). The product of points, shape (..., 3), and the transpose are the upright
+        coordinates.
+        """
+        gravity = np.array(self.chain.gravity_m_s2)
+        size = float(np.linalg.norm(gravity))
+        up = np.array([0.0, 0.0, 1.0])
+        if size:
+            up = -gravity / size
+        # the first axis that is not nearly vertical: x, unless gravity acts along x
+        is_vertical = np.abs(up) > 0.9
+        axis_index = int(np.argmin(is_vertical))
+        axis = np.eye(3)[axis_index]
+        vertical_part = (axis @ up) * up
+        forward = axis - vertical_part
+        forward /= np.linalg.norm(forward)
+        sideways = np.cross(up, forward)
+        return np.array([forward, sideways, up])
+
+    @property
+    def least_inertia_kg_m2(self) -> float:
+        """A lower bound on the eigenvalues of the inertia matrix M(q) for all poses q.
+
+        The bound is the least inertia of a drive, which moves with its joint.
+        """
+        return min(joint.armature_kg_m2 for joint in self.chain.joints)
+
     def hanging_angle(self, q: Array) -> float:
         """Returns an angle, in rad, that says how far the chain is from hanging straight down.
 
@@ -873,226 +947,3 @@ def build_arm_rows(scenario: Scenario, site: str) -> ArmRows:
         task = chain.task._replace(posture=spec.q0_rad)
         chain = chain._replace(task=task)
     return ChainArmRows(model.theta, chain)
-
-
-def joint_positions_m(arm: ArmModel, q: Array) -> Array:
-    """Returns the positions of the base, the joints and the end effector, for drawing an arm.
-
-    Lines between successive points are the links of the arm.
-
-    Args:
-        arm: The arm.
-        q: Joint angles in K poses, shape (K, n), in rad.
-
-    Returns:
-        Positions of these L points in m, shape (K, L, 2) for the planar arm, or (K, L, 3) for
-        chains.
-    """
-    if arm.chain is not None:
-        return ChainDynamics(arm.chain, arm.theta).place_points(q)
-    points_per_pose = 1 + JOINTS
-    points = np.zeros((len(q), points_per_pose, 2))
-    for pose, angles in zip(points, q, strict=True):
-        pose[1:] = forward_kinematics(arm.lengths_m, angles)
-    return points
-
-
-def upright_axes(chain: ChainSetup) -> Array:
-    """Returns the axes of a frame that stands upright, for drawings of the arm.
-
-    A URDF file may mount the base of a chain in any orientation. The direction of gravity shows
-    which way is up. Without gravity, the z axis of the base counts as up.
-
-    Returns:
-        Unit vectors forward, sideways and up as rows, in the frame of the base, shape (3, 3).
-            The product of points, shape (..., 3), and the transpose are the upright
-            coordinates.
-    """
-    gravity = np.array(chain.gravity_m_s2)
-    size = float(np.linalg.norm(gravity))
-    up = np.array([0.0, 0.0, 1.0])
-    if size:
-        up = -gravity / size
-    # the first axis that is not nearly vertical: x, unless gravity acts along x
-    is_vertical = np.abs(up) > 0.9
-    axis_index = int(np.argmin(is_vertical))
-    axis = np.eye(3)[axis_index]
-    vertical_part = (axis @ up) * up
-    forward = axis - vertical_part
-    forward /= np.linalg.norm(forward)
-    sideways = np.cross(up, forward)
-    return np.array([forward, sideways, up])
-
-
-DEPENDENT_SHARE = 1e-9
-"""Largest part of a column that is independent of the columns before it for the column to count
-as dependent on them, relative to the column.
-"""
-
-
-class _BaseParameters(NamedTuple):
-    """Base parameters of an arm: combinations of masses and inertias that torques determine.
-
-    No measurement of torque and motion can determine every single dynamic parameter in the
-    vector theta of a chain. Such a measurement determines only the B linear combinations in the
-    rows of `combination`, and the base parameters are combination @ theta.
-
-    Attributes:
-        kept: For each combination, the index of the parameter after which the combination is
-            named, ascending, shape (B,).
-        combination: Factors of all P parameters in each combination, shape (B, P). The factor
-            of the parameter that gives the name is 1.
-    """
-
-    kept: NDArray[np.int64]
-    combination: Array
-
-
-def stack_regressors(arm: ChainArmRows, states: int) -> Array:
-    """Returns the regressors of random motions, stacked into one matrix.
-
-    The regressor maps the dynamic parameters to joint torques. The column space of this matrix
-    shows which combinations of parameters have an effect on torques.
-
-    Args:
-        arm: The chain with n joints.
-        states: Number of random states, each with angles, velocities and accelerations.
-
-    Returns:
-        Matrix, shape (states n, 10 n).
-    """
-    random = np.random.default_rng(1)
-    n = len(arm.chain.joints)
-    parameters = len(arm.theta)
-    q = random.uniform(-np.pi, np.pi, (states, n))
-    qd, qdd = random.normal(size=(2, states, n))
-    # column p of a regressor is the torque of a chain whose only nonzero parameter is p, 1
-    state_of_row = np.repeat(np.arange(states), parameters)
-    unit_parameters = np.tile(np.eye(parameters), (states, 1))
-    links = arm.without_drives()
-    torque = links.law_torque(
-        theta_hat=unit_parameters,
-        q=q[state_of_row],
-        qd=qd[state_of_row],
-        v=qd[state_of_row],
-        a=qdd[state_of_row],
-    )
-
-    columns = torque.reshape(states, parameters, n)
-    regressors = columns.transpose(0, 2, 1)
-    return regressors.reshape(-1, parameters)
-
-
-@lru_cache(maxsize=64)
-def _find_chain_base(chain: ChainSetup, learnt: tuple[bool, ...]) -> _BaseParameters:
-    """Finds the base parameters of a serial arm by a QR decomposition (Gautier 1991).
-
-    Base parameters are the combinations of masses and inertias that joint torques determine. If
-    a column of the stacked regressors depends linearly on the columns before it, torques do not
-    determine the parameter of this column by itself.
-
-    Args:
-        chain: The chain.
-        learnt: True for each parameter that the control law learns.
-    """
-    arm = ChainArmRows(np.zeros(len(learnt)), chain)
-    # random motions excite every combination that has an effect on the torques
-    regressors = stack_regressors(arm, 4 * LINK_PARAMETERS)
-    learnt_columns = regressors[:, list(learnt)]
-    learnt_indices = np.flatnonzero(learnt)
-
-    matrix_norm = float(np.linalg.norm(learnt_columns))
-    root_of_columns = np.sqrt(learnt_columns.shape[1])
-    least_norm = DEPENDENT_SHARE * matrix_norm / root_of_columns
-
-    basis = np.zeros((len(learnt_columns), 0))
-    independent = []
-    for column_index, column in enumerate(learnt_columns.T):
-        # Gram-Schmidt, twice: the first pass leaves rounding errors of the size of the column
-        remainder = column - basis @ (basis.T @ column)
-        remainder -= basis @ (basis.T @ remainder)
-        remainder_norm = float(np.linalg.norm(remainder))
-        if remainder_norm > least_norm:
-            basis = np.column_stack([basis, remainder / remainder_norm])
-            independent.append(column_index)
-
-    independent_columns = learnt_columns[:, independent]
-    factors = np.linalg.lstsq(independent_columns, learnt_columns, rcond=None)[0]
-    contributes = np.abs(factors) > DEPENDENT_SHARE
-
-    parameter_indices = learnt_indices[independent]
-    base_count = len(independent)
-    combination = np.zeros((base_count, len(learnt)))
-    combination[:, learnt_indices] = np.where(contributes, factors, 0.0)
-    combination[:, parameter_indices] = np.eye(base_count)
-    return _BaseParameters(parameter_indices, combination)
-
-
-def find_base_parameters(arm: ArmRows, learnt: NDArray[np.bool_]) -> _BaseParameters:
-    """Finds which combinations of an arm's dynamic parameters can be learnt from its torques.
-
-    Torques do not determine every single parameter of a chain, but only some linear
-    combinations of the parameters, which are called base parameters. For the planar arm, each
-    of its five parameters is a base parameter.
-
-    Args:
-        arm: The arm, with P dynamic parameters.
-        learnt: True for each parameter that the control law learns, shape (P,). The other
-            parameters are in no combination.
-    """
-    if isinstance(arm, ChainArmRows):
-        return _find_chain_base(arm.chain, tuple(learnt.tolist()))
-    kept = np.flatnonzero(learnt)
-    combination = np.eye(len(learnt))[kept]
-    return _BaseParameters(kept, combination)
-
-
-def find_pseudo_inertias(theta: Array) -> Array:
-    """Returns the pseudo-inertia of every link, shape (n, 4, 4).
-
-    This symmetric matrix contains the ten parameters of a link, and is positive definite if and
-    only if a rigid body can have these parameters. It is [[S, m c], [m c', m]] with S = tr(I) /
-    2 - I. Here m is the mass of the link, m c its first moment, I its inertia, and tr the
-    trace.
-
-    Args:
-        theta: Parameters of the links, shape (10 n,).
-    """
-    links = theta.reshape(-1, LINK_PARAMETERS)
-    mass = links[:, 0]
-    moment = links[:, 1:4]
-    inertias = links[:, 4:]
-    xx, xy, yy, xz, yz, zz = inertias.T
-    row_x = [xx, xy, xz]
-    row_y = [xy, yy, yz]
-    row_z = [xz, yz, zz]
-    inertia = np.array([row_x, row_y, row_z])
-    inertia_of_link = inertia.transpose(2, 0, 1)
-    half_trace = 0.5 * (xx + yy + zz)
-    half_trace_of_link = half_trace[:, np.newaxis, np.newaxis]
-    S = half_trace_of_link * np.eye(3) - inertia_of_link
-
-    count = len(links)
-    pseudo_inertias = np.zeros((count, 4, 4))
-    pseudo_inertias[:, :3, :3] = S
-    pseudo_inertias[:, :3, 3] = moment
-    pseudo_inertias[:, 3, :3] = moment
-    pseudo_inertias[:, 3, 3] = mass
-    return pseudo_inertias
-
-
-def find_consistent_links(theta: Array) -> list[bool]:
-    """Finds the links whose learnt masses and inertias a rigid body can have.
-
-    A negative mass, for example, is impossible. The condition is that the link's pseudo-inertia
-    (see `find_pseudo_inertias`) is positive definite (Wensing et al. 2018).
-
-    Args:
-        theta: Parameters of the links, shape (10 n,).
-    """
-    pseudo_inertias = find_pseudo_inertias(theta)
-    eigenvalues = np.linalg.eigvalsh(pseudo_inertias)
-    least_eigenvalues = eigenvalues.min(axis=1)
-    is_positive_definite = least_eigenvalues > 0.0
-    consistent: list[bool] = is_positive_definite.tolist()
-    return consistent

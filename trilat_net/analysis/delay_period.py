@@ -125,7 +125,7 @@ def _find_near_period_s(
     return float(spans_s[first_match])
 
 
-class _DelayPeriod(NamedTuple):
+class DelayPeriod(NamedTuple):
     """The time after which all network delays and control periods repeat together.
 
     For example, a delay that alternates every 20 ms repeats after 40 ms. The exact stability
@@ -148,32 +148,45 @@ class _DelayPeriod(NamedTuple):
         """
         return self.span_s is not None and self.span_s == self.true_s
 
+    @classmethod
+    def of_links(cls, links: Sequence[LinkBase], rates_hz: Sequence[int]) -> "DelayPeriod":
+        """Finds the period after which the delays of links and the ticks of sites repeat.
 
-def find_delay_period(links: Sequence[LinkBase], rates_hz: Sequence[int]) -> _DelayPeriod:
-    """Finds the period after which the delays of links and the ticks of sites repeat.
+        A tick is one period of a site's control loop. The true period is the least common
+        multiple of the ticks and of the periods of all delays. If the true period is longer
+        than `MAX_PERIOD_TICKS`, the function looks for a shorter time after which the delays
+        nearly repeat.
 
-    A tick is one period of a site's control loop. The true period is the least common multiple
-    of the ticks and of the periods of all delays. If the true period is longer than
-    `MAX_PERIOD_TICKS`, the function looks for a shorter time after which the delays nearly
-    repeat.
+        Args:
+            links: Delay models of the links.
+            rates_hz: Tick rate of each site.
 
-    Args:
-        links: Delay models of the links.
-        rates_hz: Tick rate of each site.
+        Returns:
+            The period. Its attributes are `None` if a delay is random, or follows a trace that
+            ends.
+        """
+        for link in links:
+            if link.random or link.measured or is_ending_trace(link):
+                return cls(None, None)
+        cycles = [cycle for cycle in map(_find_cycle, links) if cycle is not None]
+        true_period = _find_common_period(cycles, math.gcd(*rates_hz))
+        true_s = float(true_period)
+        if true_s * max(rates_hz) <= MAX_PERIOD_TICKS:
+            return cls(true_s, true_s)
+        return cls(true_s, _find_near_period_s(cycles, rates_hz))
 
-    Returns:
-        The period. Its attributes are `None` if a delay is random, or follows a trace that
-        ends.
-    """
-    for link in links:
-        if link.random or link.measured or is_ending_trace(link):
-            return _DelayPeriod(None, None)
-    cycles = [cycle for cycle in map(_find_cycle, links) if cycle is not None]
-    true_period = _find_common_period(cycles, math.gcd(*rates_hz))
-    true_s = float(true_period)
-    if true_s * max(rates_hz) <= MAX_PERIOD_TICKS:
-        return _DelayPeriod(true_s, true_s)
-    return _DelayPeriod(true_s, _find_near_period_s(cycles, rates_hz))
+    @classmethod
+    def of_scenario(cls, scenario: Scenario) -> "DelayPeriod":
+        """Finds the time after which all delays and control periods repeat at the end of a run.
+
+        Models and rates that the scenario replaces before the end do not count.
+
+        Args:
+            scenario: Description of the experiment.
+        """
+        links = [find_final_link(scenario, name) for name in scenario.links]
+        rates_hz = [scenario.sites[name].rate_hz for name in scenario.names]
+        return cls.of_links(links, rates_hz)
 
 
 def is_ending_trace(link: LinkBase) -> bool:
@@ -201,19 +214,6 @@ def find_final_link(scenario: Scenario, name: str) -> LinkBase:
     for from_ns, later_link in scenario.scheduled_links(name):
         link = later_link if from_ns <= end_ns else link
     return link
-
-
-def find_final_delay_period(scenario: Scenario) -> _DelayPeriod:
-    """Finds the time after which all delays and control periods repeat at the end of a run.
-
-    Models and rates that the scenario replaces before the end do not count.
-
-    Args:
-        scenario: Description of the experiment.
-    """
-    links = [find_final_link(scenario, name) for name in scenario.links]
-    rates_hz = [scenario.sites[name].rate_hz for name in scenario.names]
-    return find_delay_period(links, rates_hz)
 
 
 def find_burst_interval_s(scenario: Scenario) -> float | None:

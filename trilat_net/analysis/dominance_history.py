@@ -61,6 +61,17 @@ class DominanceHistory(NamedTuple):
         return not has_steps and not has_ramps
 
     @classmethod
+    def of_scenario(cls, scenario: Scenario, site: str, t_s: Array) -> "DominanceHistory":
+        """Returns the dominance factors that the scenario plans for a site.
+
+        Args:
+            scenario: The description of the experiment.
+            site: Name of the site.
+            t_s: Ascending times, one tick period apart, shape (K,), in s.
+        """
+        return DominancePlan.of_scenario(scenario, site).evaluate(t_s)
+
+    @classmethod
     def of_log(cls, log: Log, site: str, t_s: Array) -> "DominanceHistory":
         """Returns the dominance factors of a site at successive ticks.
 
@@ -77,7 +88,7 @@ class DominanceHistory(NamedTuple):
             LogError: A record names a change that is not valid.
         """
         history = DominancePlan.of_log(log, site).evaluate(t_s)
-        is_present = ~find_lost_peers(log, site, t_s)
+        is_present = ~_find_lost_peers(log, site, t_s)
         if is_present.all():
             return history
 
@@ -95,6 +106,23 @@ class DominanceHistory(NamedTuple):
             rate=numerator / total**2,
             before=before / total_before,
         )
+
+    @classmethod
+    def list_ramp_spans_s(cls, log: Log, site: str) -> list[tuple[float, float]]:
+        """Lists the start and the end of each ramp of a site's dominance factors, in s.
+
+        The slopes of the factors change only at these times, as long as no peer is lost. The
+        start and the end of a sudden change are equal.
+
+        Args:
+            log: The log of the run.
+            site: Name of the site.
+
+        Raises:
+            LogError: A recorded change is not valid.
+        """
+        ramps = DominancePlan.of_log(log, site).ramps
+        return [(ramp.start_ns * 1e-9, ramp.end_ns * 1e-9) for ramp in ramps]
 
 
 class DominancePlan(NamedTuple):
@@ -208,7 +236,7 @@ class DominancePlan(NamedTuple):
         return DominanceHistory(alpha, rate, at_period_ends)
 
 
-def find_lost_peers(log: Log, site: str, t_s: Array) -> NDArray[np.bool_]:
+def _find_lost_peers(log: Log, site: str, t_s: Array) -> NDArray[np.bool_]:
     """Finds the times at which an arm continued without another arm whose messages had stopped.
 
     An arm counts as lost if no message from it arrived for some time, see `core.lost_peers`.
@@ -273,7 +301,7 @@ class PeerLoss(NamedTuple):
         losses = []
         for site in log.sites:
             site_log = log[site]
-            is_lost = find_lost_peers(log, site, site_log.t_s)
+            is_lost = _find_lost_peers(log, site, site_log.t_s)
             lost = is_lost.astype(int)
             times_s = site_log.t_s
             if len(site_log):

@@ -19,15 +19,14 @@ import msgspec
 
 from ..execution import FusedRun, SimulatedLog, simulate_columns
 from ..log import MIN_COVERAGE, Log
-from ..scenario import Scenario, describe_law_conditions, list_law_situations
+from ..scenario import Scenario
 from .blas_threads import limit_blas_threads
-from .certificate.certificate_result import Certificate
-from .certificate.observed_energy import find_energy_laws
+from .certificate.observed_energy import ObservedEnergy
 from .certificate.premise_quantities import MissingFunctional
-from .certificate.stability_certificate import certify_log
+from .certificate.stability_certificate import Certificate
 from .decision_facts import LoopRoots, RunFindings, StabilityDecision
 from .delay_period import find_final_link
-from .run_end import RunEnd, RunTrace, Stability
+from .run_end import RunEnd, Stability
 from .run_remarks import RunCircumstances
 from .stability_decision import decide_stability, is_decided_by_roots
 from .theory.loop_roots import find_log_roots, find_run_roots, resolve_final_scenario
@@ -52,7 +51,7 @@ def list_law_proofs(scenario: Scenario) -> list[str]:
     links = {name: find_final_link(scenario, name) for name in scenario.links}
     final_scenario = msgspec.structs.replace(scenario, links=links, timeline=())
     proofs = []
-    for _, law, situation in list_law_situations(final_scenario):
+    for _, law, situation in final_scenario.law_situations():
         condition = law.condition(situation)
         if condition is None or not condition.proves_decay:
             return []
@@ -70,9 +69,9 @@ def certify_run(
 ) -> Certificate:
     """Certifies whether a recorded run was stable, with all available checks.
 
-    In addition to the checks of `certify_log`, the run is repeated with small pushes, which
-    shows whether disturbances grow. The characteristic roots of the coupled arms are computed
-    at the end pose.
+    In addition to the checks of `Certificate.of_log`, the run is repeated with small pushes,
+    which shows whether disturbances grow. The characteristic roots of the coupled arms are
+    computed at the end pose.
 
     Args:
         log: The log of the run.
@@ -85,7 +84,7 @@ def certify_run(
     Raises:
         LogError: A record cannot be read, or contains a change that is not valid.
     """
-    certificate = certify_log(log, min_coverage=min_coverage, own_laws=own_laws)
+    certificate = Certificate.of_log(log, min_coverage=min_coverage, own_laws=own_laws)
 
     growth = None
     if twins != 0:
@@ -93,7 +92,7 @@ def certify_run(
 
     final_scenario = resolve_final_scenario(log)
     roots = find_log_roots(log, own_laws=own_laws)
-    conditions = describe_law_conditions(final_scenario, ticks_grow=roots.is_refutation)
+    conditions = final_scenario.describe_law_conditions(ticks_grow=roots.is_refutation)
 
     return replace(
         certificate,
@@ -154,8 +153,7 @@ def judge_virtual_run(
     if run.diverged_s is None:
         executed_scenario = msgspec.structs.replace(scenario, duration_s=run.ran_s)
     if end is None:
-        trace = RunTrace(run.buckets, run.tau_x, run.diverged_s)
-        end = trace.classify_end(executed_scenario)
+        end = RunEnd.of_run(run, executed_scenario)
     findings = RunFindings(
         end=end,
         roots=find_run_roots(executed_scenario, run),
@@ -174,11 +172,11 @@ def judge_virtual_run(
     )
     if is_weak and ticks <= MAX_RECORDED_TICKS and _has_energies(executed_scenario):
         # Only a written log contains the memories from which laws compute declared energies.
-        if find_energy_laws(executed_scenario, own_laws=True):
+        if ObservedEnergy.find_laws(executed_scenario, own_laws=True):
             log: Log = SimulatedLog(executed_scenario)
         else:
             log = simulate_columns(executed_scenario)
-        certificate_of_log = certify_log(log, own_laws=True)
+        certificate_of_log = Certificate.of_log(log, own_laws=True)
         certificate = replace(
             certificate_of_log,
             roots=findings.roots,
@@ -194,4 +192,4 @@ def judge_virtual_run(
 def _has_energies(scenario: Scenario) -> bool:
     """Returns True if a run has the energy function V, or energies that its laws declare."""
     has_functional = not MissingFunctional.list_of_scenario(scenario)
-    return has_functional or bool(find_energy_laws(scenario, own_laws=True))
+    return has_functional or bool(ObservedEnergy.find_laws(scenario, own_laws=True))

@@ -31,6 +31,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core import BUCKETS_PER_S, LIVE_KINDS, OWN_KINDS, Array, DominanceMatrix, TorqueKind
+from ..execution import FusedRun
 from ..hooks import find_hook
 from ..log import Ints, Log, SiteLog
 from ..scenario import Scenario
@@ -38,7 +39,7 @@ from .arm_rows import HANGING_RAD, build_arm_rows
 from .site_signals import SETTLED_ERROR_RAD, JointError
 from .timeline import Timeline
 from .torque_sources import SourceRows
-from .twins.envelope_trend import FLOOR_RAD, EnvelopeFit, EnvelopeTrend, fit_envelopes
+from .twins.envelope_trend import FLOOR_RAD, EnvelopeFit, EnvelopeTrend
 
 SETTLED_SPEED_RAD_S = 1e-2
 """Largest speed in the last second at which the arms of a run count as resting, in rad/s."""
@@ -265,6 +266,42 @@ class RunEnd(NamedTuple):
             return end
         site_logs = [log[site] for site in log.sites]
         return end._replace(frequency_hz=_find_frequency_hz(site_logs))
+
+    @classmethod
+    def of_run(cls, run: FusedRun, scenario: Scenario) -> "RunEnd":
+        """Judges whether the motion of the arms died away at the end of a simulated run.
+
+        The result is that of `of_log` for a log of the same run, without the quantities for
+        which records are needed.
+
+        Args:
+            run: The run in the fused loop.
+            scenario: Scenario of the run, whose duration may differ from that of the run.
+        """
+        return RunTrace(run.buckets, run.tau_x, run.diverged_s).classify_end(scenario)
+
+    @staticmethod
+    def find_hanging_sites(scenario: Scenario, ends: Mapping[str, Array]) -> list[str]:
+        """Finds the sites whose arms fell: they hang down at the end, but did not at the start.
+
+        An arm whose controller does not hold it comes to rest as well, but must not count as
+        stable.
+
+        Args:
+            scenario: The description of the experiment, with the start poses.
+            ends: Last joint angles of the sites to be judged, by name, shape (n,) each, in rad.
+
+        Returns:
+            Names of these sites. Empty if no arm fell.
+        """
+        hanging = []
+        for site, q in ends.items():
+            arm = build_arm_rows(scenario, site)
+            start = np.array(scenario.sites[site].q0_rad)
+            hangs = arm.hanging_angle(q) < HANGING_RAD
+            if hangs and arm.hanging_angle(start) >= HANGING_RAD:
+                hanging.append(site)
+        return hanging
 
 
 class RunTrace(NamedTuple):
@@ -538,7 +575,7 @@ def _find_worst_joint(
     envelopes = []
     for site in columns:
         envelopes += [site[:, 0], site[:, 1]]
-    fits = iter(fit_envelopes(t_s, np.hstack(envelopes)))
+    fits = iter(EnvelopeFit.fit_columns(t_s, np.hstack(envelopes)))
 
     ends = []
     for name, judged, whole in zip(scenario.names, columns, sites, strict=True):
@@ -884,7 +921,7 @@ def _find_disagreement(
         joint = int(spread[-1].argmax())
         end_spread = spread[-1, joint]
         envelope = spread.max(axis=1, keepdims=True)
-        (distance_fit,) = fit_envelopes(t_s, envelope)
+        (distance_fit,) = EnvelopeFit.fit_columns(t_s, envelope)
         is_approaching = distance_fit.trend is EnvelopeTrend.DECAYS
 
         # A torque at the end holds the sites apart if the errors are large enough, or if the
@@ -954,7 +991,7 @@ def _find_odd_pose(scenario: Scenario, sites: Sequence[Array]) -> Iterable[EndDo
     starts = [np.array(spec.q0_rad) for spec in scenario.sites.values()]
     ends = [site[-1, 2, : len(start)] for site, start in zip(sites, starts, strict=True)]
     end_by_site = dict(zip(scenario.names, ends, strict=True))
-    hanging = find_hanging_sites(scenario, end_by_site)
+    hanging = RunEnd.find_hanging_sites(scenario, end_by_site)
     if hanging:
         yield EndDoubt("arms fell", tuple(hanging))
         return
@@ -971,29 +1008,6 @@ def _find_odd_pose(scenario: Scenario, sites: Sequence[Array]) -> Iterable[EndDo
     if distances[worst] > THROWN_RAD and not (scenario.external or has_operator):
         thrown = scenario.names[worst]
         yield EndDoubt("arm thrown", (thrown,), distance_rad=distances[worst])
-
-
-def find_hanging_sites(scenario: Scenario, ends: Mapping[str, Array]) -> list[str]:
-    """Finds the sites whose arms fell: they hang down at the end, but did not at the start.
-
-    An arm whose controller does not hold it comes to rest as well, but must not count as
-    stable.
-
-    Args:
-        scenario: The description of the experiment, with the start poses.
-        ends: Last joint angles of the sites to be judged, by name, shape (n,) each, in rad.
-
-    Returns:
-        Names of these sites. Empty if no arm fell.
-    """
-    hanging = []
-    for site, q in ends.items():
-        arm = build_arm_rows(scenario, site)
-        start = np.array(scenario.sites[site].q0_rad)
-        hangs = arm.hanging_angle(q) < HANGING_RAD
-        if hangs and arm.hanging_angle(start) >= HANGING_RAD:
-            hanging.append(site)
-    return hanging
 
 
 def _find_last_operator_action(scenario: Scenario, span_s: float) -> float:

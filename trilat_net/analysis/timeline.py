@@ -20,7 +20,7 @@ from ..core import HELD_OVERRUN_TICKS, DelayKind, LifeAlarm
 from ..errors import count_nouns
 from ..log import Log
 from ..net import MODES, ModeMeaning
-from ..scenario import Change, LinkBase, describe_event, find_requester
+from ..scenario import Change, LinkBase
 
 
 class _AppliedChange(NamedTuple):
@@ -212,7 +212,7 @@ class Timeline:
                     if event is None:
                         sentence = change.describe()
                     else:
-                        sentence = describe_event(event.kind, event.text, event.command)
+                        sentence = Change.describe_event(event.kind, event.text, event.command)
                     applied_changes.append(_AppliedChange(change, site, tick, sentence))
 
         visible_entries = []
@@ -315,7 +315,7 @@ class Timeline:
         """
         log = self._log
         requesters = {
-            (entry.site, entry.taken_at_tick): find_requester(entry.sentence)
+            (entry.site, entry.taken_at_tick): Change.find_requester(entry.sentence)
             for entry in self.changes
         }
 

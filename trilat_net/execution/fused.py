@@ -22,13 +22,11 @@ import numpy as np
 from ..core import MAX_ARRIVALS, CompiledRun, CoreChange, IntArray, LinkSchedule, RunInputs
 from ..errors import ScenarioError, count_nouns
 from ..log import Log
-from ..own_code import find_user_laws
 from ..records import NS_PER_S
 from ..scenario import (
     HandPlayer,
     PlantPlayer,
     Scenario,
-    make_hand_players,
 )
 
 
@@ -76,7 +74,7 @@ class FusedRun(CompiledRun):
         setups = [scenario.setup(name) for name in names]
         live_hands: Mapping[str, HandPlayer] = {}
         if inputs is None:
-            live_hands = {**make_hand_players(scenario), **hands}
+            live_hands = {**HandPlayer.make_all(scenario), **hands}
         # The torque sources of a site are its operators, followed by its environment.
         first_environments = [
             len(spec.hands) if spec.environment else -1 for spec in scenario.sites.values()
@@ -139,7 +137,7 @@ class FusedRun(CompiledRun):
         if scenario.external:
             arms = ", ".join(sorted(scenario.external))
             return f"the reaction of the external arm of {arms} is not known"
-        if find_user_laws(scenario) and not own_laws:
+        if scenario.inspect_user_laws() and not own_laws:
             return "the imported control laws may not run (permit them with --law FILE)"
         if set(log.executed_sites) != set(log.sites):
             return "in a rerun, the sites whose records were copied did not react"

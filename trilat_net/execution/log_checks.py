@@ -29,7 +29,7 @@ from ..log import (
     describe_unknown_ends,
     open_log,
 )
-from ..own_code import CodeConsents, allowed_code, find_user_laws
+from ..own_code import CodeConsents, allowed_code
 from .verification import VerifyResult, verify_log
 from .virtual_comparison import compare_with_virtual
 
@@ -197,7 +197,7 @@ def _check_log(
 
     yield _check_coverage(log, result)
     yield Finding("integrity", result.integrity.text, result.integrity.passed)
-    for law in find_user_laws(log.scenario):
+    for law in log.scenario.inspect_user_laws():
         yield Finding("user law", str(law), law.allowed, law.allowed)
     yield _check_execution(result, recorded)
     if log.scenario.external:
@@ -381,7 +381,7 @@ def _add_memory_advice(finding: Finding, log: Log, result: VerifyResult) -> Find
     Returns:
         The finding, with the advice if it says that whole runs of users' laws agree.
     """
-    files = list(dict.fromkeys(str(law.file) for law in find_user_laws(log.scenario)))
+    files = list(dict.fromkeys(str(law.file) for law in log.scenario.inspect_user_laws()))
     have_runs_agreed = finding.check == "executed again" and finding.passed and result.whole_run
     if not files or not have_runs_agreed or result.withheld:
         return finding

@@ -51,7 +51,6 @@ from ..log import (
     open_log,
 )
 from ..net import MODE_WORDS, STATE_VECTORS, State
-from ..own_code import find_user_laws
 from ..recorded_change import count_skipped_ticks
 from ..records import TickRecord
 from ..scenario import parse_core_change
@@ -916,7 +915,7 @@ def _execute_sites(
     samples = SampleTable.of_log(log) if result.whole_run else None
     if samples is None:
         _map_records(log, lazy=False)  # raises an error if a record cannot be read
-    withheld_laws = [law for law in find_user_laws(log.scenario) if not law.allowed]
+    withheld_laws = [law for law in log.scenario.inspect_user_laws() if not law.allowed]
     withheld_sites = [name for law in withheld_laws for name in law.sites if name in sites]
     result.withheld += withheld_sites
     for name in withheld_sites:

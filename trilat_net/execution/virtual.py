@@ -62,7 +62,7 @@ from ..net import (
 from ..own_code import ImportedLaw
 from ..recorded_change import count_skipped_ticks
 from ..records import NS_PER_S, Arrival, Mode, TickRecord
-from ..scenario import POLICY, PlantPlayer, Scenario, make_hand_players, make_plant_players
+from ..scenario import POLICY, HandPlayer, PlantPlayer, Scenario
 from .resumption import select_peer_channels
 from .virtual_network import Network, PromptNetwork
 
@@ -595,8 +595,8 @@ def write_virtual_log(
         LawFailed: A user's control law failed. The log contains an event with the reason.
     """
     check_virtual(scenario)
-    hand_players = make_hand_players(scenario)
-    plants = make_plant_players(scenario)
+    hand_players = HandPlayer.make_all(scenario)
+    plants = PlantPlayer.make_all(scenario)
     tracks: dict[str, Callable[[Site, int], Sequence[float]]] = {
         name: player.track for name, player in hand_players.items()
     }

@@ -47,7 +47,6 @@ from ..log import (
     open_log,
 )
 from ..net import READABLE, State, decode
-from ..own_code import find_user_laws
 from ..records import NS_PER_S, Mode
 from ..results import Result, finite_or_none
 from .rerun_execution import RerunExecution, RerunOverrides, RerunRequest, RerunTick
@@ -640,7 +639,7 @@ def _describe_limits(result: Rerun) -> Iterator[str]:
         )
     if not log.complete:
         yield "the log is incomplete: it is executed up to its last record"
-    for law in find_user_laws(request.scenario):
+    for law in request.scenario.inspect_user_laws():
         if law.changed and any(site in request.replaced for site in law.sites):
             yield f"the law is executed as its file is now: {law}"
     yield from _describe_later_changes(result)

@@ -52,7 +52,7 @@ from ..net import (
     decode,
     topics,
 )
-from ..own_code import LawFiles, allow_logged_code, find_user_laws
+from ..own_code import LawFiles, allow_logged_code
 from ..records import NS_PER_S
 from ..results import Result
 from ..scenario import (
@@ -429,7 +429,7 @@ class Log(Result, Mapping[str, SiteLog]):
         Whoever permitted the laws of a log also permitted what computes its run again, for
         example copies of the run that start slightly displaced (twins).
         """
-        return all(law.allowed for law in find_user_laws(self.scenario))
+        return all(law.allowed for law in self.scenario.inspect_user_laws())
 
     @property
     def failed_hands(self) -> list[str]:

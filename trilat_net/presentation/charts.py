@@ -22,30 +22,21 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ..analysis import DelayDistribution, Timeline, joint_positions_m, site_signals
+from ..analysis import DelayDistribution, Timeline, build_arm_rows, site_signals
 from ..core import Array
 from ..log import Ints, Log, SiteLog
+from ..scenario import Scenario
 from . import plot_signals, style
 from .appearance import DARK_SITE_COLOURS, list_site_colours
 from .figures import age_and_lateness, arm_poses
 from .page_data import (
-    ChainArm,
     Chart,
-    ColumnTable,
     DistributionChart,
-    DistributionSeries,
     HistogramChart,
-    HistogramSeries,
-    MarkedChange,
-    ModeSpan,
     PageData,
-    Palettes,
-    PlanarArm,
-    StatedLine,
-    TableSeries,
     TimeChart,
 )
-from .page_leaders import caption_site, list_lead_bars, trace_leads
+from .page_leaders import SlaveLead
 from .plot_signals import decimate
 
 Values = NDArray[Any]
@@ -113,9 +104,9 @@ class ChartBuilder:
         self._twin = twin
         self._timeline = Timeline(log)
         self._end_s = self._timeline.end_s
-        self._tables: list[ColumnTable] = []
+        self._tables: list[PageData.Table] = []
         self._has_values: list[list[bool]] = []  # by table and column
-        self.leads = trace_leads(log)
+        self.leads = SlaveLead.list_of_log(log)
 
         # The pictures of the arms show the whole motion, which is sampled at a few times.
         times_s = np.linspace(0.0, self._end_s, _BOX_INSTANTS)
@@ -173,20 +164,22 @@ class ChartBuilder:
             if len(log[site]):
                 arms.append(self._build_arm(index, site))
             intervals = self._timeline.find_mode_intervals(site)
-            spans[site] = [ModeSpan(index, *interval) for interval in intervals]
+            spans[site] = [PageData.ModeSpan(index, *interval) for interval in intervals]
 
         changes = []
         for number, applied in enumerate(self._timeline.changes, 1):
             change = applied.change
-            changes.append(MarkedChange(number, change.at_s, applied.site, change.link))
+            changes.append(
+                PageData.MarkedChange(number, change.at_s, applied.site, change.link)
+            )
 
         light = list_site_colours(log.scenario)
         dark = list_site_colours(log.scenario, DARK_SITE_COLOURS)
         data = PageData(
             end_s=self._end_s,
-            colours=Palettes(light, dark),
+            colours=PageData.Palettes(light, dark),
             arms=arms,
-            leads=list_lead_bars(self.leads),
+            leads=[lead.bar for lead in self.leads if not lead.is_constant],
             tables=self._tables,
             charts=charts,
             changes=changes,
@@ -204,7 +197,7 @@ class ChartBuilder:
         log = self._log
         unit = plot_signals.shared_unit(log)
         settled_line = self._draw_limit(site_signals.SETTLED_ERROR_RAD)
-        stated_delays: list[StatedLine] = []
+        stated_delays: list[TimeChart.StatedLine] = []
         for site in log.sites:
             stated_delays += self._list_stated_delays(site)
         has_one_delay = len({line.value for line in stated_delays}) == 1
@@ -247,7 +240,7 @@ class ChartBuilder:
                 return f" Errors below {_LEAST_DRAWN:g} {unit} are drawn at this value."
         return ""
 
-    def _add_maxima(self, read_values: Callable[[str], Array]) -> list[TableSeries]:
+    def _add_maxima(self, read_values: Callable[[str], Array]) -> list[TimeChart.Series]:
         """Adds a line per arm with the largest value of a signal in each short time interval.
 
         Within an interval, the line is constant. A line of the values themselves would be a
@@ -356,7 +349,7 @@ class ChartBuilder:
         """
         columns = [_encode(column, "<f4") for column in values.T]
         rate_hz = self._log.scenario.sites[site].rate_hz
-        table = ColumnTable(rate_hz=rate_hz, tick=_encode(tick, "<i4"), columns=columns)
+        table = PageData.Table(rate_hz=rate_hz, tick=_encode(tick, "<i4"), columns=columns)
         self._tables.append(table)
         has_values = [bool(np.isfinite(column).any()) for column in values.T]
         self._has_values.append(has_values)
@@ -396,7 +389,7 @@ class ChartBuilder:
 
     def _add_signal(
         self, signal: Callable[[SiteLog], Values], sites: Sequence[str] = ()
-    ) -> dict[str, list[TableSeries]]:
+    ) -> dict[str, list[TimeChart.Series]]:
         """Adds the values of a signal, such as joint torques, to the report, for several arms.
 
         Args:
@@ -416,7 +409,7 @@ class ChartBuilder:
 
     def _add_columns(
         self, site: str, tick: Ints, t_s: Array, values: Values
-    ) -> list[TableSeries]:
+    ) -> list[TimeChart.Series]:
         """Adds as many values of one arm to the page as a screen can show.
 
         All columns share one table if there are few of them. Otherwise each column has its own
@@ -441,7 +434,9 @@ class ChartBuilder:
         columns = range(values.shape[1])
         return [self._make_series(site, table, column) for column in columns]
 
-    def _make_series(self, site: str, table: int, column: int, label: str = "") -> TableSeries:
+    def _make_series(
+        self, site: str, table: int, column: int, label: str = ""
+    ) -> TimeChart.Series:
         """Returns a line of a chart in the colour of an arm.
 
         Args:
@@ -451,14 +446,14 @@ class ChartBuilder:
             label: Text in the legend. Empty for the name of the site.
         """
         colour = self._log.sites.index(site)
-        return TableSeries(label=label or site, colour=colour, table=table, column=column)
+        return TimeChart.Series(label=label or site, colour=colour, table=table, column=column)
 
     def _make_chart(
         self,
         section: str,
         title: str,
         unit: str,
-        series: Sequence[TableSeries],
+        series: Sequence[TimeChart.Series],
         sites: Sequence[str] = (),
         **options: Any,
     ) -> TimeChart:
@@ -488,7 +483,7 @@ class ChartBuilder:
         section: str,
         title: str,
         unit: str,
-        series_by_site: dict[str, list[TableSeries]],
+        series_by_site: dict[str, list[TimeChart.Series]],
         titles: Sequence[str] = (),
     ) -> Iterator[TimeChart]:
         """Yields one chart per joint, in which each arm has a line.
@@ -520,7 +515,7 @@ class ChartBuilder:
                 angles = np.stack([actual[:, joint], desired[:, joint]], axis=1)
                 table = self._add_records(site, angles)
                 actual_line = self._make_series(site, table, column=0)
-                desired_line = TableSeries(
+                desired_line = TimeChart.Series(
                     label="desired", colour="limit", table=table, column=1, dash=True
                 )
 
@@ -558,7 +553,7 @@ class ChartBuilder:
                 lines=self._draw_truths(true_values),
             )
 
-    def _draw_truths(self, truths: Sequence[float]) -> list[StatedLine]:
+    def _draw_truths(self, truths: Sequence[float]) -> list[TimeChart.StatedLine]:
         """Returns lines at the true values of a parameter over the whole run.
 
         An adaptive control law estimates the parameters of the arm, and the lines show how
@@ -575,12 +570,14 @@ class ChartBuilder:
             return [self._draw_limit(truths[0])]
         lines = []
         for colour, truth in enumerate(truths):
-            lines.append(StatedLine(value=truth, colour=colour, from_s=0.0, to_s=self._end_s))
+            lines.append(
+                TimeChart.StatedLine(value=truth, colour=colour, from_s=0.0, to_s=self._end_s)
+            )
         return lines
 
-    def _draw_limit(self, value: float) -> StatedLine:
+    def _draw_limit(self, value: float) -> TimeChart.StatedLine:
         """Returns a line at a value over the whole run, in a neutral colour."""
-        return StatedLine(value=value, colour="limit", from_s=0.0, to_s=self._end_s)
+        return TimeChart.StatedLine(value=value, colour="limit", from_s=0.0, to_s=self._end_s)
 
     def _chart_ages(self) -> Iterator[TimeChart]:
         """Yields a chart per site with the age of the samples that its controller uses.
@@ -614,7 +611,7 @@ class ChartBuilder:
                 margin=0.025,
             )
 
-    def _list_stated_delays(self, site: str) -> list[StatedLine]:
+    def _list_stated_delays(self, site: str) -> list[TimeChart.StatedLine]:
         """Returns lines at the mean delays that the scenario states for the links to a site.
 
         They are drawn next to the measured delays, so that a reader sees whether the network
@@ -628,7 +625,7 @@ class ChartBuilder:
             delays are equal, a single line in a neutral colour.
         """
         log = self._log
-        lines: list[StatedLine] = []
+        lines: list[TimeChart.StatedLine] = []
         for peer in log[site].peers:
             colour = log.sites.index(peer)
             link = f"{peer}->{site}"
@@ -637,7 +634,7 @@ class ChartBuilder:
             models = zip(t_s[::3], t_s[1::3], mean_ms[::3], strict=True)
             for start_s, end_s, delay_ms in models:
                 if np.isfinite(delay_ms):
-                    line = StatedLine(
+                    line = TimeChart.StatedLine(
                         value=float(delay_ms),
                         colour=colour,
                         from_s=float(start_s),
@@ -657,7 +654,7 @@ class ChartBuilder:
         of a message is its delay plus the time until a newer message replaces it.
         """
         distributions = DelayDistribution.list_of_log(self._log)
-        x_ms = age_and_lateness.choose_delay_axis_ms(distributions)
+        axis = age_and_lateness.DelayAxis.of_links(distributions)
         for site in self._log.sites:
             series = []
             for link in distributions:
@@ -667,11 +664,11 @@ class ChartBuilder:
                 curves = (("age", link.age_ms, False), ("delay", link.delay_ms, True))
                 for quantity, values_ms, dash in curves:
                     # A link without any message has no curve.
-                    percent = age_and_lateness.compute_cumulative_percent(values_ms, x_ms)
+                    percent = axis.compute_percent(values_ms)
                     if not np.isfinite(percent).any():
                         continue
 
-                    curve = DistributionSeries(
+                    curve = DistributionChart.Series(
                         label=f"{quantity}, {link.peer}",
                         colour=colour,
                         dash=dash,
@@ -684,8 +681,8 @@ class ChartBuilder:
                 title=f"delay and age on the way to {site}",
                 unit="ms",
                 series=series,
-                x=_encode(x_ms, "<f4"),
-                log=bool(x_ms[0] > 0.0),
+                x=_encode(axis.x_ms, "<f4"),
+                log=axis.is_logarithmic,
             )
 
     def _chart_histograms(self) -> Iterator[HistogramChart]:
@@ -695,7 +692,7 @@ class ChartBuilder:
         other how long the computation of a tick took.
         """
         log = self._log
-        edges_us = age_and_lateness.choose_bin_edges_us(log)
+        bins = age_and_lateness.LoopTimeBins.of_log(log)
         rates_hz = {log.scenario.sites[site].rate_hz for site in log.sites}
         periods_us = sorted(1e6 / rate_hz for rate_hz in rates_hz)
 
@@ -708,19 +705,19 @@ class ChartBuilder:
             for colour, site in enumerate(log.sites):
                 if len(log[site]):
                     times_us = getattr(log[site], field)
-                    counts = age_and_lateness.bin_loop_times(times_us, edges_us)
-                    series.append(HistogramSeries(site, colour, counts.tolist()))
+                    counts = bins.count_times(times_us)
+                    series.append(HistogramChart.Series(site, colour, counts.tolist()))
 
             yield HistogramChart(
                 section="timing",
                 title=f"{title}, histogram",
                 unit="µs",
                 series=series,
-                edges=edges_us.tolist(),
+                edges=bins.edges_us.tolist(),
                 periods=periods_us,
             )
 
-    def _build_arm(self, index: int, site: str) -> PlanarArm | ChainArm:
+    def _build_arm(self, index: int, site: str) -> PageData.PlanarArm | PageData.ChainArm:
         """Adds the motion of an arm, and of bodies that it touches, for the moving picture.
 
         The script of the page draws planar arms from their joint angles and link lengths. Other
@@ -743,16 +740,16 @@ class ChartBuilder:
         desired = plot_signals.reference_angles(records)
         bodies = self._trace_bodies(site, np.arange(len(records)))
         table = self._add_records(site, np.hstack([actual, desired, *bodies]))
-        return PlanarArm(
+        return PageData.PlanarArm(
             site=site,
-            caption=caption_site(self._log.scenario, site),
+            caption=_caption_site(self._log.scenario, site),
             colour=index,
             table=table,
             bodies=len(bodies),
             links_m=[self.units_per_m * length_m for length_m in arm.lengths_m],
         )
 
-    def _build_chain(self, index: int, site: str) -> ChainArm:
+    def _build_chain(self, index: int, site: str) -> PageData.ChainArm:
         """Adds the motion of a chain, an arm of any number of joints in space.
 
         The page cannot compute the forward kinematics of chains. Its table therefore contains
@@ -767,18 +764,19 @@ class ChartBuilder:
             Description of the chain, which refers to the table of its motion.
         """
         records = self._log[site]
-        arm = self._log.scenario.arms[site]
+        arm = build_arm_rows(self._log.scenario, site)
         last_record = len(records) - 1
         record_indices = np.linspace(0, last_record, _CHAIN_INSTANTS).astype(np.int64)
         rows = np.unique(record_indices)  # a short log has fewer records than `_CHAIN_INSTANTS`
 
         desired_q = plot_signals.reference_angles(records)
-        actual_m = joint_positions_m(arm, records.q[rows])
-        desired_m = joint_positions_m(arm, desired_q[rows])
+        axes = arm.upright_axes
+        actual_m = arm.joint_positions_m(records.q[rows])
+        desired_m = arm.joint_positions_m(desired_q[rows])
         pictures = (
-            arm_poses.project_arm_m(arm, actual_m),
-            arm_poses.project_arm_m(arm, desired_m),
-            arm_poses.project_arm_m(arm, actual_m, onto_floor=True),
+            arm_poses.project_arm_m(axes, actual_m),
+            arm_poses.project_arm_m(axes, desired_m),
+            arm_poses.project_arm_m(axes, actual_m, onto_floor=True),
         )
         # The first point is the base, which does not move.
         moving_points_m = [picture[:, 1:] for picture in pictures]
@@ -786,9 +784,9 @@ class ChartBuilder:
         bodies = self._trace_bodies(site, rows)
         values = np.hstack([points.reshape(len(rows), -1), *bodies])
         table = self._add_table(site, records.tick[rows], values)
-        return ChainArm(
+        return PageData.ChainArm(
             site=site,
-            caption=caption_site(self._log.scenario, site),
+            caption=_caption_site(self._log.scenario, site),
             colour=index,
             table=table,
             bodies=len(bodies),
@@ -811,9 +809,9 @@ class ChartBuilder:
         sizes_m = self._log.scenario.bodies_m(site).values()
         if not sizes_m:
             return []
-        arm = self._log.scenario.arms[site]
+        arm = build_arm_rows(self._log.scenario, site)
         poses = self._log[site].bodies[rows]
-        paths_m = arm_poses.trace_bodies_m(arm, sizes_m, poses)
+        paths_m = arm_poses.trace_bodies_m(arm.upright_axes, sizes_m, poses)
         return [self.units_per_m * path.reshape(len(rows), -1) for path in paths_m]
 
 
@@ -831,3 +829,20 @@ def _encode(column: Values, kind: str) -> str:
     """
     numbers = np.ascontiguousarray(column.astype(kind))
     return base64.b64encode(numbers.tobytes()).decode()
+
+
+def _caption_site(scenario: Scenario, site: str) -> str:
+    """Returns the caption of an arm in the drawing, for example "m1, master 1"."""
+    return f"{site}, {_name_role(scenario, site)}"
+
+
+def _name_role(scenario: Scenario, site: str) -> str:
+    """Returns the role of an arm in words: "master 2", or "slave" if there is only one.
+
+    Args:
+        scenario: Scenario of the run.
+        site: Name of the site.
+    """
+    role = scenario.sites[site].role
+    with_role = [name for name, spec in scenario.sites.items() if spec.role == role]
+    return role if len(with_role) == 1 else f"{role} {with_role.index(site) + 1}"

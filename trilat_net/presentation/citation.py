@@ -17,7 +17,6 @@ from ..analysis import Certificate, Stability
 from ..errors import count_nouns
 from ..files import find_version
 from ..log import Log, collect_provenance
-from ..own_code import ImportedLaw
 from ..scenario import Scenario, describe_value
 
 _SOFTWARE = """@software{{trilat_net,
@@ -145,21 +144,22 @@ def _state_settings(scenario: Scenario) -> Iterator[str]:
     law_texts = {}
     for name, site in scenario.sites.items():
         control = site.control
-        law = control.tag
         gains = msgspec.structs.asdict(control)
         code_note = ""
 
         # The law is a user's Python class. Its hash tells which version of the file was used.
-        if isinstance(control, ImportedLaw):
-            law = control.code
-            gains = control.settings
+        user_law = site.user_law
+        if user_law is not None:
+            gains = user_law.settings
             code_note = (
-                f", other settings as in its file (SHA-256 {control.source_sha256[:16]})"
+                f", other settings as in its file (SHA-256 {user_law.source_sha256[:16]})"
             )
 
         gains_text = ", ".join(f"{key} {describe_value(value)}" for key, value in gains.items())
         law_texts[name] = (
-            f"{law} ({gains_text}){code_note}" if gains_text else f"{law}{code_note}"
+            f"{site.law_name} ({gains_text}){code_note}"
+            if gains_text
+            else f"{site.law_name}{code_note}"
         )
 
     delay_texts = {name: link.describe() for name, link in scenario.links.items()}

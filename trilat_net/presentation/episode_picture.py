@@ -18,7 +18,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from ..analysis import joint_positions_m
+from ..analysis import build_arm_rows
 from ..core import Array
 from ..scenario import Scenario
 from . import style
@@ -58,6 +58,7 @@ class EpisodePicture:
         self._scenario = scenario
         self._goal_site = goal_site
         names = scenario.names
+        self._arms = {site: build_arm_rows(scenario, site) for site in names}
         side_in = PANEL_PX / _DPI
         width_in = PANEL_PX * len(names) / _DPI
         self._figure = Figure(figsize=(width_in, side_in), dpi=_DPI)
@@ -88,18 +89,18 @@ class EpisodePicture:
             Colours of the pixels (red, green, blue), shape (height, width, 3).
         """
         for number, (site, axes) in enumerate(self._panels.items()):
-            arm = self._scenario.arms[site]
+            arm = self._arms[site]
             colour = SITE_COLOURS[number % len(SITE_COLOURS)]
             q_rows_rad = np.asarray(q_rad[site])[np.newaxis]
-            points_m = joint_positions_m(arm, q_rows_rad)[0]
+            points_m = arm.joint_positions_m(q_rows_rad)[0]
 
             axes.clear()
             _scale_panel(axes, points_m)
             self._draw_bodies(axes, site, bodies.get(site, {}))
-            _draw_arm(axes, project_arm_m(arm, points_m), colour)
+            _draw_arm(axes, project_arm_m(arm.upright_axes, points_m), colour)
 
             if goal_m is not None and site == self._goal_site:
-                goal_in_picture = project_arm_m(arm, np.asarray(goal_m))
+                goal_in_picture = project_arm_m(arm.upright_axes, np.asarray(goal_m))
                 axes.plot(*goal_in_picture, **_GOAL)
             axes.text(0.03, 0.97, site, transform=axes.transAxes, va="top", fontsize=9.0)
 
@@ -121,8 +122,8 @@ class EpisodePicture:
             return
         poses = np.concatenate(list(bodies.values()))
         sizes_m = self._scenario.bodies_m(site).values()
-        arm = self._scenario.arms[site]
-        for path in trace_bodies_m(arm, sizes_m, poses[np.newaxis]):
+        arm = self._arms[site]
+        for path in trace_bodies_m(arm.upright_axes, sizes_m, poses[np.newaxis]):
             axes.plot(*path[0].T, color=style.REFERENCE, linewidth=0.8)
 
     def _read_pixels(self) -> NDArray[np.uint8]:

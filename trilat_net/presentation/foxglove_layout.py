@@ -1,9 +1,10 @@
-"""Builds the layout in which Foxglove and Lichtblick, viewers for robot data, show a log.
+"""Writes the layout in which Foxglove and Lichtblick, viewers for robot data, show a log.
 
-A layout is a JSON file that a user imports into the viewer. The file states which panels are
-shown, and which values of which topics they draw. The layout contains the plots of the layout
-for Rerun (`rerun_viewer.build_plot_layout`), the modes of the arms' controllers, the events,
-and the arms in space.
+A layout is a JSON file next to the log, which a user imports into the viewer. It also serves a
+bag, a file of standard messages of ROS 2, into which a log can be exported. The file states
+which panels are shown, and which values of which topics they draw. The layout contains the
+plots of the layout for Rerun (`rerun_viewer.PlotLayout`), the modes of the arms' controllers,
+the events, and the arms in space.
 
 The topics of the live bridge to ROS 2 and of exported bags differ from those of logs. The
 layout of a log therefore has two tabs: one for the log itself, and one for a running session of
@@ -14,15 +15,21 @@ Invariant:
       of the live bridge.
     - Panels without data take no space.
     - Equal channels give layouts with equal bytes.
+    - An existing file is replaced only with `force`.
 
 The format is that of files which the viewers export: `configById` contains the settings of each
 panel by its identifier, and `layout` is a binary tree of identifiers. Viewers ignore settings
 that they do not know.
 """
 
+import json
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
+from ..errors import UsageError
+from ..files import refuse_existing, write_whole
+from ..log import open_log
 from ..log.ros2 import (
     FLOAT64_ARRAY,
     NUMBERS_BY_MODE_WORD,
@@ -31,9 +38,12 @@ from ..log.ros2 import (
     STRING,
     WORLD,
     Ros2Channels,
+    Ros2Topics,
 )
-from .rerun_viewer import CurvePlot, PlotLayout, build_plot_layout
+from .rerun_viewer import CurvePlot, PlotLayout
 
+_LAYOUT_SUFFIX = ".foxglove.json"
+"""Suffix of the file of a layout, which replaces the suffix of the log's name."""
 _MODE = "mode"
 """Name of the topic with the mode of a site."""
 _MODE_NUMBERS = (_MODE, "mode_number")
@@ -50,7 +60,41 @@ Tree = str | JsonObject
 """Identifier of a panel, or a node that divides an area into two."""
 
 
-def build_foxglove_layout(sources: Mapping[str, Ros2Channels]) -> JsonObject:
+def write_foxglove_layout(log: Path, *, force: bool = False) -> Path:
+    """Writes the layout of a log or a bag for the viewers Foxglove and Lichtblick.
+
+    With the layout, the viewer shows plots of all sites without manual arrangement.
+
+    Args:
+        log: File of the log or bag.
+        force: True to replace an existing file.
+
+    Returns:
+        The path of the layout, which is next to the log.
+
+    Raises:
+        UsageError: The file contains no channels for viewers, or the layout exists.
+        LogError: The log cannot be read.
+    """
+    path = log.with_suffix(_LAYOUT_SUFFIX)
+    refuse_existing(path, force=force)
+    channels = Ros2Topics.of_file(log)
+    if not PlotLayout.of_channels(channels).pages:
+        raise UsageError(
+            f"{log}: there is nothing to plot, because the file is not finished or was written "
+            f"with --views off; write a file for viewers with `trilat log export {log} --to "
+            "ros2`, and name that file instead"
+        )
+
+    sources = {"ROS 2": channels}
+    if channels.are_of_log:
+        sources = {"Log": channels, "ROS 2": Ros2Topics.of_log(open_log(log))}
+    layout = _build_layout(sources)
+    write_whole(path, json.dumps(layout, indent=1) + "\n", force=force)
+    return path
+
+
+def _build_layout(sources: Mapping[str, Ros2Channels]) -> JsonObject:
     """Returns a layout of plots for Foxglove, a program that shows data of robots.
 
     The layout shows the channels of a log or of a running session. Foxglove opens it from a
@@ -123,7 +167,7 @@ def _arrange_source(panels: _Panels, channels: Ros2Channels) -> Tree:
     A mode is what an arm's controller does at a time, for example "resting". Areas without data
     are left out.
     """
-    layout = build_plot_layout(channels)
+    layout = PlotLayout.of_channels(channels)
     tabs: dict[str, Tree] = {}
     for name, page in layout.pages.items():
         rows = []

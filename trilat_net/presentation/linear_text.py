@@ -16,7 +16,7 @@ from itertools import chain
 
 import numpy as np
 
-from ..analysis import QUOTED_AT_HZ, LinearAnalysis, Passivity, PortAnalysis, TwoPort
+from ..analysis import QUOTED_AT_HZ, LinearAnalysis, Passivity, PortAnalysis
 from ..core import Array
 from ..errors import count_nouns
 from .decision_text import describe_tick_span
@@ -36,13 +36,13 @@ def compose_linear(analysis: LinearAnalysis) -> Iterator[Block]:
     Args:
         analysis: The analysis.
     """
-    yield from describe_equilibrium(analysis)
-    yield from describe_effective_delays(analysis)
+    yield from _describe_equilibrium(analysis)
+    yield from _describe_effective_delays(analysis)
     yield ""
-    yield tabulate_roots(analysis)
-    yield describe_zero_roots(analysis)
+    yield _tabulate_roots(analysis)
+    yield _describe_zero_roots(analysis)
 
-    verdict, _, explanation = describe_linear_verdict(analysis).partition(": ")
+    verdict, _, explanation = _describe_linear_verdict(analysis).partition(": ")
     yield MarkedText(f"[{_COLOURS[verdict]}]{verdict}[/]:", explanation)
 
     margin = analysis.margin.description
@@ -73,7 +73,7 @@ def _describe_scans(analysis: LinearAnalysis) -> Iterator[str]:
         yield f"{scan.key} from {scan.low:g} to {scan.high:g}: {result}"
 
 
-def describe_equilibrium(analysis: LinearAnalysis) -> Iterator[str]:
+def _describe_equilibrium(analysis: LinearAnalysis) -> Iterator[str]:
     """Yields lines that describe the equilibrium pose at which the arms were linearised.
 
     The lines state how the equilibrium was computed, its residual, and the pose of each arm. If
@@ -108,7 +108,7 @@ def _list_numbers(values: Array) -> str:
     return ", ".join(f"{value:.4f}" for value in values)
 
 
-def describe_effective_delays(analysis: LinearAnalysis) -> Iterator[str]:
+def _describe_effective_delays(analysis: LinearAnalysis) -> Iterator[str]:
     """Yields lines for the user about the delays with which arms follow each other.
 
     There is a line for each link (one-way connection between two arms), or a single line if all
@@ -132,7 +132,7 @@ def describe_effective_delays(analysis: LinearAnalysis) -> Iterator[str]:
         yield f"{quantity} on {names[j]}->{names[i]}: {1e3 * age_s[i, j]:.4g} ms"
 
 
-def tabulate_roots(analysis: LinearAnalysis) -> TextTable:
+def _tabulate_roots(analysis: LinearAnalysis) -> TextTable:
     """Returns a table of the rightmost characteristic roots, which determine stability.
 
     A motion with the root s changes as exp(s t), and grows if the real part of s is positive.
@@ -200,7 +200,7 @@ def describe_moving_states(states: Sequence[str]) -> str:
     return "; ".join(phrases)
 
 
-def describe_zero_roots(analysis: LinearAnalysis) -> str:
+def _describe_zero_roots(analysis: LinearAnalysis) -> str:
     """Returns a sentence about the roots that are zero by the structure of the system.
 
     For example, if all arms were moved to another common pose, no torque would bring them back.
@@ -223,7 +223,7 @@ def describe_zero_roots(analysis: LinearAnalysis) -> str:
     )
 
 
-def describe_linear_verdict(analysis: LinearAnalysis) -> str:
+def _describe_linear_verdict(analysis: LinearAnalysis) -> str:
     """Returns a sentence that says whether small motions of the coupled arms decay.
 
     The sentence states the growth rate and the frequency of the slowest decaying, or fastest
@@ -447,64 +447,41 @@ def _describe_two_ports(ports: PortAnalysis) -> list[str]:
     Args:
         ports: Results for the joints at which the operators act.
     """
-    failing_ports = [two_port for two_port in ports.two_ports if two_port.minima.below]
-
     # For arms with many joints, the failing two-ports of a pair of sites share a line.
     has_line_per_joint = len(ports.joints) <= _MAX_SEPARATE_JOINTS
-    ports_by_line: dict[tuple[object, ...], list[TwoPort]] = {}
-    for two_port in failing_ports:
-        joint = two_port.joint if has_line_per_joint else ""
-        line_key = (two_port.sites, two_port.clamped, joint)
-        ports_by_line.setdefault(line_key, []).append(two_port)
-    lines = [_describe_failing(ports, group) for group in ports_by_line.values()]
+    lines = []
+    failing_count = 0
+    for group in ports.group_failing_two_ports(by_joint=has_line_per_joint):
+        failing_count += len(group)
+        worst = min(group, key=lambda two_port: two_port.minima.least)
 
-    holding_count = len(ports.two_ports) - len(failing_ports)
+        # In task space, the numbers of the ports stand for axes with names.
+        port_names = [str(ports.axes.get(port.joint, port.joint)) for port in group]
+        subject = " and ".join(worst.sites)
+        if worst.clamped:
+            subject += f", {worst.clamped} clamped"
+        subject += f", {ports.kind} {', '.join(port_names)}"
+
+        frequencies = _list_bands(worst.minima.below)
+        if len(group) > 1:
+            # Several two-ports have too many bands to list, but one range contains them.
+            bands = list(chain.from_iterable(port.minima.below for port in group))
+            from_hz = min(band.from_hz for band in bands)
+            to_hz = max(band.to_hz for band in bands)
+            frequencies = f"within {from_hz:.3g}-{to_hz:.3g} Hz"
+        least = f"least {worst.minima.least:.3g} at {worst.minima.least_hz:.3g} Hz"
+        lines.append(f"{subject}: fails {frequencies}; {least}")
+
+    holding_count = len(ports.two_ports) - failing_count
     if not holding_count:
         return lines
 
     subject = "the others"
-    if not failing_ports:
+    if not failing_count:
         subject = f"every pair and {ports.kind}"
         if any(two_port.clamped for two_port in ports.two_ports):
             subject += ", the third site free or clamped"
     return [*lines, f"{subject}: holds ({holding_count} two-ports)"]
-
-
-def _describe_failing(ports: PortAnalysis, group: list[TwoPort]) -> str:
-    """Returns a line that says at which frequencies Llewellyn's criterion fails.
-
-    A two-port is one joint of two sites. The criterion fails at a frequency if Llewellyn's
-    parameter is below 1 there. The line ends with the smallest value of the parameter and its
-    frequency. An example is "m1 and s, joint 1: fails at 2-5 Hz; least 0.8 at 3 Hz".
-
-    Args:
-        ports: Results for all joints, from which the names of joints and axes are taken.
-        group: Failing two-ports of the same two sites. All have the same third site clamped, or
-            no clamped site.
-    """
-    worst = min(group, key=lambda two_port: two_port.minima.least)
-    minima = worst.minima
-
-    # In task space, the numbers of the ports stand for axes with names.
-    port_names = []
-    for two_port in group:
-        port_name = ports.axes.get(two_port.joint, two_port.joint)
-        port_names.append(str(port_name))
-    subject = " and ".join(worst.sites)
-    if worst.clamped:
-        subject += f", {worst.clamped} clamped"
-    subject += f", {ports.kind} {', '.join(port_names)}"
-
-    if len(group) == 1:
-        frequencies = _list_bands(minima.below)
-    else:
-        # Several two-ports have too many bands to list. The range that contains them is stated.
-        bands = list(chain.from_iterable(two_port.minima.below for two_port in group))
-        from_hz = min(band.from_hz for band in bands)
-        to_hz = max(band.to_hz for band in bands)
-        frequencies = f"within {from_hz:.3g}-{to_hz:.3g} Hz"
-    least = f"least {minima.least:.3g} at {minima.least_hz:.3g} Hz"
-    return f"{subject}: fails {frequencies}; {least}"
 
 
 def _describe_transparency(ports: PortAnalysis) -> Iterator[str]:

@@ -24,7 +24,6 @@ from .figures.joint_motion import explain_absent_operator
 from .html_templates import render_macro
 from .page_data import Chart
 from .page_html import render_details, render_note
-from .page_leaders import describe_leads, render_lead_bars
 
 _TEXTS: dict[str, dict[str, Any]] = tomllib.loads(
     (resources.files("trilat_net.presentation") / "assets" / "report.toml").read_text("utf-8")
@@ -60,9 +59,13 @@ def render_overview(log: Log, builder: ChartBuilder, charts: Sequence[Chart]) ->
     has_records = any(len(log[site]) for site in log.sites)
     if has_records:
         html += render_macro("charts.html", "arm_player")
-        html += render_lead_bars(log, builder.leads)
-        sentences = [*describe_leads(log, builder.leads), _ARM_NOTE]
-        html += render_note(" ".join(sentences))
+        sentences = []
+        for lead in builder.leads:
+            if lead.is_constant:
+                sentences.append(lead.describe_constant(log.scenario))
+            else:
+                html += lead.render_bar(log)
+        html += render_note(" ".join([*sentences, _ARM_NOTE]))
 
     empty_sites = [site for site in log.sites if not len(log[site])]
     if empty_sites:

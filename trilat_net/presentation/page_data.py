@@ -26,96 +26,6 @@ The lines of references, true values and limits have the colour "limit".
 """
 
 
-class ColumnTable(msgspec.Struct, frozen=True):
-    """Values of one arm over time, as the report's web page contains them.
-
-    A table has one row per shown tick (control period). The lines of charts refer to its
-    columns.
-
-    Attributes:
-        rate_hz: Tick rate of the site, which converts ticks to times.
-        tick: Ticks of the rows, as base64 of little-endian int32.
-        columns: Values of each column, as base64 of little-endian float32. NaN stands for a
-            missing value.
-    """
-
-    rate_hz: int
-    tick: str
-    columns: list[str]
-
-
-class TableSeries(msgspec.Struct, frozen=True, kw_only=True):
-    """A line of a chart over time, which draws one column of a `ColumnTable`.
-
-    Several charts may draw from the same table, so that the page contains its values only once.
-
-    Attributes:
-        label: Name of the line in the legend.
-        colour: Colour of the line.
-        table: Index of the table in `PageData.tables`.
-        column: Index of the column in the table.
-        dash: True for a dashed line.
-    """
-
-    label: str
-    colour: Colour
-    table: int
-    column: int
-    dash: bool = False
-
-
-class HistogramSeries(msgspec.Struct, frozen=True):
-    """One line of a histogram, which shows how often the times of an arm lie in each bin.
-
-    The bins belong to the chart, and are the same for all of its lines.
-
-    Attributes:
-        label: Name of the line in the legend.
-        colour: Colour of the line.
-        counts: Number of ticks in each bin.
-    """
-
-    label: str
-    colour: Colour
-    counts: list[int]
-
-
-class DistributionSeries(msgspec.Struct, frozen=True):
-    """One line of a cumulative distribution: the percentage of values up to each x.
-
-    For example, 95 % of the delays are up to 20 ms.
-
-    Attributes:
-        label: Name of the line in the legend.
-        colour: Colour of the line.
-        dash: True for a dashed line.
-        values: Percentages at the chart's `x`, as base64 of little-endian float32.
-    """
-
-    label: str
-    colour: Colour
-    dash: bool
-    values: str
-
-
-class StatedLine(msgspec.Struct, frozen=True, rename={"from_s": "from", "to_s": "to"}):
-    """Dashed horizontal line in a chart at a value of the scenario, such as the mean delay.
-
-    Readers compare it with the measured values.
-
-    Attributes:
-        value: The value, in the unit of the chart.
-        colour: Colour of the line.
-        from_s: Start of the line, in s. The field is called "from" in JSON.
-        to_s: End of the line, in s. The field is called "to" in JSON.
-    """
-
-    value: float
-    colour: Colour
-    from_s: float
-    to_s: float
-
-
 class TimeChart(msgspec.Struct, frozen=True, kw_only=True, tag="time", tag_field="kind"):
     """A chart of a report that shows a quantity, such as joint angles, over time.
 
@@ -134,10 +44,47 @@ class TimeChart(msgspec.Struct, frozen=True, kw_only=True, tag="time", tag_field
         note: Sentences below the chart. Empty for no sentence.
     """
 
+    class Series(msgspec.Struct, frozen=True, kw_only=True):
+        """A line of a chart over time, which draws one column of a `PageData.Table`.
+
+        Several charts may draw from the same table, so that the page contains its values only
+        once.
+
+        Attributes:
+            label: Name of the line in the legend.
+            colour: Colour of the line.
+            table: Index of the table in `PageData.tables`.
+            column: Index of the column in the table.
+            dash: True for a dashed line.
+        """
+
+        label: str
+        colour: Colour
+        table: int
+        column: int
+        dash: bool = False
+
+    class StatedLine(msgspec.Struct, frozen=True, rename={"from_s": "from", "to_s": "to"}):
+        """Dashed horizontal line in a chart at a value of the scenario, such as the mean delay.
+
+        Readers compare it with the measured values.
+
+        Attributes:
+            value: The value, in the unit of the chart.
+            colour: Colour of the line.
+            from_s: Start of the line, in s. The field is called "from" in JSON.
+            to_s: End of the line, in s. The field is called "to" in JSON.
+        """
+
+        value: float
+        colour: Colour
+        from_s: float
+        to_s: float
+
     section: str
     title: str
     unit: str
-    series: list[TableSeries]
+    series: list[Series]
     sites: list[str]
     lines: list[StatedLine] = []
     links: bool = False
@@ -163,10 +110,25 @@ class HistogramChart(
         periods: Tick periods of the sites, in the unit of the edges. They are drawn as limits.
     """
 
+    class Series(msgspec.Struct, frozen=True):
+        """One line of a histogram, which shows how often the times of an arm lie in each bin.
+
+        The bins belong to the chart, and are the same for all of its lines.
+
+        Attributes:
+            label: Name of the line in the legend.
+            colour: Colour of the line.
+            counts: Number of ticks in each bin.
+        """
+
+        label: str
+        colour: Colour
+        counts: list[int]
+
     section: str
     title: str
     unit: str
-    series: list[HistogramSeries]
+    series: list[Series]
     edges: list[float]
     periods: list[float]
 
@@ -185,127 +147,32 @@ class DistributionChart(
         log: True if the horizontal axis is logarithmic.
     """
 
+    class Series(msgspec.Struct, frozen=True):
+        """One line of a cumulative distribution: the percentage of values up to each x.
+
+        For example, 95 % of the delays are up to 20 ms.
+
+        Attributes:
+            label: Name of the line in the legend.
+            colour: Colour of the line.
+            dash: True for a dashed line.
+            values: Percentages at the chart's `x`, as base64 of little-endian float32.
+        """
+
+        label: str
+        colour: Colour
+        dash: bool
+        values: str
+
     section: str
     title: str
     unit: str
-    series: list[DistributionSeries]
+    series: list[Series]
     x: str
     log: bool
 
 
 Chart = TimeChart | HistogramChart | DistributionChart
-
-
-class PlanarArm(msgspec.Struct, frozen=True, kw_only=True, tag="planar", tag_field="kind"):
-    """Data with which a report draws an arm of two links that moves in a plane.
-
-    Attributes:
-        site: Name of the site, the process that runs the arm.
-        caption: Name and role of the site, such as "m1, master 1".
-        colour: Number that selects the colour of the arm.
-        table: Index of the table that the picture uses. It contains the actual and the desired
-            angles of both joints, in rad, and then the outlines of the bodies.
-        bodies: Number of bodies that the arm can touch.
-        links_m: Lengths of the links, in units of the picture.
-    """
-
-    site: str
-    caption: str
-    colour: int
-    table: int
-    bodies: int
-    links_m: list[float]
-
-
-class ChainArm(msgspec.Struct, frozen=True, kw_only=True, tag="chain", tag_field="kind"):
-    """Data with which a report draws an arm that moves in space, as a picture in a plane.
-
-    Attributes:
-        site: Name of the site, the process that runs the arm.
-        caption: Name and role of the site, such as "m1, master 1".
-        colour: Number that selects the colour of the arm.
-        table: Index of the table with the coordinates to draw. It contains the points of the
-            actual arm, of the arm in the desired pose, and of the shadow on the floor, and then
-            the outlines of the bodies.
-        bodies: Number of bodies that the arm can touch.
-        points: Number of points of an arm: the joints without the base, and the end effector.
-    """
-
-    site: str
-    caption: str
-    colour: int
-    table: int
-    bodies: int
-    points: int
-
-
-class LeadBar(msgspec.Struct, frozen=True, kw_only=True):
-    """Data of a bar that shows which arms lead a slave arm over time.
-
-    A slave follows its peers, the other arms, with weights, the dominance factors. Between two
-    points in time the factors change linearly.
-
-    Attributes:
-        site: Name of the slave.
-        peers: Names of the peers.
-        t: Times of the points, in s.
-        shares: For each peer its dominance factor at these times.
-    """
-
-    site: str
-    peers: list[str]
-    t: list[float]
-    shares: list[list[float]]
-
-
-class MarkedChange(msgspec.Struct, frozen=True):
-    """A change during the run that charts mark, such as a new delay of a link.
-
-    The number n connects the mark with the row of the table that explains the change.
-
-    Attributes:
-        n: Number in the table of changes.
-        t: Time from which the change applies, in s.
-        site: Name of the site that applies the change.
-        link: The changed link. Empty for a change of another kind.
-    """
-
-    n: int
-    t: float
-    site: str
-    link: str
-
-
-class ModeSpan(msgspec.Struct, frozen=True, array_like=True):
-    """An interval, shaded in charts, in which an arm did not follow the others.
-
-    The page receives it as a JSON list.
-
-    Attributes:
-        colour: Index of the site, on which its colour depends.
-        mode: Mode of the site.
-        from_s: Start of the interval, in s.
-        to_s: End of the interval, in s.
-    """
-
-    colour: int
-    mode: str
-    from_s: float
-    to_s: float
-
-
-class Palettes(msgspec.Struct, frozen=True):
-    """Colours of the arms for light and for dark screens.
-
-    The colours are in the order of the scenario, as CSS writes them: "#004488".
-
-    Attributes:
-        light: Colours for light screens.
-        dark: Colours for dark screens.
-    """
-
-    light: list[str]
-    dark: list[str]
 
 
 class PageData(msgspec.Struct, frozen=True, kw_only=True):
@@ -324,9 +191,133 @@ class PageData(msgspec.Struct, frozen=True, kw_only=True):
             pictures.
     """
 
+    class PlanarArm(msgspec.Struct, frozen=True, kw_only=True, tag="planar", tag_field="kind"):
+        """Data with which a report draws an arm of two links that moves in a plane.
+
+        Attributes:
+            site: Name of the site, the process that runs the arm.
+            caption: Name and role of the site, such as "m1, master 1".
+            colour: Number that selects the colour of the arm.
+            table: Index of the table that the picture uses. It contains the actual and the
+                desired angles of both joints, in rad, and then the outlines of the bodies.
+            bodies: Number of bodies that the arm can touch.
+            links_m: Lengths of the links, in units of the picture.
+        """
+
+        site: str
+        caption: str
+        colour: int
+        table: int
+        bodies: int
+        links_m: list[float]
+
+    class ChainArm(msgspec.Struct, frozen=True, kw_only=True, tag="chain", tag_field="kind"):
+        """Data with which a report draws an arm that moves in space, as a picture in a plane.
+
+        Attributes:
+            site: Name of the site, the process that runs the arm.
+            caption: Name and role of the site, such as "m1, master 1".
+            colour: Number that selects the colour of the arm.
+            table: Index of the table with the coordinates to draw. It contains the points of
+                the actual arm, of the arm in the desired pose, and of the shadow on the floor,
+                and then the outlines of the bodies.
+            bodies: Number of bodies that the arm can touch.
+            points: Number of points of an arm: the joints without the base, and the end
+                effector.
+        """
+
+        site: str
+        caption: str
+        colour: int
+        table: int
+        bodies: int
+        points: int
+
+    class Table(msgspec.Struct, frozen=True):
+        """Values of one arm over time, as the report's web page contains them.
+
+        A table has one row per shown tick (control period). The lines of charts refer to its
+        columns.
+
+        Attributes:
+            rate_hz: Tick rate of the site, which converts ticks to times.
+            tick: Ticks of the rows, as base64 of little-endian int32.
+            columns: Values of each column, as base64 of little-endian float32. NaN stands for a
+                missing value.
+        """
+
+        rate_hz: int
+        tick: str
+        columns: list[str]
+
+    class MarkedChange(msgspec.Struct, frozen=True):
+        """A change during the run that charts mark, such as a new delay of a link.
+
+        The number n connects the mark with the row of the table that explains the change.
+
+        Attributes:
+            n: Number in the table of changes.
+            t: Time from which the change applies, in s.
+            site: Name of the site that applies the change.
+            link: The changed link. Empty for a change of another kind.
+        """
+
+        n: int
+        t: float
+        site: str
+        link: str
+
+    class ModeSpan(msgspec.Struct, frozen=True, array_like=True):
+        """An interval, shaded in charts, in which an arm did not follow the others.
+
+        The page receives it as a JSON list.
+
+        Attributes:
+            colour: Index of the site, on which its colour depends.
+            mode: Mode of the site.
+            from_s: Start of the interval, in s.
+            to_s: End of the interval, in s.
+        """
+
+        colour: int
+        mode: str
+        from_s: float
+        to_s: float
+
+    class Palettes(msgspec.Struct, frozen=True):
+        """Colours of the arms for light and for dark screens.
+
+        The colours are in the order of the scenario, as CSS writes them: "#004488".
+
+        Attributes:
+            light: Colours for light screens.
+            dark: Colours for dark screens.
+        """
+
+        light: list[str]
+        dark: list[str]
+
+    class LeadBar(msgspec.Struct, frozen=True, kw_only=True):
+        """Data of a bar that shows which arms lead a slave arm over time.
+
+        A slave follows its peers, the other arms, with weights, the dominance factors. Between
+        two points in time the factors change linearly.
+
+        Attributes:
+            site: Name of the slave.
+            peers: Names of the peers.
+            t: Times of the points, in s.
+            shares: For each peer its dominance factor at these times.
+        """
+
+        site: str
+        peers: list[str]
+        t: list[float]
+        shares: list[list[float]]
+
     end_s: float
     colours: Palettes
-    tables: list[ColumnTable]
+    tables: list[Table]
     charts: list[Chart]
     changes: list[MarkedChange]
     spans: dict[str, list[ModeSpan]]

@@ -13,7 +13,6 @@ from typing import Any
 
 from markupsafe import Markup
 
-from ..log import Log
 from .html_templates import render_macro
 
 NO_NUMBER = "–"
@@ -69,7 +68,7 @@ def render_facts(facts: Iterable[tuple[str, str]]) -> Markup:
 
     If the table is wider than the screen, it scrolls inside its own frame.
     """
-    return render_scrolling(_render("facts", facts=facts), "facts")
+    return _render_scrolling(_render("facts", facts=facts), "facts")
 
 
 def render_table(
@@ -87,25 +86,10 @@ def render_table(
             is always a text.
     """
     table = _render("table", columns=columns, rows=rows, text_columns=text_columns)
-    return render_scrolling(table, next(iter(columns)))
+    return _render_scrolling(table, next(iter(columns)))
 
 
-def render_legend(columns: Mapping[str, str]) -> Markup:
-    """Renders the meanings of a table's columns as a line of text, for touch screens.
-
-    On other screens, the meaning of a column is shown while the pointer is on its header.
-
-    Args:
-        columns: Meanings of the columns by header. Columns with an empty meaning are left out.
-
-    Returns:
-        The line. Empty if no column has a meaning.
-    """
-    items = [f"{header}: {meaning}" for header, meaning in columns.items() if meaning]
-    return _render("legend", text="; ".join(items)) if items else Markup()
-
-
-def render_scrolling(content: Markup, label: str) -> Markup:
+def _render_scrolling(content: Markup, label: str) -> Markup:
     """Renders wide content in a region that scrolls sideways, also by the keyboard.
 
     The page itself then never becomes wider than the screen.
@@ -115,35 +99,6 @@ def render_scrolling(content: Markup, label: str) -> Markup:
         label: Name of the region for screen readers, as plain text.
     """
     return _render("scrolling", content=content, label=label)
-
-
-def render_code(text: str) -> Markup:
-    """Renders commands or the content of a file as HTML in a fixed-width type.
-
-    Line breaks are kept.
-
-    Args:
-        text: The commands or the content, as plain text.
-    """
-    return _render("code", text=text)
-
-
-def label_site(log: Log, name: str) -> Markup:
-    """Renders the label of a site in a table, for example "m1 (master)".
-
-    A square before the label has the colour of the site in all charts.
-    """
-    role = log.scenario.sites[name].role
-    return _render("labelled", index=log.sites.index(name), text=f"{name} ({role})")
-
-
-def label_link(log: Log, link: str) -> Markup:
-    """Renders the label of a link in a table, for example "m1 → s" for the link "m1->s".
-
-    A square before the label has the colour of the sending site.
-    """
-    peer, site = link.split("->")
-    return _render("labelled", index=log.sites.index(peer), text=f"{peer} → {site}")
 
 
 def _render(macro: str, **values: Any) -> Markup:
@@ -160,18 +115,3 @@ def format_cell(value: float | None) -> str:
     if value is None:
         return NO_NUMBER
     return str(value) if isinstance(value, int) else f"{value:.4g}"
-
-
-def format_numbers(values: Iterable[float] | None) -> str:
-    """Returns numbers as one cell of a table, for example "0.1000, -0.2500".
-
-    `None`, for values that do not exist, gives a dash.
-    """
-    if values is None:
-        return NO_NUMBER
-    return ", ".join(f"{value:.4f}" for value in values)
-
-
-def to_percent(share: float | None) -> float | None:
-    """Converts a fraction to percent: 0.05 gives 5. `None` (unknown) gives `None`."""
-    return None if share is None else 100.0 * share

@@ -15,12 +15,16 @@ from markupsafe import Markup
 
 from ..errors import count_nouns, join_words
 from ..log import Log, describe_unknown_ends
-from ..own_code import find_user_laws
 from ..results import JsonObject
-from ..scenario import Scenario, compare_scenarios, list_arm_notes, list_shipped, load_scenario
+from ..scenario import (
+    Scenario,
+    ScenarioDifference,
+    list_arm_notes,
+    list_shipped,
+    load_scenario,
+)
 from .html_templates import render_macro
 from .page_html import (
-    render_code,
     render_details,
     render_facts,
     render_folds,
@@ -51,13 +55,13 @@ def render_origin(log: Log, facts: JsonObject, licence: str) -> Markup:
     folds = [
         render_details("What this scenario is about", _render_description(scenario)),
         render_details("What is assumed", _render_assumptions(scenario)),
-        render_details(f"The resolved scenario, {hint}", render_code(scenario.text)),
+        render_details(f"The resolved scenario, {hint}", _render_code(scenario.text)),
         render_details("The recording", render_facts(recording)),
         render_details("Versions of the software", render_facts(_list_versions(log))),
-        render_details("Licence of the plotting library", render_code(licence)),
+        render_details("Licence of the plotting library", _render_code(licence)),
     ]
 
-    body = render_code(_list_commands(log, name)) + render_folds(folds)
+    body = _render_code(_list_commands(log, name)) + render_folds(folds)
     intro = "These commands check the log, simulate its run again, and run its scenario."
 
     law_files = _list_law_files(scenario)
@@ -104,7 +108,7 @@ def describe_changes(scenario: Scenario) -> str:
     if shipped.title != scenario.title:
         return ""
 
-    all_differences = compare_scenarios([shipped, scenario])
+    all_differences = ScenarioDifference.list_between([shipped, scenario])
     differences = [entry for entry in all_differences if entry.key not in _STATED_KEYS]
     phrases = []
     for difference in differences[:_MAX_CHANGES]:
@@ -208,7 +212,7 @@ def _list_law_files(scenario: Scenario) -> list[str]:
     A log names the module of a law, such as "mine.laws", and not the folder of its file.
     """
     files = []
-    for law in find_user_laws(scenario):
+    for law in scenario.inspect_user_laws():
         module, _, _ = law.code.partition(":")
         files.append(f"{module.replace('.', '/')}.py")
     return list(dict.fromkeys(files))
@@ -237,3 +241,14 @@ def _list_versions(log: Log) -> list[tuple[str, str]]:
         if key.startswith(prefix):
             entries.append((key.removeprefix(prefix), version))
     return entries
+
+
+def _render_code(text: str) -> Markup:
+    """Renders commands or the content of a file as HTML in a fixed-width type.
+
+    Line breaks are kept.
+
+    Args:
+        text: The commands or the content, as plain text.
+    """
+    return render_macro("parts.html", "code", text=text)

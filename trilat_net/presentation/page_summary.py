@@ -23,10 +23,9 @@ from ..analysis import (
     Certificate,
     EndBehaviour,
     JointError,
-    RunView,
+    LogMetrics,
     Stability,
     Timeline,
-    measure_undelayed_error,
 )
 from ..errors import count_nouns, join_words
 from ..log import Finding, Log
@@ -122,7 +121,7 @@ def render_verdict(log: Log, certificate: Certificate, findings: Sequence[Findin
         "verdict",
         css_class=css_class,
         word=word.capitalize(),
-        basis=typeset(describe_basis(certificate)),
+        basis=typeset(_describe_basis(certificate)),
         explanation=" ".join(sentences),
         remarks=" ".join(remarks),
     )
@@ -141,7 +140,7 @@ def _start_sentence(text: str) -> str:
     return text if is_name and first_word != "a" else f"{text[:1].upper()}{text[1:]}"
 
 
-def describe_basis(certificate: Certificate) -> str:
+def _describe_basis(certificate: Certificate) -> str:
     """Returns a sentence on the meaning and the basis of a judgement about stability.
 
     A simulation and a live session, or a proof and an observation, support a judgement to
@@ -350,18 +349,13 @@ def _describe_undelayed_error(log: Log, slaves: Sequence[str]) -> list[_KeyNumbe
     Returns:
         The number in a list. Empty if the distance is unknown.
     """
-    run_view = RunView(log)
-    unit = "rad" if shared_unit(log) == "rad" else "m"
-    distances = []
-    for slave in slaves:
-        metrics = measure_undelayed_error(run_view, slave)
-        distances.append(metrics[f"undelayed_max_{unit}"].value)
-    known_distances = [distance for distance in distances if distance is not None]
-    if not known_distances:
+    distances = LogMetrics.find_undelayed_maxima(log, slaves)
+    if not distances:
         return []
 
+    unit = "rad" if shared_unit(log) == "rad" else "m"
     name = f"{join_words(slaves)} from where the masters are"
-    value = f"{max(known_distances):.3g} {unit}"
+    value = f"{max(distances.values()):.3g} {unit}"
     return [_KeyNumber(name, value, "largest at the same moment, delay included")]
 
 

@@ -110,7 +110,7 @@ def open_rerun(
             named_path.symlink_to(path.resolve())
             path = named_path
 
-        layout = build_plot_layout(Ros2Topics.of_file(path))
+        layout = PlotLayout.of_channels(Ros2Topics.of_file(path))
         layout_path = Path(folder) / "layout.rbl"
         _save_blueprint(layout, path.stem, layout_path)
         environment = {**_QUIET_ENVIRONMENT, **os.environ}
@@ -248,6 +248,39 @@ class PlotLayout(NamedTuple):
     lines: str
     arms: bool = False
 
+    @classmethod
+    def of_channels(cls, channels: Ros2Channels) -> "PlotLayout":
+        """Arranges the channels (series of messages) of a log as plots on pages of the viewer.
+
+        A page has a row of plots per quantity and a plot per arm. Pages and rows without any
+        curve are left out.
+
+        Args:
+            channels: Standard channels by topic. Topics of sites are `<root>/<site>/<name>`,
+                those of the session are `<root>/log` and others.
+        """
+        session_topics = [
+            topic for topic in channels if _get_channel_name(topic) in _SESSION_CHANNELS
+        ]
+        # A dictionary instead of a set keeps the order of the sites.
+        site_roots: dict[str, None] = {}
+        for topic in channels:
+            if topic not in session_topics:
+                site_roots[topic.rpartition("/")[0]] = None
+
+        rows_by_page = {**_PAGES, "Sent by laws": _list_sent_rows(channels)}
+        pages = {}
+        for name, rows in rows_by_page.items():
+            plots_by_row = [_build_row(channels, list(site_roots), row) for row in rows]
+            page = [row_plots for row_plots in plots_by_row if row_plots]
+            if page:
+                pages[name] = page
+
+        line_topics = [topic for topic in session_topics if topic.endswith(f"/{LINES}")]
+        lines = line_topics[0] if line_topics else ""
+        has_arms = any(channel.kind == TRANSFORMS for channel in channels.values())
+        return cls(pages, lines, has_arms)
+
 
 class _PlotRow(NamedTuple):
     """A row of plots on a page of the viewer Rerun: one quantity, with a plot for each arm.
@@ -306,39 +339,6 @@ _PAGES: dict[str, tuple[_PlotRow, ...]] = {
 """The rows of each page."""
 _MAX_LEGEND_NAMES = 20
 """Largest number of curves in a legend. The names of more curves appear under the pointer."""
-
-
-def build_plot_layout(channels: Ros2Channels) -> PlotLayout:
-    """Arranges the channels (series of messages) of a log as plots on the pages of the viewer.
-
-    A page has a row of plots per quantity and a plot per arm. Pages and rows without any curve
-    are left out.
-
-    Args:
-        channels: Standard channels by topic. Topics of sites are `<root>/<site>/<name>`, those
-            of the session are `<root>/log` and others.
-    """
-    session_topics = [
-        topic for topic in channels if _get_channel_name(topic) in _SESSION_CHANNELS
-    ]
-    # A dictionary instead of a set keeps the order of the sites.
-    site_roots: dict[str, None] = {}
-    for topic in channels:
-        if topic not in session_topics:
-            site_roots[topic.rpartition("/")[0]] = None
-
-    rows_by_page = {**_PAGES, "Sent by laws": _list_sent_rows(channels)}
-    pages = {}
-    for name, rows in rows_by_page.items():
-        plots_by_row = [_build_row(channels, list(site_roots), row) for row in rows]
-        page = [row_plots for row_plots in plots_by_row if row_plots]
-        if page:
-            pages[name] = page
-
-    line_topics = [topic for topic in session_topics if topic.endswith(f"/{LINES}")]
-    lines = line_topics[0] if line_topics else ""
-    has_arms = any(channel.kind == TRANSFORMS for channel in channels.values())
-    return PlotLayout(pages, lines, has_arms)
 
 
 def _get_channel_name(topic: str) -> str:

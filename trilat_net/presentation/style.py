@@ -231,52 +231,6 @@ def positive(values: Array) -> Array:
     return np.where(values > 0.0, values, np.nan)
 
 
-SPREAD_BUCKETS = 120
-"""Number of intervals of time for which `plot_spread` draws a median and a band."""
-SPREAD: LineOptions = {"color": FAINT, "alpha": 0.35, "linewidth": 6.0}
-"""Options of the line that represents the band of a spread in a legend."""
-
-
-def plot_spread(axes: Axes, t_s: Array, values: Array, **options: Any) -> None:
-    """Draws a fluctuating signal as its median in a band from least to largest value.
-
-    The time is divided into `SPREAD_BUCKETS` intervals with equal numbers of values. Each
-    interval gives a point of the median and of the edges of the band.
-
-    Args:
-        axes: Panel of the figure, as Matplotlib axes.
-        t_s: Times of the values, in s, shape (K,).
-        values: The values, shape (K,). NaN values are ignored.
-        **options: Options of the line of the median. They must include a "color", which also
-            applies to the band.
-    """
-    buckets = np.array_split(np.arange(len(values)), SPREAD_BUCKETS)
-    points = []
-    for bucket in buckets:
-        if len(bucket):
-            middle_s = t_s[bucket].mean()
-            points.append((middle_s, *_compute_spread(values[bucket])))
-
-    middles_s, smallest, median, largest = np.array(points).reshape(-1, 4).T
-    axes.fill_between(
-        middles_s,
-        smallest,
-        largest,
-        color=options["color"],
-        alpha=SPREAD["alpha"],
-        linewidth=0.0,
-    )
-    axes.plot(middles_s, median, **options)
-
-
-def _compute_spread(values: Array) -> tuple[float, float, float]:
-    """Returns the least, median and largest of the finite values, or NaN if there are none."""
-    # NumPy prints a warning if all values are NaN.
-    if not np.isfinite(values).any():
-        return np.nan, np.nan, np.nan
-    return np.nanmin(values), np.nanmedian(values), np.nanmax(values)
-
-
 def set_plain_log_axis(axis: Axis, steps: Sequence[float] = (1.0, 2.0, 5.0)) -> None:
     """Labels a logarithmic axis with plain numbers, such as 20 instead of a power of 10.
 
@@ -330,32 +284,6 @@ def name_shared(log: Log) -> list[str]:
     return name_joints(log)
 
 
-def title_joints(log: Log, row: Sequence[Axes], titles: Sequence[str] = ()) -> None:
-    """Writes the name of a joint above each panel of a row, or another title.
-
-    Args:
-        log: Log with the joints.
-        row: A panel per title.
-        titles: The titles. Empty for the names of the joints.
-    """
-    for title, axes in zip(titles or name_joints(log), row, strict=True):
-        axes.set_title(title)
-
-
-def label_row(axes: Axes, text: str, form: FigureSize) -> None:
-    """Writes a label beside a row of low panels of a figure, in several lines.
-
-    A low panel has no room beside it for a long label in one line.
-
-    Args:
-        axes: First panel of the row, beside which the label is written.
-        text: The label. It is wrapped after 12 characters.
-        form: Size of the figure, which determines the size of the text.
-    """
-    lines = textwrap.wrap(text, 12)
-    axes.set_ylabel("\n".join(lines), fontsize=form.tick_pt)
-
-
 def flatten_rounding(axes: Axes) -> None:
     """Widens the value axis of a panel whose curves differ only by rounding errors.
 
@@ -373,7 +301,7 @@ def flatten_rounding(axes: Axes) -> None:
 class _JointPanels(NamedTuple):
     """Panels of a figure in which each joint of the arms has a panel of its own.
 
-    `add_joint_panels` creates them.
+    `TimeFigure.add_joint_panels` creates them.
 
     Attributes:
         joints: A panel per joint.
@@ -424,43 +352,6 @@ def arrange_joints(joints: int, narrow: bool) -> list[list[str]]:
     return [cells[first : first + columns] for first in range(0, len(cells), columns)]
 
 
-def add_joint_panels(
-    figure: Figure, joints: int, form: FigureSize, below: str = ""
-) -> _JointPanels:
-    """Adds a panel per joint to a figure, and optionally a wide panel below them.
-
-    Two joints share one value axis. If there are more, each joint has its own, because the
-    torques of wrists are much smaller than those of shoulders.
-
-    Args:
-        figure: The Matplotlib figure.
-        joints: Number of joints.
-        form: Width, type sizes and resolution of the figure.
-        below: Name of the wide panel. Empty for no wide panel.
-    """
-    grid = arrange_joints(joints, form.narrow)
-    columns = len(grid[0])
-    rows = list(grid)
-    if below:
-        rows.append([below] * columns)
-    panels: dict[str, Axes] = figure.subplot_mosaic([[*row] for row in rows])
-    joint_panels = [panels[str(joint)] for joint in range(joints)]
-
-    # Only the lowest panel of a column has a labelled time axis.
-    for upper, lower in zip(joint_panels, joint_panels[columns:], strict=False):
-        upper.sharex(lower)
-        upper.tick_params(labelbottom=False)
-    if joints == 2:
-        joint_panels[1].sharey(joint_panels[0])
-        joint_panels[1].tick_params(labelleft=False)
-    return _JointPanels(
-        joints=joint_panels,
-        columns=columns,
-        lowest=joint_panels[-columns:],
-        below=panels.get(below),
-    )
-
-
 def typeset(text: str) -> str:
     """Replaces "+-" and "->", which the terminal shows, by the signs ± and →.
 
@@ -479,24 +370,6 @@ def typeset_unit(unit: str) -> str:
         unit: The unit, such as "rad/s^2".
     """
     return unit.replace("^2", "²")
-
-
-def typeset_symbol(parameter: str) -> str:
-    """Returns the symbol of an inertial parameter for Matplotlib, with its index below.
-
-    An adaptive control law estimates such parameters, for example a mass or an inertia.
-
-    Args:
-        parameter: Name of the parameter: a moment of inertia such as "Ixx", a first moment such
-            as "mc_x", or the mass.
-    """
-    if parameter[0] == "I":
-        stem = parameter[:1]
-        index = parameter[1:]
-    else:
-        stem = parameter[:2]
-        index = parameter[3:]  # behind the underscore
-    return f"${stem.strip()}_{{{index}}}$" if index else f"${stem}$"
 
 
 _MAX_LEGEND_COLUMNS = 6
@@ -735,7 +608,7 @@ class TimeFigure:
     ) -> None:
         self.log = log
         self.figure = figure
-        self._small_pt = form.small_pt
+        self._form = form
         timeline = Timeline(log)
         self._interval_s = interval_s or (0.0, timeline.end_s)
 
@@ -748,6 +621,38 @@ class TimeFigure:
             ]
         self._changes = list(enumerate(shown_changes, 1))
         self._modes = {site: timeline.find_mode_intervals(site) for site in log.sites}
+
+    def add_joint_panels(self, joints: int, below: str = "") -> _JointPanels:
+        """Adds a panel per joint to the figure, and optionally a wide panel below them.
+
+        Two joints share one value axis. If there are more, each joint has its own, because the
+        torques of wrists are much smaller than those of shoulders.
+
+        Args:
+            joints: Number of joints.
+            below: Name of the wide panel. Empty for no wide panel.
+        """
+        grid = arrange_joints(joints, self._form.narrow)
+        columns = len(grid[0])
+        rows = list(grid)
+        if below:
+            rows.append([below] * columns)
+        panels: dict[str, Axes] = self.figure.subplot_mosaic([[*row] for row in rows])
+        joint_panels = [panels[str(joint)] for joint in range(joints)]
+
+        # Only the lowest panel of a column has a labelled time axis.
+        for upper, lower in zip(joint_panels, joint_panels[columns:], strict=False):
+            upper.sharex(lower)
+            upper.tick_params(labelbottom=False)
+        if joints == 2:
+            joint_panels[1].sharey(joint_panels[0])
+            joint_panels[1].tick_params(labelleft=False)
+        return _JointPanels(
+            joints=joint_panels,
+            columns=columns,
+            lowest=joint_panels[-columns:],
+            below=panels.get(below),
+        )
 
     def trace(
         self, axes: Axes, site: str, values: Array, width: float | None = None, **options: Any
@@ -848,7 +753,7 @@ class TimeFigure:
                 xy=(at_s, 1.0),
                 # x in s, y from 0 to 1 over the height of the panel
                 xycoords=axes.get_xaxis_transform(),
-                fontsize=self._small_pt,
+                fontsize=self._form.small_pt,
                 **_CHANGE_NUMBER,
             )
 
@@ -885,7 +790,9 @@ class TimeFigure:
 
         For example, the sentences explain the marked changes and the shaded times.
         """
-        letters_per_line = int(_LETTERS_PER_IN * self.figure.get_figwidth() / self._small_pt)
+        letters_per_line = int(
+            _LETTERS_PER_IN * self.figure.get_figwidth() / self._form.small_pt
+        )
         lines: list[str] = []
         for sentence in sentences:
             lines += textwrap.wrap(sentence, letters_per_line)
@@ -894,7 +801,7 @@ class TimeFigure:
                 typeset("\n".join(lines)),
                 x=0.01,
                 ha="left",
-                fontsize=self._small_pt,
+                fontsize=self._form.small_pt,
                 color=REFERENCE,
             )
 

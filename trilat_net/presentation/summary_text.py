@@ -4,7 +4,7 @@ Each function `compose_...` turns the result of one command into lines and table
 `terminal_output` prints. The results are about:
 
 - a run: its summary, metrics, checks of its log, recovery of its log, and repeated execution,
-- a live session: `compose_ping`, `compose_topic_delays`,
+- a live session: `compose_ping`,
 - this machine: `compose_doctor`, `compose_benchmark`.
 
 `format_run_lines` lists the notable facts of a run, such as alarms, changed settings, and
@@ -25,10 +25,8 @@ from ..analysis import (
     LogMetrics,
     Metric,
     Quantity,
-    RunView,
     Timeline,
     link_summary,
-    measure_undelayed_error,
 )
 from ..errors import count_nouns
 from ..execution import LogCheckReport, Rerun
@@ -88,15 +86,15 @@ def format_run_lines(log: Log) -> list[str]:
     """
     return [
         *_limit_lines([f"*** {alarm}" for alarm in Timeline(log).alarms]),
-        *format_outside_lines(log),
-        *format_link_lines(log),
+        *_format_outside_lines(log),
+        *_format_link_lines(log),
         *_format_change_lines(log),
         *_format_mode_lines(log),
-        *format_clock_lines(log),
+        *_format_clock_lines(log),
     ]
 
 
-def format_outside_lines(log: Log) -> list[str]:
+def _format_outside_lines(log: Log) -> list[str]:
     """Returns the messages that users' control laws and external arms left in a log, as lines.
 
     These texts come from other programs. Therefore they are cut to a bounded length, and
@@ -117,7 +115,7 @@ def format_outside_lines(log: Log) -> list[str]:
     return _limit_lines(lines)
 
 
-def format_link_lines(log: Log) -> list[str]:
+def _format_link_lines(log: Log) -> list[str]:
     """Returns a line for each network link whose delay varies or which loses messages.
 
     A link transmits the state of one arm to another, as a message (sample) per control period.
@@ -192,7 +190,7 @@ def _format_mode_lines(log: Log) -> list[str]:
     return lines
 
 
-def format_clock_lines(log: Log) -> list[str]:
+def _format_clock_lines(log: Log) -> list[str]:
     """Returns a line for each link whose two sites have different clocks.
 
     The line states the difference between the clocks, because measured delays depend on it.
@@ -450,18 +448,10 @@ def _compare_undelayed_errors(rerun: Rerun) -> dict[str, tuple[float, float]]:
     Returns:
         Largest undelayed error in the log and in the rerun, by site.
     """
-    logged_run = RunView(rerun.before)
-    repeated_run = RunView(rerun.after)
-    key = "undelayed_max_rad" if shared_unit(rerun.before) == "rad" else "undelayed_max_m"
-    errors = {}
-    for site, effect in rerun.sites.items():
-        if not effect.compared:
-            continue
-        logged_error = measure_undelayed_error(logged_run, site, repeated_run)[key].value
-        repeated_error = measure_undelayed_error(repeated_run, site, logged_run)[key].value
-        if logged_error is not None and repeated_error is not None:
-            errors[site] = (logged_error, repeated_error)
-    return errors
+    sites = [site for site, effect in rerun.sites.items() if effect.compared]
+    logged = LogMetrics.find_undelayed_maxima(rerun.before, sites, rerun.after)
+    repeated = LogMetrics.find_undelayed_maxima(rerun.after, sites, rerun.before)
+    return {site: (logged[site], repeated[site]) for site in logged if site in repeated}
 
 
 _USED_FIELD = "used["
@@ -594,64 +584,6 @@ def compose_ping(report: Result) -> Iterator[Block]:
             rows.append([link["from"], link["to"], *delay_cells, *clock_cells])
         link_headers = ("from", "to", "delay p50", "max", "rtt min", "offset s", "+- us")
         yield TextTable(link_headers, rows, align="llr")
-
-
-_BARS = " ▁▂▃▄▅▆▇█"
-"""Bars of a histogram in text, by their height in eighths."""
-_DELAY_KEYS = ("min", "p50", "p99", "max")
-
-
-def compose_topic_delays(report: Result) -> Iterator[Block]:
-    """Yields a table of the delays with which the messages of a ROS 2 topic arrive.
-
-    There is a row per publishing program. The last column is a histogram of the delays, from
-    the smallest to the largest one.
-
-    Args:
-        report: Result of the measurement.
-    """
-    measurement = report.to_dict()
-    duration = f"{measurement['lasted_s']:.3g} s"
-    yield f"/{measurement['topic']}, {duration}; times in us, from sending to arrival"
-
-    rows = []
-    has_negative_delay = False
-    for publisher in measurement["publishers"]:
-        delays_us = publisher["delay_us"]
-        if delays_us["min"] < 0.0:
-            has_negative_delay = True
-
-        cells = [
-            publisher["gid"][:8],
-            publisher["type"],
-            str(publisher["messages"]),
-            str(publisher["lost"]),
-            f"{publisher['rate_hz']:.1f}",
-        ]
-        cells += [f"{delays_us[key]:.0f}" for key in _DELAY_KEYS]
-        cells.append(_draw_histogram(publisher["histogram"]["counts"]))
-        rows.append(cells)
-    headers = ("publisher", "type", "messages", "lost", "Hz", *_DELAY_KEYS, "min to max")
-    yield TextTable(headers, rows, align="llrrrrrrrl")
-
-    if has_negative_delay:
-        yield "delays below 0: the publisher's clock is ahead of the clock of this machine"
-    yield "between two machines, delays contain the offset of the clocks"
-
-
-def _draw_histogram(counts: Sequence[int]) -> str:
-    """Draws a histogram as one line of text, with a block character for each bin.
-
-    Args:
-        counts: Number of messages in each bin. At least one bin must have a message.
-    """
-    largest = max(counts)
-    bars = ""
-    for count in counts:
-        # Rounded up, so that a bin with a single message has a visible bar.
-        height_eighths = math.ceil(8 * count / largest)
-        bars += _BARS[height_eighths]
-    return bars
 
 
 def _describe_clock(member: dict[str, Any]) -> str:

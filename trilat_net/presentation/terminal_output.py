@@ -27,7 +27,7 @@ from rich.markup import escape
 from rich.text import Text
 
 from ..errors import count_nouns
-from .untrusted_text import CONTROLS, MAX_LETTERS, escape_controls, sanitize
+from .untrusted_text import CONTROLS, MAX_LETTERS, sanitize
 
 if TYPE_CHECKING:
     from ..log import Log
@@ -50,7 +50,7 @@ class TextConsole(Console):
             text: The text.
             **options: Options of Rich.
         """
-        return super().render_str(escape_controls(text), **options)
+        return super().render_str(_escape_controls(text), **options)
 
 
 out = TextConsole(highlight=False)
@@ -153,7 +153,7 @@ def print_line(text: str) -> None:
     Args:
         text: The line.
     """
-    sys.stdout.write(escape_controls(text) + "\n")
+    sys.stdout.write(_escape_controls(text) + "\n")
     sys.stdout.flush()
 
 
@@ -363,9 +363,7 @@ def warn_user_laws(log: "Log") -> None:
     Args:
         log: The log.
     """
-    from ..own_code import find_user_laws
-
-    for law in find_user_laws(log.scenario):
+    for law in log.scenario.inspect_user_laws():
         if law.allowed:
             print_note(f"executing this log runs code from outside: {law}")
         else:
@@ -401,3 +399,14 @@ def warn_if_unfinished(path: Path) -> None:
             f"{path}: was not finished: its end and its index are missing; repair it with: "
             f"trilat log recover {path}"
         )
+
+
+def _escape_controls(text: str) -> str:
+    """Replaces control characters of a text by their names, as in <U+001B>.
+
+    Otherwise a text from another program could control the terminal, for example clear it.
+
+    Args:
+        text: The text.
+    """
+    return CONTROLS.sub(lambda match: f"<U+{ord(match[0]):04X}>", text)

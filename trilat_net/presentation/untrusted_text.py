@@ -21,17 +21,6 @@ MAX_LETTERS = 4000
 """Largest length of a printed line."""
 
 
-def escape_controls(text: str) -> str:
-    """Replaces control characters of a text by their names, as in <U+001B>.
-
-    Otherwise a text from another program could control the terminal, for example clear it.
-
-    Args:
-        text: The text.
-    """
-    return CONTROLS.sub(lambda match: f"<U+{ord(match[0]):04X}>", text)
-
-
 def sanitize(text: object, most: int = 300) -> str:
     """Replaces the harmful characters of a text of unknown origin, and truncates a long text.
 

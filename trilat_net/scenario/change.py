@@ -1,8 +1,8 @@
 """Defines a change of a running experiment, such as a new delay, and describes it to people.
 
 Since old versions of the program stored the settings of a change in place of a sentence, old
-logs would show JSON to people. `describe_event` composes the missing sentence, so that old and
-new logs read alike.
+logs would show JSON to people. `Change.describe_event` composes the missing sentence, so that
+old and new logs read alike.
 
 Invariant:
     - A change contains the time from which it holds, and the complete settings after it, so
@@ -92,35 +92,36 @@ class Change(RecordedChange, frozen=True, omit_defaults=True):
         target = shares or "nobody"
         return f"the shares of {self.dominance} were set to {target}{ramp}{by}, from {at} on"
 
+    @staticmethod
+    def find_requester(sentence: str) -> str:
+        """Returns who requested a stop, from the sentence about it in a log, for a report.
 
-def find_requester(sentence: str) -> str:
-    """Returns who requested a stop, from the sentence about it in a log, for a report.
+        Args:
+            sentence: Sentence that `describe` returned.
 
-    Args:
-        sentence: Sentence that `Change.describe` returned.
+        Returns:
+            The requester as a noun phrase. Empty if the sentence is not about a stop, or does
+            not say who requested it.
+        """
+        match = re.fullmatch(r"\S+ was stopped by (.+) at [\d.]+ s", sentence)
+        return "" if match is None else match[1]
 
-    Returns:
-        The requester as a noun phrase. Empty if the sentence is not about a stop, or does not
-        say who requested it.
-    """
-    match = re.fullmatch(r"\S+ was stopped by (.+) at [\d.]+ s", sentence)
-    return "" if match is None else match[1]
+    @classmethod
+    def describe_event(cls, kind: str, text: str, command: str) -> str:
+        """Returns the sentence that describes an event of a log to people.
 
+        Older versions of the program logged the JSON text of a change in place of a sentence.
+        For such an event, the sentence is composed here, so that old and new logs read alike.
+        All other texts are returned unchanged.
 
-def describe_event(kind: str, text: str, command: str) -> str:
-    """Returns the sentence that describes an event of a log to people.
-
-    Older versions of the program logged the JSON text of a change in place of a sentence. For
-    such an event, the sentence is composed here, so that old and new logs read alike. All other
-    texts are returned unchanged.
-
-    Args:
-        kind: Kind of the event, a short name for programs.
-        text: Text of the event, as a site or a recorder published it.
-        command: JSON text of the change that the event reports. Empty for other events.
-    """
-    if kind == "change" and command and command in text:
-        # The command of an untrusted log may lack the keys of a change. The text is then kept.
-        with suppress(msgspec.MsgspecError, KeyError, TypeError, ValueError):
-            return msgspec.json.decode(command, type=Change).describe()
-    return text
+        Args:
+            kind: Kind of the event, a short name for programs.
+            text: Text of the event, as a site or a recorder published it.
+            command: JSON text of the change that the event reports. Empty for other events.
+        """
+        if kind == "change" and command and command in text:
+            # The command of an untrusted log may lack the keys of a change. The text is then
+            # kept.
+            with suppress(msgspec.MsgspecError, KeyError, TypeError, ValueError):
+                return msgspec.json.decode(command, type=cls).describe()
+        return text

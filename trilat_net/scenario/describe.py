@@ -12,7 +12,7 @@ Invariant:
 """
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -21,28 +21,16 @@ import numpy as np
 
 from ..core import (
     ROW_SUM_TOLERANCE,
-    Array,
     ChainJoint,
-    DelayKind,
+    IntArray,
     link_key,
 )
 from ..errors import count_nouns
-from ..laws import ArmLoad, LawSettings, LawSituation, StabilityCondition
+from ..records import NS_PER_S
 from .arms import TASK_AXES, Arm
-from .delay_models import LinkBase
-from .operators.kernel_operators import (
-    Chirp,
-    JointSpring,
-    Multisine,
-    Pulse,
-    RecordedTorque,
-    ViscousEnvironment,
-)
 from .rest_bounds import find_rest_bounds
-from .sample_uses import count_silences, draw_used_samples
 from .scenario_reader import load_scenario
 from .scenario_types import Scenario
-from .site_spec import SiteSpec
 from .urdf import UrdfJoint
 
 # Notes on the matrix of dominance factors, the weights with which sites follow their peers.
@@ -57,149 +45,6 @@ IRREVERSIBLE_SHARES = (
 )
 
 
-def _find_link_delays(links: Mapping[str, LinkBase], rates_hz: Mapping[str, int]) -> Array:
-    """Returns the delay of every network link in s, for the stability conditions.
-
-    A constant delay is rounded up to whole control periods of the receiver. Delays that vary
-    are NaN.
-
-    Args:
-        links: Links by name.
-        rates_hz: Tick rates of the sites, by name.
-    """
-    names = list(rates_hz)
-    delay_s = np.zeros((len(names), len(names)))
-    for name, link in links.items():
-        sender, _, receiver = name.partition("->")
-        index = (names.index(receiver), names.index(sender))
-        model = link.to_core_model()
-        if model.kind != DelayKind.CONSTANT or link.loss or link.measured:
-            delay_s[index] = np.nan
-            continue
-        rate_hz = rates_hz[receiver]
-        delay_us = max(round(model.location), model.playout_us)
-        # rounded up, because without a delay a sample is used from the next tick on
-        ticks = max(1, -(-delay_us * rate_hz // 1_000_000))
-        delay_s[index] = ticks / rate_hz
-    return delay_s
-
-
-def _find_hold_time(scenario: Scenario) -> float:
-    """Returns for how long the torque of an arm is held constant, in s.
-
-    This is the control period for the integration scheme "digital", and 0 for other schemes. It
-    is NaN if the control loops of the arms have different rates.
-    """
-    if scenario.scheme != "digital":
-        return 0.0
-    periods_s = {1.0 / site.rate_hz for site in scenario.sites.values()}
-    return periods_s.pop() if len(periods_s) == 1 else math.nan
-
-
-def _find_hand_impedances(site: SiteSpec, joints: int) -> tuple[ArmLoad, ...] | None:
-    """Returns the operators and environments of a site that react to the motion of its arm.
-
-    Operators whose torque depends on time alone are left out.
-
-    Args:
-        site: Description of the site.
-        joints: Number of joints of its arm.
-
-    Returns:
-        The spring and the damper of each. None if the reaction of an operator depends on the
-        pose, because the operator acts on the end effector, or if the reaction is not known,
-        because the operator is a live operator or a program.
-    """
-    impedances = []
-    for source in (*site.hands, *site.environment):
-        if isinstance(source, _TIMED_TORQUES):
-            continue
-        if not isinstance(source, JointSpring | ViscousEnvironment):
-            return None
-        # A sampled torque lags behind the motion, so it is not that of a spring and damper.
-        if source.sampled:
-            return None
-        stiffness: tuple[float, ...] = (0.0,)
-        if isinstance(source, JointSpring):
-            stiffness = source.stiffness_nm_rad
-        damping = source.damping_nm_s_rad
-        impedance = ArmLoad(
-            stiffness_nm_rad=tuple(np.broadcast_to(stiffness, joints).tolist()),
-            damping_nm_s_rad=tuple(np.broadcast_to(damping, joints).tolist()),
-        )
-        impedances.append(impedance)
-    return tuple(impedances)
-
-
-_TIMED_TORQUES = (Pulse, Chirp, Multisine, RecordedTorque)
-"""Operators whose torque depends on time alone."""
-
-
-def list_law_situations(scenario: Scenario) -> Iterator[tuple[str, LawSettings, LawSituation]]:
-    """Yields each arm with its control law and the facts on which its stability depends.
-
-    The facts are delays, the rates of the control loops, and the weights with which the arms
-    follow each other. A law with a stability condition evaluates it from them.
-    """
-    rates_hz = {name: site.rate_hz for name, site in scenario.sites.items()}
-    delay_s = _find_link_delays(scenario.links, rates_hz)
-    hold_s = _find_hold_time(scenario)
-    hands = tuple(
-        _find_hand_impedances(site, len(site.q0_rad)) for site in scenario.sites.values()
-    )
-    for n, (name, site) in enumerate(scenario.sites.items()):
-        situation = LawSituation(
-            site=n,
-            names=scenario.names,
-            laws=scenario.controls,
-            alpha=scenario.alpha,
-            delay_s=delay_s,
-            tau_limit_nm=tuple(np.atleast_1d(site.limits.tau_limit_nm).tolist()),
-            rate_hz=site.rate_hz,
-            gravity_nm=scenario.arms[name].largest_gravity(site.arm.g_m_s2),
-            hold_s=hold_s,
-            hands=hands,
-            in_task_space=scenario.layout(name).task,
-        )
-        yield name, scenario.controls[n], situation
-
-
-_LOOP_GROWS = ", but the roots of the sampled loop grow"
-"""Addition to the line about a satisfied condition if the sampled loop is unstable."""
-_SAMPLING_BREAKS = ", but sampling breaks it here: the roots of the sampled loop grow"
-"""The same addition for a condition that proves decay in continuous time."""
-
-
-def describe_law_conditions(scenario: Scenario, *, ticks_grow: bool = False) -> list[str]:
-    """Returns lines for the user that say whether the conditions of the stability proofs hold.
-
-    Every control law has its own stability conditions, for example on its gains and on the
-    delays. Sites with the same law and the same condition share a line.
-
-    Most conditions are proved for controllers that act in continuous time. A controller that
-    acts once per tick may be unstable although its condition holds.
-
-    Args:
-        scenario: Description of the experiment.
-        ticks_grow: True if the loop, computed tick by tick, is known to be unstable. The lines
-            about satisfied conditions then mention this.
-    """
-    owners: dict[tuple[str, StabilityCondition], list[str]] = {}
-    for name, law, situation in list_law_situations(scenario):
-        condition = law.condition(situation)
-        if condition:
-            owners.setdefault((law.tag, condition), []).append(name)
-    verdicts = {True: "holds", False: "does not hold", None: "is undecided"}
-    lines = []
-    for (tag, condition), sites in owners.items():
-        verdict = verdicts[condition.holds]
-        line = f"condition of {tag} at {', '.join(sites)} {verdict}: {condition.text}"
-        if ticks_grow and condition.holds:
-            line += _SAMPLING_BREAKS if condition.proves_decay else _LOOP_GROWS
-        lines.append(line)
-    return lines
-
-
 def _describe_idle_shares(scenario: Scenario) -> list[str]:
     """Returns lines about arms for which the weights in the scenario have no effect.
 
@@ -208,7 +53,7 @@ def _describe_idle_shares(scenario: Scenario) -> list[str]:
     """
     ramped_sites = {change.dominance for change in scenario.timeline}
     owners: dict[str, list[str]] = {}
-    for name, law, situation in list_law_situations(scenario):
+    for name, law, situation in scenario.law_situations():
         reason = law.explain_idle_shares(situation)
         if not reason and name in ramped_sites and law.fixed_shares:
             reason = (
@@ -245,7 +90,7 @@ def describe_scenario(scenario: str | Path | Mapping[str, Any] | Scenario) -> li
         f"sites: {names}; {scenario.duration_s:g} s, {', '.join(tick_counts)}",
         *_describe_links(scenario),
         *_describe_shares(scenario),
-        *describe_law_conditions(scenario),
+        *scenario.describe_law_conditions(),
         *_describe_idle_shares(scenario),
         *_describe_arms(scenario),
         *_describe_tasks(scenario),
@@ -497,14 +342,13 @@ def _describe_silences(scenario: Scenario) -> list[str]:
             link = scenario.links[f"{peer}->{name}"]
             if link.measured or not scenario.dominance[name].get(peer):
                 continue
-            used = draw_used_samples(
-                link=link,
+            used = link.draw_used_samples(
                 key=link_key(scenario.seed, f"{peer}->{name}"),
                 receiver_hz=spec.rate_hz,
                 sender_hz=scenario.sites[peer].rate_hz,
                 duration_s=scenario.duration_s,
             )
-            count = count_silences(used, spec.rate_hz, spec.on_stale.rule.age_ns)
+            count = _count_silences(used, spec.rate_hz, spec.on_stale.rule.age_ns)
             if not count:
                 continue
             per_minute = 60.0 * count / scenario.duration_s
@@ -517,6 +361,26 @@ def _describe_silences(scenario: Scenario) -> list[str]:
                 f"not counted{advice}"
             )
     return lines
+
+
+def _count_silences(used: IntArray, receiver_hz: int, silence_ns: int) -> int:
+    """Counts how often an arm receives nothing new from another arm for longer than a limit.
+
+    The time before the first message does not count.
+
+    Args:
+        used: Number of the sample in use in every tick. -1 before the first sample.
+        receiver_hz: Tick rate of the site, in Hz.
+        silence_ns: Longest time without a new sample that is not counted as a silence, in ns.
+    """
+    new_sample_ticks = np.flatnonzero(np.diff(used, prepend=-1) > 0)
+    if not len(new_sample_ticks):
+        return 0
+    gap_ticks = np.diff(new_sample_ticks, append=len(used))
+    gaps_ns = gap_ticks * NS_PER_S // receiver_hz
+    # Without a silence, the distance between new samples is one period.
+    period_ns = NS_PER_S // receiver_hz
+    return int(np.count_nonzero(gaps_ns - period_ns > silence_ns))
 
 
 def _describe_stops(scenario: Scenario) -> list[str]:
@@ -585,6 +449,39 @@ class ScenarioDifference(NamedTuple):
     owners: tuple[str, ...]
     values: tuple[str, ...]
 
+    @classmethod
+    def list_between(cls, scenarios: Sequence[Scenario]) -> list["ScenarioDifference"]:
+        """Finds the settings in which several experiments differ.
+
+        Settings that only some of the experiments have are included.
+
+        Args:
+            scenarios: Descriptions of at least two experiments.
+
+        Returns:
+            One entry for each difference, in the order of the keys. Empty if the experiments
+            are equal.
+        """
+        differences: list[ScenarioDifference] = []
+        site_lists = [", ".join(scenario.names) for scenario in scenarios]
+        if len(set(site_lists)) > 1:
+            differences.append(cls("sites", (), tuple(site_lists)))
+        tables: list[dict[str, Any]] = [msgspec.to_builtins(scenario) for scenario in scenarios]
+        common_tables = [_omit_keys(table, _NOT_COMPARED) for table in tables]
+        differences += _compare_tables(common_tables)
+
+        # Sites with the same difference are collected in one entry.
+        owners: dict[tuple[str, tuple[str, ...]], list[str]] = {}
+        for site in scenarios[0].names:
+            if not all(site in other.sites for other in scenarios):
+                continue
+            site_tables = [table["sites"][site] for table in tables]
+            for difference in _compare_tables(site_tables):
+                owners.setdefault((difference.key, difference.values), []).append(site)
+        for (key, values), sites in owners.items():
+            differences.append(cls(key, tuple(sites), values))
+        return differences + _compare_links(scenarios)
+
     @property
     def concerns_link(self) -> bool:
         """True if the differing key belongs to a network link, such as "link m1->s"."""
@@ -593,39 +490,6 @@ class ScenarioDifference(NamedTuple):
     def __str__(self) -> str:
         """Returns the key that differs, with the names of the arms for which it does."""
         return f"{self.key} of {', '.join(self.owners)}" if self.owners else self.key
-
-
-def compare_scenarios(scenarios: Sequence[Scenario]) -> list[ScenarioDifference]:
-    """Finds the settings in which several experiments differ.
-
-    Settings that only some of the experiments have are included.
-
-    Args:
-        scenarios: Descriptions of at least two experiments.
-
-    Returns:
-        One entry for each difference, in the order of the keys. Empty if the experiments are
-        equal.
-    """
-    differences: list[ScenarioDifference] = []
-    site_lists = [", ".join(scenario.names) for scenario in scenarios]
-    if len(set(site_lists)) > 1:
-        differences.append(ScenarioDifference("sites", (), tuple(site_lists)))
-    tables: list[dict[str, Any]] = [msgspec.to_builtins(scenario) for scenario in scenarios]
-    common_tables = [_omit_keys(table, _NOT_COMPARED) for table in tables]
-    differences += _compare_tables(common_tables)
-
-    # Sites with the same difference are collected in one entry.
-    owners: dict[tuple[str, tuple[str, ...]], list[str]] = {}
-    for site in scenarios[0].names:
-        if not all(site in other.sites for other in scenarios):
-            continue
-        site_tables = [table["sites"][site] for table in tables]
-        for difference in _compare_tables(site_tables):
-            owners.setdefault((difference.key, difference.values), []).append(site)
-    for (key, values), sites in owners.items():
-        differences.append(ScenarioDifference(key, tuple(sites), values))
-    return differences + _compare_links(scenarios)
 
 
 def _omit_keys(table: Mapping[str, Any], keys: Sequence[str]) -> dict[str, Any]:

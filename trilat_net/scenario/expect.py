@@ -131,30 +131,6 @@ _QUANTITIES = tuple(key for key in _WINDOW_KEYS if key not in ("from_s", "to_s",
 _JOINT_QUANTITY = re.compile(r"(?:q|push)(\d+)_")
 
 
-def complete_expect(
-    written: TomlTable, sites: TomlTable, urdf_texts: Mapping[str, str]
-) -> TomlTable:
-    """Returns the table of expectations, with indices in place of names of joints.
-
-    An expectation states what a test of the scenario requires of a run. It may apply to a
-    window of time and to one joint. The author may name this joint as in the URDF file of the
-    arm; the result contains its index.
-
-    Args:
-        written: Table `expect` as its author wrote it.
-        sites: Complete tables of the sites, by name.
-        urdf_texts: Texts of the URDF files, by name.
-    """
-    if "windows" not in written:
-        return written
-    joint_names = {}
-    for name, site in sites.items():
-        if site["arm"].get("urdf"):
-            chain = msgspec.convert(site["arm"], Arm).read_chain(urdf_texts)
-            joint_names[name] = tuple(joint.name for joint in chain.joints)
-    return {**written, "windows": _number_window_joints(written["windows"], joint_names)}
-
-
 def _number_window_joints(
     written: list[TomlTable], joint_names: Mapping[str, tuple[str, ...]]
 ) -> list[TomlTable]:
@@ -326,6 +302,30 @@ class Expect(
     no_gaps: bool = False
     windows: tuple[ExpectWindow, ...] = ()
     metrics: dict[str, LeastMost] = {}
+
+    @staticmethod
+    def complete_table(
+        written: TomlTable, sites: TomlTable, urdf_texts: Mapping[str, str]
+    ) -> TomlTable:
+        """Returns the table of expectations, with indices in place of names of joints.
+
+        An expectation states what a test of the scenario requires of a run. It may apply to a
+        window of time and to one joint. The author may name this joint as in the URDF file of
+        the arm; the result contains its index.
+
+        Args:
+            written: Table `expect` as its author wrote it.
+            sites: Complete tables of the sites, by name.
+            urdf_texts: Texts of the URDF files, by name.
+        """
+        if "windows" not in written:
+            return written
+        joint_names = {}
+        for name, site in sites.items():
+            if site["arm"].get("urdf"):
+                chain = msgspec.convert(site["arm"], Arm).read_chain(urdf_texts)
+                joint_names[name] = tuple(joint.name for joint in chain.joints)
+        return {**written, "windows": _number_window_joints(written["windows"], joint_names)}
 
     @property
     def has_expectations(self) -> bool:

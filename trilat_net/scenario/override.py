@@ -14,7 +14,7 @@ Invariant:
 
 import tomllib
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 from ..errors import ScenarioError, count_nouns, suggest_nearest
 from ..fields import TomlTable
@@ -39,43 +39,148 @@ Override = tuple[str, Any]
 """Dotted key and its new value."""
 
 
-def expand_overrides(scenario: Scenario, pairs: Sequence[Override]) -> dict[str, Any]:
-    """Replaces an override for all sites or links by one override for each of them.
+class ScenarioOverrides(NamedTuple):
+    """Changes of single keys of a scenario, such as `control.Kd=5`, as a user orders them.
 
-    An override replaces one value of a scenario, the description of an experiment. Groups are
-    all sites (the processes of the arms) or all links (the connections between them). For
-    example, an override of `control.K` becomes one override for each site whose control law has
-    a gain K.
-
-    Args:
-        scenario: The complete scenario.
-        pairs: The overrides. Each is a pair of a dotted key and a value.
-
-    Returns:
-        Values by the dotted key of a single site or link.
-
-    Raises:
-        ScenarioError: The key does not exist, or no site or link of the scenario can have it.
+    Attributes:
+        pairs: Dotted key and new value of each override.
     """
-    flat_pairs = _flatten_groups(pairs)
-    overridden = dict(flat_pairs)
-    group_values: dict[str, Any] = {}
-    single_values: dict[str, Any] = {}
-    for key, value in flat_pairs:
-        group, _, name = key.partition(".")
-        is_site_group = group in SITE_GROUPS and bool(name)
-        if is_site_group:
-            vector, _ = _split_entry(name)
-            first_key = vector.split(".")[0]
-            check_keys({first_key: value}, field_names(SITE_GROUPS[group]), group)
-        if is_site_group or key == "rate_hz":
-            group_values |= {f"sites.{site}.{key}": value for site in scenario.names}
-        elif group in _KIND_KEYS and name:
-            members = _expand_group(scenario, group, name, overridden)
-            group_values |= dict.fromkeys(members, value)
-        else:
-            single_values[_expand_single(scenario, key, overridden)] = value
-    return group_values | single_values
+
+    pairs: tuple[Override, ...]
+
+    @classmethod
+    def parse(cls, written: Mapping[str, Any] | Sequence[str]) -> "ScenarioOverrides":
+        """Converts overrides of a scenario from the form in which a user wrote them.
+
+        A user writes KEY=VALUE on the command line, or a mapping in Python.
+
+        Args:
+            written: Values by dotted key, or texts KEY=VALUE. The value of a text is written as
+                in TOML, or as a bare word.
+
+        Raises:
+            ScenarioError: A text does not have the form KEY=VALUE.
+        """
+        if isinstance(written, Mapping):
+            return cls(tuple(name_law_classes(written).items()))
+        pairs = []
+        for text in written:
+            pair = split_assignment(str(text))
+            if pair is None:
+                raise ScenarioError(
+                    "an override must have the form KEY=VALUE, as in control.Kd=5, not "
+                    f"{text!r}{hint_at_quotes(str(text))}"
+                )
+            pairs.append(pair)
+        return cls(tuple(pairs))
+
+    def expand(self, scenario: Scenario) -> "ScenarioOverrides":
+        """Replaces an override for all sites or links by one override for each of them.
+
+        Groups are all sites (the processes of the arms) or all links (the connections between
+        them). For example, an override of `control.K` becomes one override for each site whose
+        control law has a gain K.
+
+        Args:
+            scenario: The complete scenario.
+
+        Returns:
+            Overrides with the dotted keys of single sites and links.
+
+        Raises:
+            ScenarioError: The key does not exist, or no site or link of the scenario can have
+                it.
+        """
+        flat_pairs = _flatten_groups(self.pairs)
+        overridden = dict(flat_pairs)
+        group_values: dict[str, Any] = {}
+        single_values: dict[str, Any] = {}
+        for key, value in flat_pairs:
+            group, _, name = key.partition(".")
+            is_site_group = group in SITE_GROUPS and bool(name)
+            if is_site_group:
+                vector, _ = _split_entry(name)
+                first_key = vector.split(".")[0]
+                check_keys({first_key: value}, field_names(SITE_GROUPS[group]), group)
+            if is_site_group or key == "rate_hz":
+                group_values |= {f"sites.{site}.{key}": value for site in scenario.names}
+            elif group in _KIND_KEYS and name:
+                members = _expand_group(scenario, group, name, overridden)
+                group_values |= dict.fromkeys(members, value)
+            else:
+                single_values[_expand_single(scenario, key, overridden)] = value
+        return ScenarioOverrides(tuple((group_values | single_values).items()))
+
+    def split_entries(
+        self, tables: TomlTable
+    ) -> tuple["ScenarioOverrides", "ScenarioOverrides"]:
+        """Separates overrides that can be applied to a scenario file at once from all others.
+
+        Some overrides replace one entry of a list, such as the stiffness of joint 2. The file
+        may lack this list, because its author wrote one number for all joints or left the
+        setting out. These overrides must wait until the scenario has been completed with all
+        lists.
+
+        Args:
+            tables: Content of the scenario file.
+
+        Returns:
+            The overrides that can be applied now, and the overrides that must wait.
+        """
+        applicable = []
+        waiting = []
+        for key, value in self.pairs:
+            vector, entry = _split_entry(key)
+            if not entry or isinstance(_find_value(tables, vector), list):
+                applicable.append((key, value))
+            else:
+                waiting.append((key, value))
+        return ScenarioOverrides(tuple(applicable)), ScenarioOverrides(tuple(waiting))
+
+    def apply_to(self, tables: TomlTable) -> None:
+        """Replaces single values in the tables of a scenario file.
+
+        A number in a key is the index of an entry of a list, counted from 0, as in
+        sites.s.environment.0.stiffness_n_m. A key that names a kind (the model or preset of a
+        link, a law, the URDF file of an arm) removes the other keys of its table, because they
+        belong to the previous kind.
+
+        Args:
+            tables: Tables of the scenario file. They are changed in place.
+
+        Raises:
+            ScenarioError: The key of an override does not exist.
+        """
+        overridden_keys = {key for key, _ in self.pairs}
+        for key, value in self.pairs:
+            *parents, last = key.split(".")
+            _check_site_exists(tables, parents, key)
+            table = _reach_table(tables, parents, last)
+            if isinstance(table, list):
+                table[_list_index(table, last, key)] = value
+                continue
+            if last in _list_kind_keys(parents):
+                for other in list(table):
+                    if ".".join([*parents, other]) not in overridden_keys:
+                        del table[other]
+            table[last] = value
+
+    def nest(self) -> TomlTable:
+        """Returns the overrides as nested tables, as in a scenario file.
+
+        `find_written_path` searches these tables for the key of an error.
+        """
+        tables: TomlTable = {}
+        for key, value in self.pairs:
+            *parents, last = key.split(".")
+            table = tables
+            for name in parents:
+                inner = table.setdefault(name, {})
+                if not isinstance(inner, dict):
+                    inner = table[name] = {}
+                table = inner
+            table[last] = value
+        return tables
 
 
 def _flatten_groups(pairs: Sequence[Override]) -> list[Override]:
@@ -208,36 +313,6 @@ def _split_entry(key: str) -> tuple[str, str]:
     return key, ""
 
 
-def split_entries(
-    tables: TomlTable, pairs: Sequence[Override]
-) -> tuple[dict[str, Any], list[Override]]:
-    """Separates overrides that can be applied to a scenario file at once from all others.
-
-    An override replaces one value of a scenario, the description of an experiment. Some
-    overrides replace one entry of a list, such as the stiffness of joint 2. The file may lack
-    this list, because its author wrote one number for all joints or left the setting out. These
-    overrides must wait until the scenario has been completed with all lists.
-
-    Args:
-        tables: Content of the scenario file.
-        pairs: The overrides. Each is a pair of a dotted key, such as `control.K.1`, and a
-            value.
-
-    Returns:
-        The overrides that can be applied now, as values by key, and the overrides that must
-        wait.
-    """
-    applicable = {}
-    waiting = []
-    for key, value in pairs:
-        vector, entry = _split_entry(key)
-        if not entry or isinstance(_find_value(tables, vector), list):
-            applicable[key] = value
-        else:
-            waiting.append((key, value))
-    return applicable, waiting
-
-
 def _find_value(tables: TomlTable, key: str) -> Any:
     """Returns the value of a scenario at a dotted key, in which a number is an index of a list.
 
@@ -274,37 +349,6 @@ def _find_model(scenario: Scenario, link: str, overridden: Mapping[str, Any]) ->
             preset = PRESETS.get(str(overridden[f"{path}.preset"]), {})
             return preset.get("model", "constant")
     return scenario.links[link].__struct_config__.tag
-
-
-def apply_overrides(tables: TomlTable, overrides: Mapping[str, Any] | Sequence[str]) -> None:
-    """Replaces single values in the tables of a scenario file.
-
-    A number in a key is the index of an entry of a list, counted from 0, as in
-    sites.s.environment.0.stiffness_n_m. A key that names a kind (the model or preset of a link,
-    a law, the URDF file of an arm) removes the other keys of its table, because they belong to
-    the previous kind.
-
-    Args:
-        tables: Tables of the scenario file. They are changed in place.
-        overrides: Values by dotted key, or texts KEY=VALUE.
-
-    Raises:
-        ScenarioError: An override does not have the form KEY=VALUE, or its key does not exist.
-    """
-    pairs = parse_overrides(overrides)
-    overridden_keys = {key for key, _ in pairs}
-    for key, value in pairs:
-        *parents, last = key.split(".")
-        _check_site_exists(tables, parents, key)
-        table = _reach_table(tables, parents, last)
-        if isinstance(table, list):
-            table[_list_index(table, last, key)] = value
-            continue
-        if last in _list_kind_keys(parents):
-            for other in list(table):
-                if ".".join([*parents, other]) not in overridden_keys:
-                    del table[other]
-        table[last] = value
 
 
 def _list_kind_keys(parents: Sequence[str]) -> list[str]:
@@ -387,33 +431,6 @@ def _list_index(entries: list[Any], name: str, path: str) -> int:
     return int(name)
 
 
-def parse_overrides(overrides: Mapping[str, Any] | Sequence[str]) -> list[Override]:
-    """Converts overrides of a scenario, as a user wrote them, to pairs of key and value.
-
-    An override replaces one value of a scenario, the description of an experiment. A user
-    writes KEY=VALUE on the command line, or a mapping in Python.
-
-    Args:
-        overrides: Values by dotted key, or texts KEY=VALUE. The value of a text is written as
-            in TOML, or as a bare word.
-
-    Raises:
-        ScenarioError: A text does not have the form KEY=VALUE.
-    """
-    if isinstance(overrides, Mapping):
-        return list(name_law_classes(overrides).items())
-    pairs = []
-    for text in overrides:
-        pair = split_assignment(str(text))
-        if pair is None:
-            raise ScenarioError(
-                "an override must have the form KEY=VALUE, as in control.Kd=5, not "
-                f"{text!r}{hint_at_quotes(str(text))}"
-            )
-        pairs.append(pair)
-    return pairs
-
-
 def find_written_path(error: ScenarioError, tables: TomlTable) -> str:
     """Returns the path of a wrong key as its author wrote it.
 
@@ -458,27 +475,6 @@ def find_written_path(error: ScenarioError, tables: TomlTable) -> str:
         if value is not None:
             return written_key
     return path
-
-
-def nest_overrides(pairs: Sequence[Override]) -> TomlTable:
-    """Returns overrides with dotted keys as nested tables, as in a scenario file.
-
-    `find_written_path` searches these tables for the key of an error.
-
-    Args:
-        pairs: Dotted keys and their values.
-    """
-    tables: TomlTable = {}
-    for key, value in pairs:
-        *parents, last = key.split(".")
-        table = tables
-        for name in parents:
-            inner = table.setdefault(name, {})
-            if not isinstance(inner, dict):
-                inner = table[name] = {}
-            table = inner
-        table[last] = value
-    return tables
 
 
 def split_assignment(text: str) -> Override | None:

@@ -47,49 +47,51 @@ class OwnPlant(Frozen, frozen=True, rename={"code": "class"}, omit_defaults=True
     bodies: dict[str, tuple[float, float, float]] = field(default_factory=dict)
     settings: dict[str, Any] = field(default_factory=dict)
 
+    @staticmethod
+    def complete_table(written: Any, path: str) -> Any:
+        """Completes the settings of a user's plant in a scenario.
 
-def resolve_plant(written: Any, path: str) -> Any:
-    """Completes the settings of a user's plant in a scenario.
+        A plant is a user's Python class that computes the motion of an arm, and of bodies such
+        as a box that it moves. The result contains the SHA-256 hash of the file with the class,
+        the arguments of the class, and the sizes of the bodies.
 
-    A plant is a user's Python class that computes the motion of an arm, and of bodies such as a
-    box that it moves. The result contains the SHA-256 hash of the file with the class, the
-    arguments of the class, and the sizes of the bodies.
+        Args:
+            written: Value of the key `plant` as the author of the scenario wrote it: a class
+                name, as in "my_plant:Scene", or a table.
+            path: Path of the key, for error messages.
 
-    Args:
-        written: Value of the key `plant` as the author of the scenario wrote it: a class name,
-            as in "my_plant:Scene", or a table.
-        path: Path of the key, for error messages.
+        Returns:
+            The completed table. A text that is not a class name, such as "external", and a
+            value of a wrong type are returned unchanged.
 
-    Returns:
-        The completed table. A text that is not a class name, such as "external", and a value of
-        a wrong type are returned unchanged.
+        Raises:
+            ScenarioError: The class is missing, its file cannot be read, or the size of a body
+                is not valid.
+        """
+        table = written
+        if isinstance(written, str) and ":" in written:
+            table = {"class": written}
+        if not isinstance(table, Mapping):
+            return written
+        code = table.get("class")
+        if not isinstance(code, str):
+            raise ScenarioError("must be a class, as in 'my_plant:Scene'", path=f"{path}.class")
+        bodies = {}
+        if "bodies" in table:
+            bodies["bodies"] = _check_bodies(table["bodies"], f"{path}.bodies")
+        # A table with a hash has been resolved before.
+        if "source_sha256" in table:
+            return {**table, **bodies}
 
-    Raises:
-        ScenarioError: The class is missing, its file cannot be read, or the size of a body is
-            not valid.
-    """
-    table = written
-    if isinstance(written, str) and ":" in written:
-        table = {"class": written}
-    if not isinstance(table, Mapping):
-        return written
-    code = table.get("class")
-    if not isinstance(code, str):
-        raise ScenarioError("must be a class, as in 'my_plant:Scene'", path=f"{path}.class")
-    bodies = {}
-    if "bodies" in table:
-        bodies["bodies"] = _check_bodies(table["bodies"], f"{path}.bodies")
-    # A table with a hash has been resolved before.
-    if "source_sha256" in table:
-        return {**table, **bodies}
-
-    settings = {key: value for key, value in table.items() if key not in ("class", "bodies")}
-    return {
-        "class": code,
-        "source_sha256": read_code(code, path).sha256,
-        "settings": settings,
-        **bodies,
-    }
+        settings = {
+            key: value for key, value in table.items() if key not in ("class", "bodies")
+        }
+        return {
+            "class": code,
+            "source_sha256": read_code(code, path).sha256,
+            "settings": settings,
+            **bodies,
+        }
 
 
 def _check_bodies(written: Any, path: str) -> Any:

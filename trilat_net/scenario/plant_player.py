@@ -140,6 +140,29 @@ class PlantPlayer:
         bodies = self._call(0, self._read_poses)
         self.state = PlantState(spec.q0_rad, spec.qd0_rad_s, (), bodies)
 
+    @classmethod
+    def make_all(cls, scenario: Scenario) -> "dict[str, PlantPlayer]":
+        """Creates the users' plants of all sites that have one.
+
+        A plant is a user's class that computes the motion of an arm in place of this program.
+
+        Args:
+            scenario: Description of the experiment.
+
+        Returns:
+            An object that runs the plant, by the name of the site. Empty if no site has a
+            plant.
+
+        Raises:
+            CodeWithheld: A class may not run.
+            ScenarioError: A plant cannot be created.
+        """
+        return {
+            name: cls(scenario, name, spec.plant)
+            for name, spec in scenario.sites.items()
+            if isinstance(spec.plant, OwnPlant)
+        }
+
     def move(self, tick: int, tau: Sequence[float]) -> None:
         """Computes the motion from one control period to the next by the user's arm model.
 
@@ -218,25 +241,3 @@ class PlantPlayer:
     def _make_error(self, tick: int, problem: str) -> PlantFailed:
         """Returns the error that the user's arm model failed in a certain control period."""
         return PlantFailed(problem, site=self._site, code=self._code, tick=tick)
-
-
-def make_plant_players(scenario: Scenario) -> dict[str, PlantPlayer]:
-    """Creates the users' plants of all sites that have one.
-
-    A plant is a user's class that computes the motion of an arm in place of this program.
-
-    Args:
-        scenario: Description of the experiment.
-
-    Returns:
-        An object that runs the plant, by the name of the site. Empty if no site has a plant.
-
-    Raises:
-        CodeWithheld: A class may not run.
-        ScenarioError: A plant cannot be created.
-    """
-    return {
-        name: PlantPlayer(scenario, name, spec.plant)
-        for name, spec in scenario.sites.items()
-        if isinstance(spec.plant, OwnPlant)
-    }

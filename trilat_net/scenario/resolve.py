@@ -29,7 +29,7 @@ import numpy as np
 from ..errors import ScenarioError, suggest_nearest
 from ..fields import TomlTable
 from .distributions import Draws
-from .expect import complete_expect
+from .expect import Expect
 from .key_checks import check_keys, is_number
 from .link_tables import change_link, complete_link_tables
 from .named_files import NamedFiles, use_unix_line_ends
@@ -61,7 +61,7 @@ def resolve_scenario(tables: TomlTable, folder: Path | None) -> TomlTable:
     # the order of their keys is the order of the random draws.
     sites = complete_site_tables(tables, written.rate_hz, draws, files)
     site_names = list(sites)
-    expect = complete_expect(tables.get("expect", {}), sites, files.urdf_texts)
+    expect = Expect.complete_table(tables.get("expect", {}), sites, files.urdf_texts)
     check_keys(written.dominance, site_names, "dominance")
     dominance_rows = {
         name: resolve_dominance_row(

@@ -12,7 +12,7 @@ Invariant:
 import pickle
 import re
 import tomllib
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from functools import lru_cache
 from pathlib import Path
 from threading import RLock
@@ -25,15 +25,7 @@ from ..files import open_regular
 from ..own_code import allow_own_code, name_law_classes
 from ..toml_text import parse_toml
 from .named_files import SHIPPED_FOLDER
-from .override import (
-    Override,
-    apply_overrides,
-    expand_overrides,
-    find_written_path,
-    nest_overrides,
-    parse_overrides,
-    split_entries,
-)
+from .override import ScenarioOverrides, find_written_path
 from .resolve import resolve_scenario
 from .scenario_types import Scenario
 from .validate import build_scenario
@@ -113,15 +105,18 @@ def load_scenario(
             `source` is a `Scenario`, a key of a group such as `control` applies to all sites or
             links, see `override`.
         duration_s: Duration in s. By default, that of the scenario.
-        seed: Seed of the random numbers. By default, that of the scenario.
+        seed: Seed of the random numbers. By default, that of the scenario. Numbers that the
+            scenario states as distributions are drawn again with another seed.
 
     Raises:
         ScenarioError: The source cannot be read or is not a valid scenario.
     """
     source = getattr(source, "scenario", source)
-    pairs = _join_overrides(overrides, duration_s, seed)
     if isinstance(source, Scenario):
+        changed_seed = seed if overrides or seed != source.seed else None
+        pairs = _join_overrides(overrides, duration_s, changed_seed)
         return _change_scenario(source, pairs)
+    pairs = _join_overrides(overrides, duration_s, seed)
     experiment = ExperimentText.read(source)
     is_text = isinstance(source, Mapping) or "\n" in str(source)
     label = "scenario" if is_text else experiment.label
@@ -154,19 +149,19 @@ def _change_scenario(
     Raises:
         ScenarioError: An override is not valid.
     """
-    pairs: list[Override] = []
+    parsed = ScenarioOverrides(())
     try:
-        pairs = parse_overrides(overrides)
-        expanded = expand_overrides(scenario, pairs)
+        parsed = ScenarioOverrides.parse(overrides)
+        values = dict(parsed.expand(scenario).pairs)
         changed = scenario
         if overrides:
-            changed = parse_scenario(scenario.text, scenario.name, expanded)
+            changed = parse_scenario(scenario.text, scenario.name, values)
         # A person who names the class of a law, hand or plant in an override permits its code
         # to run.
-        named_classes = re.findall(r"[\w.]+:\w+", repr(list(expanded.values())))
+        named_classes = re.findall(r"[\w.]+:\w+", repr(list(values.values())))
         return allow_own_code(changed, named_classes, scenario)
     except ScenarioError as error:
-        path = find_written_path(error, nest_overrides(pairs))
+        path = find_written_path(error, parsed.nest())
         raise ScenarioError(error.problem, path=path, source=scenario.name) from None
 
 
@@ -196,7 +191,7 @@ class ExperimentText(NamedTuple):
             ScenarioError: The text is not TOML, or an override is not valid.
         """
         tables: dict[str, Any] = pickle.loads(_parse_toml(self.text))
-        apply_overrides(tables, overrides)
+        ScenarioOverrides.parse(overrides).apply_to(tables)
         return tables
 
     def load(self, overrides: Sequence[str] = ()) -> Scenario:
@@ -241,21 +236,6 @@ class ExperimentText(NamedTuple):
             return ExperimentText("./scenario.toml", source, Path())
         text, folder = _read_source(source)
         return ExperimentText(str(source), text, folder)
-
-
-def reseed_scenario(scenario: Scenario, seed: int) -> Scenario:
-    """Returns the same experiment with other random numbers.
-
-    Numbers that the scenario states as distributions are drawn again.
-
-    Args:
-        scenario: The experiment.
-        seed: Seed of the random numbers. The same seed always gives the same numbers.
-
-    Raises:
-        ScenarioError: The seed is not valid, or a number that is drawn with it is out of range.
-    """
-    return load_scenario(scenario, {"seed": seed}) if scenario.seed != seed else scenario
 
 
 def _read_source(source: str | Path) -> tuple[str, Path]:
@@ -313,14 +293,15 @@ def parse_scenario(
         try:
             tables = pickle.loads(_parse_toml(text))
             written = tables
-            pairs, entry_pairs = split_entries(tables, parse_overrides(overrides))
-            apply_overrides(tables, pairs)
+            parsed = ScenarioOverrides.parse(overrides)
+            applicable, waiting = parsed.split_entries(tables)
+            applicable.apply_to(tables)
             scenario = build_scenario(resolve_scenario(tables, folder))
-            if entry_pairs:
+            if waiting.pairs:
                 # The vectors of these entries exist only in the resolved scenario.
-                written = nest_overrides(entry_pairs)
+                written = waiting.nest()
                 tables = tomllib.loads(scenario.text)
-                apply_overrides(tables, expand_overrides(scenario, entry_pairs))
+                waiting.expand(scenario).apply_to(tables)
                 scenario = build_scenario(resolve_scenario(tables, folder))
             return scenario
         except ScenarioError as error:
@@ -367,15 +348,3 @@ def parse_embedded(text: str, source: str = "") -> Scenario:
             "the traces are not written out separately for every link", source=source
         )
     return scenario
-
-
-def embedded_names_reader(source: str) -> Callable[[str], tuple[str, ...]]:
-    """Returns a function that extracts the names of the arms from the text of an experiment.
-
-    The text may come from a log or another computer. Therefore it is not trusted, see
-    `parse_embedded`.
-
-    Args:
-        source: Name of the text, for error messages.
-    """
-    return lambda text: parse_embedded(text, source).names

@@ -11,19 +11,17 @@ Invariant:
 """
 
 import hashlib
-import re
+import math
 import zlib
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterator, Mapping
 from functools import cached_property
 from typing import Annotated, Any, Literal
 
 import msgspec
 import numpy as np
-import tomli_w
 from msgspec import Meta
 
 from ..core import (
-    ArmLinks,
     Array,
     CoreChange,
     DominanceMatrix,
@@ -39,66 +37,29 @@ from ..core import (
 )
 from ..errors import ScenarioError, suggest_nearest
 from ..fields import Frozen
-from ..laws import SentVectorSpecs
-from ..own_code import build_channel
+from ..laws import LawSettings, LawSituation, SentVectorSpecs, StabilityCondition
+from ..own_code import CodeKey, ImportedLaw, LoggedUserLaw, build_channel, list_named_code
 from ..recorded_change import SiteOrder
 from ..records import NS_PER_S, Layout
-from .arms import START_MARGIN_RAD, Arm, ArmModel, build_arm, start_margin
+from .arms import START_MARGIN_RAD, ArmModel, build_arm, start_margin
+from .canonical_text import write_canonical_text
 from .change import Change
 from .delay_models import Link, LinkBase
+from .delay_models.kernel_delays import ConstantDelay
 from .distributions import Distribution
 from .expect import Expect
 from .laws import ChosenLaw
 from .own_plant import OwnPlant
 from .site_spec import SiteSpec
 
-_ABSENT_VALUES: dict[str, tuple[Any, ...]] = {
-    **dict.fromkeys(("timeline", "environment"), ((), [])),
-    **dict.fromkeys(("expect", "drawn", "urdf", "on_stale", "task", "sends"), ({},)),
-    "plant": ("simulated",),
-    **dict.fromkeys(
-        ("tau_rate_limit_nm_s", "qd_des_limit_rad_s", "q_min_rad", "q_max_rad", "view"), (None,)
-    ),
-}
-"""Values that mean the same as a missing key, for keys that were added in later versions.
-
-They are left out of the canonical text. Otherwise the text of an older scenario, and thereby
-its hash, would change.
-"""
 _POSE_NUMBERS = 7
 """Number of values of the pose of a body: three for the position, four for the quaternion."""
 _SLAVE_COLOUR = 2
 """Index of the slave's colour in a palette."""
-_NUMBER_LIST = re.compile(r"\[\n(?:    [-+.\de]+,\n)+\]")
-"""Matches a list in which each number has its own line, as `tomli_w` writes lists."""
-
-
-def _drop_unused_keys(arm: dict[str, Any]) -> None:
-    """Removes the keys that have no effect from the table of an arm, in place.
-
-    These are the keys of the other kind of arm, and keys of a chain that have their default
-    values.
-    """
-    defaults = msgspec.to_builtins(Arm())
-    is_chain = bool(arm["urdf"])
-    unused_keys = ArmLinks._fields if is_chain else ()
-    kept_keys = () if is_chain else (*ArmLinks._fields, "g_m_s2")
-    for key, value in list(arm.items()):
-        if key in unused_keys or (key not in kept_keys and value == defaults[key]):
-            del arm[key]
-
-
-def _drop_absent_values(table: dict[str, Any]) -> None:
-    """Removes values from a table, in place, that mean the same as leaving their keys out."""
-    for key, absent_values in _ABSENT_VALUES.items():
-        if key in table and table[key] in absent_values:
-            del table[key]
-
-
-def _join_number_list(match: re.Match[str]) -> str:
-    """Returns a list of numbers, which TOML text spreads over several lines, on one line."""
-    return " ".join(match[0].split()).replace("[ ", "[").replace(", ]", "]")
-
+_LOOP_GROWS = ", but the roots of the sampled loop grow"
+"""Addition to the line about a satisfied condition if the sampled loop is unstable."""
+_SAMPLING_BREAKS = ", but sampling breaks it here: the roots of the sampled loop grow"
+"""The same addition for a condition that proves decay in continuous time."""
 
 ScenarioName = Annotated[str, Meta(pattern=r"^[A-Za-z0-9][A-Za-z0-9_\-]*\Z", max_length=64)]
 Duration = Annotated[float, Meta(gt=0.0, le=86_400.0)]
@@ -223,6 +184,74 @@ class Scenario(Frozen, frozen=True, dict=True):
         laws = [spec.control for spec in self.sites.values()]
         return tuple(law.resolve_shares(self.names, self.alpha) for law in laws)
 
+    def law_situations(self) -> Iterator[tuple[str, LawSettings, LawSituation]]:
+        """Yields each arm with its control law and the facts on which its stability depends.
+
+        The facts are delays, the rates of the control loops, and the weights with which the
+        arms follow each other. A law with a stability condition evaluates it from them.
+        """
+        delay_s = np.zeros((len(self.names), len(self.names)))
+        for name, link in self.links.items():
+            sender, _, receiver = name.partition("->")
+            index = (self.names.index(receiver), self.names.index(sender))
+            delay_s[index] = link.find_effective_delay(self.sites[receiver].rate_hz)
+        hold_s = self._find_hold_time()
+        hands = tuple(site.find_hand_impedances() for site in self.sites.values())
+        for n, (name, site) in enumerate(self.sites.items()):
+            situation = LawSituation(
+                site=n,
+                names=self.names,
+                laws=self.controls,
+                alpha=self.alpha,
+                delay_s=delay_s,
+                tau_limit_nm=tuple(np.atleast_1d(site.limits.tau_limit_nm).tolist()),
+                rate_hz=site.rate_hz,
+                gravity_nm=self.arms[name].largest_gravity(site.arm.g_m_s2),
+                hold_s=hold_s,
+                hands=hands,
+                in_task_space=self.layout(name).task,
+            )
+            yield name, self.controls[n], situation
+
+    def _find_hold_time(self) -> float:
+        """Returns for how long the torque of an arm is held constant, in s.
+
+        This is the control period for the integration scheme "digital", and 0 for other
+        schemes. It is NaN if the control loops of the arms have different rates.
+        """
+        if self.scheme != "digital":
+            return 0.0
+        periods_s = {1.0 / site.rate_hz for site in self.sites.values()}
+        return periods_s.pop() if len(periods_s) == 1 else math.nan
+
+    def describe_law_conditions(self, *, ticks_grow: bool = False) -> list[str]:
+        """Returns lines for the user that say whether conditions of stability proofs hold.
+
+        Every control law has its own stability conditions, for example on its gains and on the
+        delays. Sites with the same law and the same condition share a line.
+
+        Most conditions are proved for controllers that act in continuous time. A controller
+        that acts once per tick may be unstable although its condition holds.
+
+        Args:
+            ticks_grow: True if the loop, computed tick by tick, is known to be unstable. The
+                lines about satisfied conditions then mention this.
+        """
+        owners: dict[tuple[str, StabilityCondition], list[str]] = {}
+        for name, law, situation in self.law_situations():
+            condition = law.condition(situation)
+            if condition:
+                owners.setdefault((law.tag, condition), []).append(name)
+        verdicts = {True: "holds", False: "does not hold", None: "is undecided"}
+        lines = []
+        for (tag, condition), sites in owners.items():
+            verdict = verdicts[condition.holds]
+            line = f"condition of {tag} at {', '.join(sites)} {verdict}: {condition.text}"
+            if ticks_grow and condition.holds:
+                line += _SAMPLING_BREAKS if condition.proves_decay else _LOOP_GROWS
+            lines.append(line)
+        return lines
+
     @property
     def beta(self) -> Array | None:
         """Weights of the sites in the energy function of the stability proof, shape (N,).
@@ -243,26 +272,7 @@ class Scenario(Frozen, frozen=True, dict=True):
         Loading the text gives the same scenario. Keys without effect are left out, so that they
         do not change the hash of the scenario.
         """
-        tables: dict[str, Any] = msgspec.to_builtins(self)
-        descriptions = {key: tables.pop(key) for key in ("name", "title", "about", "assumed")}
-        descriptions = {key: value for key, value in descriptions.items() if value}
-        for site in tables["sites"].values():
-            _drop_unused_keys(site["arm"])
-
-        _drop_absent_values(tables)
-        for site in tables["sites"].values():
-            _drop_absent_values(site)
-            _drop_absent_values(site["control"])
-            _drop_absent_values(site["limits"])
-
-        # Texts for people may have several lines. Lists of numbers are written on one line.
-        urdf_texts = tables.pop("urdf", None)
-        description_text = tomli_w.dumps(descriptions, multiline_strings=True)
-        number_text = _NUMBER_LIST.sub(_join_number_list, tomli_w.dumps(tables))
-        urdf_text = ""
-        if urdf_texts:
-            urdf_text = tomli_w.dumps({"urdf": urdf_texts}, multiline_strings=True)
-        return description_text + number_text + urdf_text
+        return write_canonical_text(msgspec.to_builtins(self))
 
     @cached_property
     def sha256(self) -> str:
@@ -497,6 +507,39 @@ class Scenario(Frozen, frozen=True, dict=True):
             path=path,
             source=self.name,
         )
+
+    @property
+    def imported_code(self) -> list[tuple[str, str]]:
+        """Users' Python classes that run with the experiment: laws, operators and plants.
+
+        Each class is given by its name, such as "mylaws:Spring", and the SHA-256 hash of its
+        file.
+        """
+        named = [(code.code, code.source_sha256) for code in list_named_code(self)]
+        return list(dict.fromkeys(named))
+
+    @cached_property
+    def user_laws(self) -> dict[str, ImportedLaw]:
+        """Control laws that are users' Python classes, by the name of the site that uses them.
+
+        Empty if all laws are built in.
+        """
+        laws = {name: spec.user_law for name, spec in self.sites.items()}
+        return {name: law for name, law in laws.items() if law is not None}
+
+    def inspect_user_laws(self) -> list[LoggedUserLaw]:
+        """Returns the control laws that are users' classes, without running their code.
+
+        Each entry states whether the law may run, and which file would be used. The files and
+        the permissions are read again in each call.
+        """
+        sites: dict[CodeKey, list[str]] = {}
+        for name, law in self.user_laws.items():
+            sites.setdefault(CodeKey.of(law), []).append(name)
+        return [
+            LoggedUserLaw.inspect(self.user_laws[names[0]], tuple(names))
+            for names in sites.values()
+        ]
 
     @property
     def open_hands(self) -> tuple[str, ...]:
@@ -837,6 +880,18 @@ class Scenario(Frozen, frozen=True, dict=True):
             peer=self.peers(site).index(sender),
             model=change.after.to_core_model(change.start_ns),
         )
+
+    def with_constant_delays(self, delays_ms: Mapping[str, float]) -> "Scenario":
+        """Returns the same experiment with constant delays of some links.
+
+        The planned changes of these links are left out.
+
+        Args:
+            delays_ms: Delays in ms, by the name of the link.
+        """
+        links = {name: ConstantDelay(delay_ms=delay_ms) for name, delay_ms in delays_ms.items()}
+        timeline = tuple(change for change in self.timeline if change.link not in delays_ms)
+        return msgspec.structs.replace(self, links={**self.links, **links}, timeline=timeline)
 
     def without_hands(self) -> "Scenario":
         """Returns the same experiment without the persons or programs who move the arms.

@@ -14,8 +14,9 @@ import numpy as np
 from msgspec import Meta
 from numpy.typing import NDArray
 
-from ..core import Array, MotionLimits, StaleAction, StaleRule
+from ..core import SCRIPTED_KINDS, Array, MotionLimits, StaleAction, StaleRule, TorqueKind
 from ..fields import Frozen, Joints, Positive, PositiveJoints, RateHz, Real
+from ..laws import ArmLoad
 from ..own_code import ImportedLaw
 from ..records import MAX_JOINTS
 from .arms import Arm, Task
@@ -213,8 +214,12 @@ class SiteSpec(Frozen, frozen=True):
         The name of a user's law consists of its module and class, for example
         "package.module:Law".
         """
-        law: Any = self.control
-        return law.code if isinstance(law, ImportedLaw) else str(law.tag)
+        return str(self.control.tag) if self.user_law is None else self.user_law.code
+
+    @property
+    def user_law(self) -> ImportedLaw | None:
+        """Control law of the site if it is a user's Python class. None if it is built in."""
+        return self.control if isinstance(self.control, ImportedLaw) else None
 
     @property
     def has_program_hand(self) -> bool:
@@ -224,6 +229,33 @@ class SiteSpec(Frozen, frozen=True):
         this reaction, unlike that of an operator whom the scenario describes.
         """
         return any(isinstance(hand, ProgramHand) for hand in self.hands)
+
+    def find_hand_impedances(self) -> tuple[ArmLoad, ...] | None:
+        """Returns the operators and environments that react to the motion of the arm.
+
+        Operators whose torque depends on time alone are left out.
+
+        Returns:
+            The spring and the damper of each. None if the reaction of an operator depends on
+            the pose, because the operator acts on the end effector, or if the reaction is not
+            known, because the operator is a live operator or a program.
+        """
+        impedances = []
+        for actor in (*self.hands, *self.environment):
+            source = actor.actor
+            if source.kind in SCRIPTED_KINDS:
+                continue
+            # A sampled torque lags behind the motion, so it is not that of a spring and damper.
+            if source.kind not in (TorqueKind.HAND, TorqueKind.VISCOUS) or source.sampled:
+                return None
+            joints = len(self.q0_rad)
+            stiffness = source.K or (0.0,)
+            impedance = ArmLoad(
+                stiffness_nm_rad=tuple(np.broadcast_to(stiffness, joints).tolist()),
+                damping_nm_s_rad=tuple(np.broadcast_to(source.B, joints).tolist()),
+            )
+            impedances.append(impedance)
+        return tuple(impedances)
 
     def find_live_hand(self, *, is_open: bool = False) -> LiveHand | None:
         """Finds the operator of the site who may move the arm while the session runs.

@@ -2,23 +2,27 @@
 
 A scenario is a TOML file that describes an experiment. A site is a process that runs one arm.
 Its author may state keys once for all sites, in tables such as `[arm]`, and again for a single
-site.
+site. The law of an arm is the name of a built-in law, or a user's Python class as in
+"module:Class".
 
 The names, types and ranges of all keys have been checked before, see `written_tables`. Only
 random numbers can still be out of range, since they are drawn here.
 """
 
 import math
+import os
+from pathlib import Path
 from typing import NamedTuple
 
 from ..core import ArmLinks
 from ..errors import ScenarioError
 from ..fields import Frozen, TomlTable
+from ..own_code import parse_classes
 from .arms import BASE_KEYS, CHAIN_KEYS, Arm, ArmModel, Task, build_arm
-from .control_tables import complete_control
 from .distributions import Draws, has_distribution
 from .key_checks import (
     VectorCounts,
+    check_choice,
     expand_vectors,
     field_names,
     find_count_problem,
@@ -28,12 +32,15 @@ from .link_inertia import LinkInertia
 from .link_tables import complete_link
 from .named_files import NamedFiles
 from .operators import ENVIRONMENTS, OPERATORS, HeldArm, resolve_operators
-from .own_plant import resolve_plant
+from .own_law import complete_own_law
+from .own_plant import OwnPlant
 from .refusals import convert_drawn
 from .site_spec import GLIDE_TAU_RATE_NM_S, SITE_GROUPS, Limits, SiteSpec
+from .written_tables import check_control
 
 _MIN_DOWN_LENGTH = 1e-6
 """Smallest sum of the absolute components of a vector that still counts as a direction."""
+_DEFAULT_LAW = "adaptive"
 _BELONGS_TO_CHAIN = "belongs to an arm with a urdf, but this arm is planar"
 
 
@@ -73,7 +80,7 @@ def complete_site_tables(
     """
     control = tables.get("control", {})
     # A mistake in the table for all sites is refused there, and not at the first site.
-    complete_control(control, {}, "control", VectorCounts())
+    _complete_control(control, {}, "control", VectorCounts())
     sites = {name: _join_groups(site, tables) for name, site in tables["sites"].items()}
 
     # The kernel computes planar arms with their own formulas, and all other arms as chains. If
@@ -87,6 +94,56 @@ def complete_site_tables(
 
     shared = _SharedByAll(rate_hz, control, draws, files, chains)
     return {name: _complete_site(site, name, shared) for name, site in sites.items()}
+
+
+def _complete_control(
+    written: TomlTable, common: TomlTable, path: str, counts: VectorCounts
+) -> TomlTable:
+    """Returns the table of a control law in which every gain has a value.
+
+    Gains that the author of the scenario left out get their defaults, and a single number
+    becomes a vector with one number per joint.
+
+    Args:
+        written: Table `control` of a site as its author wrote it.
+        common: Table `control` for all sites. Its gains replace missing gains if it names the
+            same law, because other laws have other gains.
+        path: Path of the table, for error messages.
+        counts: Lengths to which a single number per vector is expanded.
+
+    Raises:
+        ScenarioError: There is no such law, or it has no such gain.
+    """
+    common_law = common.get("law", _DEFAULT_LAW)
+    law = str(written.get("law", common_law))
+    if ":" in law:
+        return complete_own_law(law, written, common, path)
+    if law not in LAWS:
+        raise _refuse_law(law, f"{path}.law")
+    check_control(written, law, path)
+    inherited = common if common_law == law else {}
+    return expand_vectors({**inherited, **written, "law": law}, LAWS[law], counts)
+
+
+def _refuse_law(law: str, path: str) -> ScenarioError:
+    """Returns the error for the name of a control law that does not exist.
+
+    If a Python file of that name exists, the message contains the right name of its class.
+
+    Args:
+        law: The name.
+        path: Path of the key, for error messages.
+    """
+    file = Path(law if law.endswith(".py") else f"{law}.py")
+    if os.path.isfile(file):  # noqa: PTH113 - Path.is_file raises for a very long name
+        classes = parse_classes(file.read_bytes(), file, path)
+        names = [f"{file.stem}:{name}" for name in classes]
+        remedy = f"write {' or '.join(names)}" if names else "it defines no class"
+        return ScenarioError(f"is {law!r}, but a law in a file is a class: {remedy}", path=path)
+    # "own" is the type of users' laws in canonical texts.
+    built_in = [name for name in LAWS if name != "own"]
+    check_choice(law, [*built_in, "module:Class"], path)
+    return ScenarioError(f"is {law!r}, but must name a class as module:Class", path=path)
 
 
 def _join_groups(written: TomlTable, tables: TomlTable) -> TomlTable:
@@ -140,14 +197,14 @@ def _complete_site(site: TomlTable, name: str, shared: _SharedByAll) -> TomlTabl
     counts = model.counts
     site = expand_vectors({"q0_rad": 0.0, "qd0_rad_s": 0.0, **site}, SiteSpec, counts)
     site["arm"] = arm
-    site["control"] = complete_control(
+    site["control"] = _complete_control(
         site.get("control", {}), shared.control, f"{path}.control", counts
     )
     site["limits"] = {**_list_default_limits(site, model), **site["limits"]}
     site.setdefault("role", "master")
     site.setdefault("rate_hz", shared.rate_hz)
     if "plant" in site:
-        site["plant"] = resolve_plant(site["plant"], f"{path}.plant")
+        site["plant"] = OwnPlant.complete_table(site["plant"], f"{path}.plant")
     if "view" in site:
         site["view"] = complete_link(site["view"], {}, name, shared.files, f"{path}.view")
 

@@ -30,7 +30,7 @@ from trilat_net.app import Device, DeviceState, Vector
 from trilat_net.core import GRIP_NS, SILENCE_NS, HandReach
 from trilat_net.errors import count_nouns
 from trilat_net.net import Clock, Hand
-from trilat_net.scenario import DeviceSettings
+from trilat_net.scenario import LiveHand
 
 RETRY_NS = 1_000_000_000
 """Time between two attempts to connect to the device, in ns."""
@@ -54,7 +54,8 @@ class DeviceHand:
     Args:
         hand: Connection to the site that runs the arm, in the role of its operator.
         device: The input device, which a person moves.
-        settings: Settings for moving the arm with the device, and for rendering the force.
+        operator: Live operator in the scenario. Its device settings say how the device moves
+            the arm, and how its force is rendered.
         clock: Clock of this machine.
         reach: Region that the arm can reach. The target never leaves it.
 
@@ -70,17 +71,17 @@ class DeviceHand:
         self,
         hand: Hand,
         device: Device,
-        settings: DeviceSettings,
+        operator: LiveHand,
         clock: Clock,
         reach: HandReach,
     ) -> None:
         self._hand = hand
         self._device = device
-        self._settings = settings
+        self._settings = operator.device
         self._clock = clock
         self._reach = reach
         # The axes of the arm in the coordinates of the device, a row per axis of the arm.
-        self._axes = settings.rows(len(hand.pose))
+        self._axes = self._settings.rows(len(hand.pose))
 
         self.states = 0
         self.jumps = 0

@@ -40,12 +40,12 @@ from scipy.optimize import least_squares
 from scipy.special import stdtrit
 
 from trilat_net.analysis import AlignedRecords, Complex, SourceRows, TorqueSplit
-from trilat_net.core import SCRIPTED_KINDS, Array
+from trilat_net.core import SCRIPTED_KINDS, Array, TorqueKind, TorqueSource
 from trilat_net.errors import UsageError, count_nouns
 from trilat_net.log import Log, open_log
 from trilat_net.presentation import Block, TextTable
 from trilat_net.results import Result
-from trilat_net.scenario import Multisine, Scenario
+from trilat_net.scenario import Scenario
 
 MIN_SEGMENTS = 5
 """Smallest number of segments for confidence intervals."""
@@ -346,9 +346,10 @@ def _find_sines(scenario: Scenario) -> _Sines:
         UsageError: No operator of the scenario is of the kind `multisine`. The error explains
             why the hand cannot be identified without it.
     """
-    multisines: list[Multisine] = []
+    multisines: list[TorqueSource] = []
     for site_settings in scenario.sites.values():
-        multisines += [hand for hand in site_settings.hands if isinstance(hand, Multisine)]
+        sources = [hand.actor for hand in site_settings.hands]
+        multisines += [source for source in sources if source.kind is TorqueKind.MULTISINE]
     if not multisines:
         raise UsageError(
             "no operator of kind 'multisine' in the scenario moves an arm, so the "
@@ -358,7 +359,8 @@ def _find_sines(scenario: Scenario) -> _Sines:
 
     frequencies_hz: list[float] = []
     for multisine in multisines:
-        frequencies_hz += map(float, multisine.frequencies_hz)
+        assert multisine.table is not None
+        frequencies_hz += multisine.table[:, 0].tolist()
     return _Sines(
         hz=np.unique(frequencies_hz),
         start_s=max(multisine.start_s for multisine in multisines),

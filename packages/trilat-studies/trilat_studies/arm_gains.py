@@ -41,7 +41,7 @@ import msgspec
 import numpy as np
 from scipy.optimize import brentq
 
-from trilat_net.analysis import EnvelopeTrend, RestingLoop, fit_envelopes
+from trilat_net.analysis import EnvelopeFit, EnvelopeTrend, RestingLoop
 from trilat_net.core import BUCKETS_PER_S, Array
 from trilat_net.errors import UsageError
 from trilat_net.execution import FusedRun
@@ -734,7 +734,7 @@ class _GainSearch:
             t_s = np.arange(len(speed)) / BUCKETS_PER_S
             floor = _STILL * speed.max()
             speed_column = speed[:, np.newaxis]
-            fits = fit_envelopes(t_s, speed_column, floor, falls_first=True)
+            fits = EnvelopeFit.fit_columns(t_s, speed_column, floor, falls_first=True)
             fit = fits[0]
             diverged = run.diverged_s is not None
             if diverged or fit.trend in _IS_STABLE:

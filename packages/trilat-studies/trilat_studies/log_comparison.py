@@ -23,7 +23,7 @@ from trilat_net.presentation import (
     format_number,
 )
 from trilat_net.results import Result
-from trilat_net.scenario import ScenarioDifference, compare_scenarios, reseed_scenario
+from trilat_net.scenario import ScenarioDifference, load_scenario
 from trilat_net.work import MeanInterval
 
 from .tuning.candidate import check_final_posture
@@ -385,7 +385,7 @@ def compare(*logs: str | Path | Log) -> LogComparison:
     return LogComparison(
         logs=tuple(opened),
         metrics=metrics,
-        differences=list(compare_scenarios(scenarios)),
+        differences=ScenarioDifference.list_between(scenarios),
         means=_average_repeats(opened, metrics),
         remarks=remarks,
     )
@@ -479,7 +479,7 @@ def _average_repeats(
     seeds = {log.scenario.seed for log in logs}
     if len(seeds) < len(logs):
         return []
-    if any(reseed_scenario(log.scenario, first.seed) != first for log in logs):
+    if any(load_scenario(log.scenario, seed=first.seed) != first for log in logs):
         return []
     return [MeanInterval.of_values(row.values) for row in metrics.rows]
 

@@ -80,14 +80,14 @@ def test_command(
     failure, the command that repeats the run is printed.
     """
     from trilat_net.files import write_whole
-    from trilat_net.work import check_workers
+    from trilat_net.work import WorkerPool
 
     if live and on is not None:
         raise UsageError(
             "--on distributes runs in virtual time and cannot be combined with --live: leave "
             "out one of the two"
         )
-    check_workers(jobs, on)
+    WorkerPool.check_options(jobs, on)
     if junit is not None and (junit.is_dir() or not os.access(junit.parent, os.W_OK)):
         raise UsageError(f"{junit} cannot be written")
     trials = _list_trials(scenarios or [], parse_seeds(seeds), overrides or [], live=live)
@@ -268,11 +268,11 @@ def _run_tuning(
         as_json: True to print the result as JSON.
     """
     from trilat_net.files import make_results_folder
-    from trilat_net.work import count_workers
+    from trilat_net.work import WorkerPool
 
     from .tuning.tuning_report import TuningReport, describe_procedure
 
-    workers = count_workers(jobs, on)
+    workers = WorkerPool.count_workers(jobs, on)
     name = plan.base.scenario.name
     results_folder = make_results_folder(folder, f"tune-{name}", force=force)
     if not as_json:
@@ -615,13 +615,13 @@ def bench_command(
         output: Folder for the results; a suite that the folder already contains is continued.
             Default: runs/bench-STUDY.
     """
-    from trilat_net.work import check_workers
+    from trilat_net.work import WorkerPool
 
     from .bench import plan_bench, prepare_bench_folder
     from .bench.bench_figures import write_bench
     from .run_commands import format_command
 
-    check_workers(jobs, on)
+    WorkerPool.check_options(jobs, on)
     chosen_study = "small" if small else study
     laws = options.split_names(law)
     if tune:

@@ -173,7 +173,7 @@ def _run_sweep(
     Returns:
         The finished sweep.
     """
-    from trilat_net.work import count_workers
+    from trilat_net.work import WorkerPool
 
     from .side_by_side import describe_runs_alone
     from .sweep import sweep_results, sweep_run
@@ -194,7 +194,7 @@ def _run_sweep(
         done_text = count_nouns(len(finished_runs), "run is", "runs are")
         terminal.print_text(f"  {done_text} done already")
 
-    workers = count_workers(jobs, on)
+    workers = WorkerPool.count_workers(jobs, on)
     estimate = sweep_run.DurationEstimate.of_sweep(plan, finished_runs, workers)
     if not yes:
         estimate.refuse_oversized_sweep(plan, workers)

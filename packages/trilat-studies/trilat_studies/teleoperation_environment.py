@@ -42,9 +42,9 @@ from trilat_net.scenario import (
     HandPlayer,
     HandSite,
     LiveHand,
+    PlantPlayer,
     Scenario,
     load_scenario,
-    make_plant_players,
 )
 
 from .reachable_places import can_reach
@@ -542,7 +542,7 @@ class TeleoperationEnv(gymnasium.Env[dict[str, Array], Array]):
         self._clipped_actions = 0
         hand_site = self.build_hand_site(scenario)
         self._player = _ActedHand(hand_site, self._actions)
-        self._plants = make_plant_players(scenario)  # users' programs that move arms, by site
+        self._plants = PlantPlayer.make_all(scenario)  # users' programs that move arms, by site
         hands = {self.user: self._player}
         ticks = [scenario.ticks(name) for name in scenario.names]
         # The environment reads the state of the last tick only, so one record is kept.

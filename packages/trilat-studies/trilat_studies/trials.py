@@ -42,11 +42,10 @@ from trilat_net.errors import LawFailed, LogError, ScenarioError, TrilatError, c
 from trilat_net.execution import check_virtual, execute_virtual, verify_log
 from trilat_net.log import open_log
 from trilat_net.net import SystemClock
-from trilat_net.own_code import list_imported_code
 from trilat_net.presentation import Block, MarkedText, TextTable
 from trilat_net.results import Result
-from trilat_net.scenario import ExperimentText, Scenario, load_scenario, reseed_scenario
-from trilat_net.work import MAX_LOSSES, MeanInterval, WorkerPool, Workers, open_worker_pool
+from trilat_net.scenario import ExperimentText, Scenario, load_scenario
+from trilat_net.work import MAX_LOSSES, MeanInterval, WorkerPool, Workers
 
 from .measure_run import ExpectationResult, RunMetrics
 from .run_commands import format_command, list_assignments, set_options
@@ -263,7 +262,7 @@ def trials(
 
     overrides = tuple(list_assignments(set) if isinstance(set, Mapping) else set)
     return [
-        Trial(reseed_scenario(scenario, seed), label, overrides, live)
+        Trial(load_scenario(scenario, seed=seed), label, overrides, live)
         for seed in distinct_seeds
     ]
 
@@ -674,9 +673,9 @@ def run_trials(
     """
     clock = SystemClock()
     start_ns = clock.monotonic_ns()
-    laws = list_imported_code(trial.scenario for trial in batch)
+    laws = list(dict.fromkeys(code for trial in batch for code in trial.scenario.imported_code))
     results: dict[int, TrialResult] = {}
-    with open_worker_pool(jobs, on, most=len(batch), laws=laws) as pool:
+    with WorkerPool.open(jobs, on, most=len(batch), laws=laws) as pool:
         for index, result in _iterate_results(pool, batch):
             # The result names the trial of the batch, and not the copy that a worker received.
             results[index] = result._replace(trial=batch[index])

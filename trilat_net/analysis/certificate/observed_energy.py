@@ -26,7 +26,6 @@ import numpy as np
 from ...core import Array, LawEnergies, LawRecords, PeerRecords, Scheme, StaleAction
 from ...hooks import find_hook
 from ...log import Log
-from ...own_code import ImportedLaw
 from ...results import JsonObject
 from ...scenario import Scenario
 from ..aligned import hold_torque
@@ -224,7 +223,7 @@ class ObservedEnergy(NamedTuple):
             LogError: A record cannot be read.
             ScenarioError: The file of a law that is not part of this program is missing.
         """
-        laws = find_energy_laws(log.scenario, own_laws=own_laws)
+        laws = cls.find_laws(log.scenario, own_laws=own_laws)
         if not laws:
             return None
 
@@ -244,6 +243,32 @@ class ObservedEnergy(NamedTuple):
 
         accounts = {site: _read_books(log, site, law) for site, law in laws.items()}
         return _judge_books(log, accounts)
+
+    @staticmethod
+    def find_laws(scenario: Scenario, *, own_laws: bool = False) -> dict[str, Any]:
+        """Returns the control laws that state their stored and dissipated energy, by site.
+
+        An example is a law with an energy tank that declares the level of the tank. A site is a
+        process that controls one arm.
+
+        Args:
+            scenario: Scenario of the run.
+            own_laws: True to also create laws that are not part of this program, which runs
+                their code.
+
+        Raises:
+            ScenarioError: The file of a law that is not part of this program is missing.
+        """
+        laws: dict[str, Any] = {}
+        user_laws = scenario.user_laws
+        for site in scenario.names:
+            setup = scenario.setup(site)
+            is_allowed = own_laws or site not in user_laws
+            if setup.law_factory is not None and is_allowed:
+                law = setup.law_factory(setup.law_context())
+                if callable(getattr(law, "energies", None)):
+                    laws[site] = law
+        return laws
 
 
 class _SiteBooks(NamedTuple):
@@ -266,31 +291,6 @@ class _SiteBooks(NamedTuple):
     taken: Array
     residual: Array
     leak: Array
-
-
-def find_energy_laws(scenario: Scenario, *, own_laws: bool = False) -> dict[str, Any]:
-    """Returns the control laws that state their stored and dissipated energy, by site.
-
-    An example is a law with an energy tank that declares the level of the tank. A site is a
-    process that controls one arm.
-
-    Args:
-        scenario: Scenario of the run.
-        own_laws: True to also create laws that are not part of this program, which runs their
-            code.
-
-    Raises:
-        ScenarioError: The file of a law that is not part of this program is missing.
-    """
-    laws: dict[str, Any] = {}
-    for site, spec in scenario.sites.items():
-        setup = scenario.setup(site)
-        is_allowed = own_laws or not isinstance(spec.control, ImportedLaw)
-        if setup.law_factory is not None and is_allowed:
-            law = setup.law_factory(setup.law_context())
-            if callable(getattr(law, "energies", None)):
-                laws[site] = law
-    return laws
 
 
 def _read_books(log: Log, site: str, law: Any) -> _SiteBooks:

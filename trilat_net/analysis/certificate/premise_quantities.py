@@ -16,9 +16,11 @@ from enum import Enum, auto
 from typing import NamedTuple
 
 from ...hooks import find_hook
+from ...log import Log
 from ...results import JsonObject
 from ...scenario import Scenario
 from ..dominance_history import PeerLoss
+from ..timeline import Timeline
 from ..torque_sources import WallEnergy
 
 
@@ -397,6 +399,13 @@ class RecordQuantities(NamedTuple):
     is_whole: bool
 
 
+LEAST_ABSENCE_S = 0.1
+"""Shortest absence of a site that counts, in s.
+
+The records of sites that are present also end at times that differ by up to this much.
+"""
+
+
 class AbsentSpan(NamedTuple):
     """Interval of time in which a site was absent from the session and executed no ticks.
 
@@ -411,6 +420,34 @@ class AbsentSpan(NamedTuple):
     site: str
     from_s: float
     to_s: float
+
+    @classmethod
+    def list_of_log(cls, log: Log) -> "list[AbsentSpan]":
+        """Finds the spans of time during which sites were absent from the session.
+
+        A site is absent while it has left and not yet joined again, and also from its last
+        record to the end of the run if the session reported that it left or was lost.
+
+        Args:
+            log: The log of the run.
+
+        Returns:
+            The spans, sorted by their start. Empty if no site was absent.
+        """
+        run_end_s = Timeline(log).end_s
+        absent = []
+        for site in log.sites:
+            site_log = log[site]
+            for first_tick, last_tick in log.absences.get(site, ()):
+                absence_start_s = first_tick / site_log.rate_hz
+                absence_end_s = (last_tick + 1) / site_log.rate_hz
+                absent.append(cls(site, absence_start_s, absence_end_s))
+            last_s = (site_log.last_tick + 1) / site_log.rate_hz
+            kinds = {event.kind for event in log.events if event.about == site}
+            has_left = bool(kinds & {"left", "lost"})
+            if last_s < run_end_s - LEAST_ABSENCE_S and has_left:
+                absent.append(cls(site, last_s, run_end_s))
+        return sorted(absent, key=lambda span: span[1:])
 
 
 class PresentStretch(NamedTuple):

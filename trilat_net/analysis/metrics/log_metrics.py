@@ -31,7 +31,7 @@ from ..site_signals import follows_in_task_space
 from . import static_windows
 from .measured_impedance import FrequencyResponse, ImpedanceEstimate
 from .measures import Measure, Metric, MetricValues, Quantity
-from .motion_metrics import ParameterEstimates
+from .motion_metrics import ParameterEstimates, measure_undelayed_error
 from .static_windows import JointLoad, SharingRatio, StiffnessEstimate
 
 # every file of this folder declares its metrics when it is imported
@@ -196,6 +196,38 @@ class LogMetrics(Result):
                 values_by_subject[subject] = metrics[key]
             run_values[key] = _reduce_to_run(quantity, values_by_subject)
         return run_values
+
+    @staticmethod
+    def find_undelayed_maxima(
+        log: Log, sites: Iterable[str], other: Log | None = None
+    ) -> dict[str, float]:
+        """Finds how far sites were at most from where their peers were at the same time.
+
+        The tracking error compares a site with what its peers sent some time ago. This distance
+        includes the effect of the delay.
+
+        Args:
+            log: The log of the run.
+            sites: Names of the sites.
+            other: Log of a run with the same sites, such as a rerun. If given, only times at
+                which this run also has a record of the site count.
+
+        Returns:
+            The largest distance by site, in rad, or in m if the sites share positions. Sites
+            without this distance, for example because they follow no other site, are missing.
+
+        Raises:
+            LogError: A record cannot be read, or names a change that is not valid.
+        """
+        view = RunView(log)
+        maxima = {}
+        for site in sites:
+            is_angle = log.scenario.sites[site].task.space == "joints"
+            key = "undelayed_max_rad" if is_angle else "undelayed_max_m"
+            distance = measure_undelayed_error(view, site, other)[key].value
+            if distance is not None:
+                maxima[site] = distance
+        return maxima
 
     def label(self, number: int) -> str:
         """Returns the name of a joint or an axis for a table, such as "1", "3 elbow" or "x".

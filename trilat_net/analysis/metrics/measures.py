@@ -22,6 +22,8 @@ from numpy.typing import ArrayLike, NDArray
 from ...core import POSITION, Array
 from ..run_view import RunView
 
+_NOT_FINITE = "the number is not finite"
+
 
 class Metric(NamedTuple):
     """Value of a metric, such as the largest error of an arm, or the reason why it is missing.
@@ -37,25 +39,24 @@ class Metric(NamedTuple):
     why: str = ""
     applies: bool = True
 
+    @classmethod
+    def of_value(cls, value: float | None, why: str = _NOT_FINITE) -> "Metric":
+        """Wraps a number in a metric. If it is missing or not finite, a reason is added.
+
+        For example, the number NaN and the reason "no contact" give a metric with the value
+        `None` and this reason.
+
+        Args:
+            value: The number. `None` if the metric has no number.
+            why: The reason that is stated if the number is `None` or not finite.
+        """
+        if value is None or not math.isfinite(value):
+            return cls(None, why)
+        return cls(float(value))
+
 
 MetricValues = dict[str, Metric]
 """Metrics of one subject, by the keys of their quantities."""
-
-_NOT_FINITE = "the number is not finite"
-
-
-def metric(value: float | None, why: str = _NOT_FINITE) -> Metric:
-    """Wraps a number in a metric. If the number is missing or not finite, a reason is added.
-
-    For example, metric(nan, "no contact") has the value `None` and the reason "no contact".
-
-    Args:
-        value: The number. `None` if the metric has no number.
-        why: The reason that is stated if the number is `None` or not finite.
-    """
-    if value is None or not math.isfinite(value):
-        return Metric(None, why)
-    return Metric(float(value))
 
 
 def unavailable(
@@ -123,9 +124,9 @@ def measure_shared(
     for unit, columns in columns_by_unit.items():
         unit_differences = differences[:, columns]
         unit_metrics = (
-            metric(rms(unit_differences)),
-            metric(peak(unit_differences)),
-            metric(peak(unit_differences[at_end]), why_not_at_end),
+            Metric.of_value(rms(unit_differences)),
+            Metric.of_value(peak(unit_differences)),
+            Metric.of_value(peak(unit_differences[at_end]), why_not_at_end),
         )
         for key, value in zip(keys, unit_metrics, strict=True):
             values[f"{key}_{unit}"] = value

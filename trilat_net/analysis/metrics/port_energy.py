@@ -26,7 +26,7 @@ from ..aligned import AlignedRecords, DelayedPeer, PeerTrajectory, hold_torque
 from ..arm_rows import ArmRows, build_arm_rows
 from ..following import build_following
 from ..run_view import RunView
-from .measures import ENERGY, Metric, MetricValues, Quantity, measures, metric, unavailable
+from .measures import ENERGY, Metric, MetricValues, Quantity, measures, unavailable
 
 _NO_FRICTION = Metric(None, "the joints have no friction", applies=False)
 
@@ -171,12 +171,12 @@ def _measure_port_energy(view: RunView, site: str) -> MetricValues:
     friction = accumulate(trapezoid_work(friction_torque, q))
 
     metrics = {
-        "controller_j": metric(controller[-1]),
-        "hands_j": metric(operator[-1]),
+        "controller_j": Metric.of_value(controller[-1]),
+        "hands_j": Metric.of_value(operator[-1]),
         "hands_most_j": _measure_most(operator),
     }
     if spec.environment or stop_torque.any():
-        metrics["walls_j"] = metric(walls[-1])
+        metrics["walls_j"] = Metric.of_value(walls[-1])
         metrics["walls_most_j"] = _measure_most(walls)
     else:
         no_walls = Metric(None, "the scenario has no environment at this site", applies=False)
@@ -185,7 +185,7 @@ def _measure_port_energy(view: RunView, site: str) -> MetricValues:
 
     metrics["friction_j"] = _NO_FRICTION
     if friction_torque.any():
-        metrics["friction_j"] = metric(friction[-1])
+        metrics["friction_j"] = Metric.of_value(friction[-1])
     if not spec.arm.known:
         unknown = Metric(None, "theta of the arm is not known")
         return {**metrics, "mechanical_j": unknown, "unaccounted_j": unknown}
@@ -194,15 +194,15 @@ def _measure_port_energy(view: RunView, site: str) -> MetricValues:
     gained = accumulate(np.diff(energy))
     unaccounted = gained - controller - operator - walls + friction
     largest_unaccounted = np.abs(unaccounted).max()
-    metrics["mechanical_j"] = metric(gained[-1])
-    metrics["unaccounted_j"] = metric(float(largest_unaccounted))
+    metrics["mechanical_j"] = Metric.of_value(gained[-1])
+    metrics["unaccounted_j"] = Metric.of_value(float(largest_unaccounted))
     return metrics
 
 
 def _measure_most(energy: Array) -> Metric:
     """Returns the metric of the largest energy over time, in J, which is at least 0."""
     largest = float(energy.max())
-    return metric(max(0.0, largest))
+    return Metric.of_value(max(0.0, largest))
 
 
 @measures(
@@ -270,7 +270,7 @@ def _measure_delay_energy(view: RunView, link: str) -> MetricValues:
     judged_work = np.where(is_judged, work, 0.0)
     injected = np.cumsum(judged_work)
     return {
-        "delay_j": metric(injected[-1]),
+        "delay_j": Metric.of_value(injected[-1]),
         "delay_most_j": _measure_most(injected),
     }
 

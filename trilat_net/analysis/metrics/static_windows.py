@@ -34,7 +34,7 @@ from ..arm_rows import build_arm_rows
 from ..row_reductions import any_in_rows, max_rows
 from ..run_end import STATIC_SPEED_RAD_S
 from ..run_view import RunView, SiteRun
-from .measures import SHARING, Metric, MetricValues, Quantity, measures, metric
+from .measures import SHARING, Metric, MetricValues, Quantity, measures
 
 WINDOW_S = 1.0
 """Length of a static window, in s."""
@@ -363,7 +363,7 @@ class SharingRatio(NamedTuple):
             elif holds_weight.value == 0.0:
                 expected = Metric(None, f"no site depends on {holds} in the end")
             else:
-                expected = metric(torque * pushed_weight.value / holds_weight.value)
+                expected = Metric.of_value(torque * pushed_weight.value / holds_weight.value)
 
             ratio = SharingRatio(
                 from_s=load.from_s,
@@ -450,7 +450,7 @@ def count_static_windows(view: RunView) -> Metric:
         return Metric(None, f"no records of {', '.join(view.absent)}")
     windows = view.compute_once(_find_static_windows)
     reason = "no second in which all sites rest under constant torques"
-    return metric(len(windows) or None, reason)
+    return Metric.of_value(len(windows) or None, reason)
 
 
 @measures(
@@ -474,7 +474,7 @@ def _measure_force_sharing(view: RunView, _run: str) -> MetricValues:
     ratios = view.compute_once(SharingRatio.list_of_run)
     deviations = [ratio.off for ratio in ratios if ratio.off is not None]
     if deviations:
-        return {"sharing_off": metric(max(deviations))}
+        return {"sharing_off": Metric.of_value(max(deviations))}
 
     reasons = [ratio.expected_nm.why for ratio in ratios]
     why = count_static_windows(view).why
@@ -518,8 +518,10 @@ def _weigh_load(
         imbalance_ratio = None
         if largest > 0.0:
             imbalance_ratio = abs(sum(weighted)) / largest
-        imbalance = metric(imbalance_ratio, "no loaded site is followed by other sites")
-        weight_metrics = {site: metric(weight[site]) for site in torque}
+        imbalance = Metric.of_value(
+            imbalance_ratio, "no loaded site is followed by other sites"
+        )
+        weight_metrics = {site: Metric.of_value(weight[site]) for site in torque}
 
     return JointLoad(
         from_s=window.from_s,

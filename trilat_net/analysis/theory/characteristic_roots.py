@@ -671,14 +671,15 @@ def _discretise_generator(pencil: Pencil, order: int) -> Array:
 
     # x in [-1, 1] stands for the time from -T_max to 0
     x = 1.0 - 2.0 * pencil.delays / longest_s
-    interpolation = chebyshev_interpolation(order, x)
+    grid = ChebyshevGrid(order)
+    interpolation = grid.build_interpolation(x)
     for weights, Ad in zip(interpolation, pencil.Ad, strict=True):
         delayed_columns = Ad[:, delayed]
         generator[:n, delayed] += weights[0] * delayed_columns
         generator[:n, n:] += np.kron(weights[1:], delayed_columns)
 
     # the history moves along the nodes: its rate is its derivative by time
-    differentiation = chebyshev_differentiation(order)
+    differentiation = grid.build_differentiation()
     transport = differentiation[1:] * (2.0 / longest_s)
     generator[n:, n:] = np.kron(transport[:, 1:], np.eye(c))
     for column, state in enumerate(delayed):
@@ -686,55 +687,51 @@ def _discretise_generator(pencil: Pencil, order: int) -> Array:
     return generator
 
 
-def chebyshev_nodes(order: int) -> Array:
-    """Returns the points in [-1, 1] at which delayed states are evaluated.
+class ChebyshevGrid(NamedTuple):
+    """The points in [-1, 1] at which delayed states are evaluated.
 
-    These Chebyshev nodes are cos(pi k / order) for k = 0, ..., order, from 1 down to -1.
+    These Chebyshev nodes are cos(pi k / order) for k = 0, ..., order, from 1 down to -1. A
+    polynomial through the points approximates the delayed motion.
 
-    Args:
-        order: Degree of the polynomial through the points.
-
-    Returns:
-        The nodes, shape (order + 1,).
-    """
-    angles = np.pi * np.arange(order + 1) / order
-    return np.cos(angles)
-
-
-def chebyshev_interpolation(order: int, x: Array) -> Array:
-    """Returns the matrix that interpolates a polynomial between the Chebyshev nodes.
-
-    Multiplied by the values at the nodes, it gives the values at the points x.
-
-    Args:
+    Attributes:
         order: Degree of the polynomial.
-        x: Points in [-1, 1], shape (K,).
-
-    Returns:
-        Matrix of shape (K, order + 1).
     """
-    nodes = chebyshev_nodes(order)
-    basis_at_nodes = chebvander(nodes, order)
-    basis_at_x = chebvander(x, order)
-    transposed = np.linalg.solve(basis_at_nodes.T, basis_at_x.T)
-    return transposed.T.astype(np.float64)
 
+    order: int
 
-def chebyshev_differentiation(order: int) -> Array:
-    """Returns the matrix that differentiates a polynomial given at the Chebyshev nodes.
+    @property
+    def nodes(self) -> Array:
+        """The nodes, shape (order + 1,)."""
+        angles = np.pi * np.arange(self.order + 1) / self.order
+        return np.cos(angles)
 
-    Multiplied by the values at the nodes, it gives the derivatives there. Delayed motion is
-    approximated by such a polynomial.
+    def build_interpolation(self, x: Array) -> Array:
+        """Returns the matrix that interpolates a polynomial between the nodes.
 
-    Args:
-        order: Degree of the polynomial.
+        Multiplied by the values at the nodes, it gives the values at the points x.
 
-    Returns:
-        Matrix of shape (order + 1, order + 1).
-    """
-    nodes = chebyshev_nodes(order)
-    basis_at_nodes = chebvander(nodes, order)
-    derivatives = chebder(np.eye(order + 1))
-    slopes = chebvander(nodes, order - 1) @ derivatives
-    transposed = np.linalg.solve(basis_at_nodes.T, slopes.T)
-    return transposed.T.astype(np.float64)
+        Args:
+            x: Points in [-1, 1], shape (K,).
+
+        Returns:
+            Matrix of shape (K, order + 1).
+        """
+        basis_at_nodes = chebvander(self.nodes, self.order)
+        basis_at_x = chebvander(x, self.order)
+        transposed = np.linalg.solve(basis_at_nodes.T, basis_at_x.T)
+        return transposed.T.astype(np.float64)
+
+    def build_differentiation(self) -> Array:
+        """Returns the matrix that differentiates a polynomial given at the nodes.
+
+        Multiplied by the values at the nodes, it gives the derivatives there.
+
+        Returns:
+            Matrix of shape (order + 1, order + 1).
+        """
+        nodes = self.nodes
+        basis_at_nodes = chebvander(nodes, self.order)
+        derivatives = chebder(np.eye(self.order + 1))
+        slopes = chebvander(nodes, self.order - 1) @ derivatives
+        transposed = np.linalg.solve(basis_at_nodes.T, slopes.T)
+        return transposed.T.astype(np.float64)

@@ -35,7 +35,7 @@ from ...core import Array
 from ...errors import count_nouns
 from ..blas_threads import limit_blas_threads
 from . import characteristic_roots
-from .linear_loop import DelayedTerm, LinearLoop
+from .linear_loop import LinearLoop
 
 MAX_COMMON_DELAY_S = 10.0
 """Longest common delay that is examined, in s."""
@@ -175,7 +175,7 @@ class DelayMargin(NamedTuple):
         delays_s = [crossing.delay_s for crossing in crossings]
         first_s = min(delays_s, default=0.2)
         start_s = 0.5 * min(first_s, 0.2)
-        start_loop = set_common_delay(loop, start_s)
+        start_loop = loop.set_common_delay(start_s)
         unstable_roots = _count_unstable_roots(start_loop)
 
         # Walk through the crossings. Each one may end or begin a stable interval.
@@ -199,27 +199,6 @@ class DelayMargin(NamedTuple):
             last_interval = _DelayInterval(low_s, MAX_COMMON_DELAY_S, low, None)
             intervals.append(last_interval)
         return cls(tuple(intervals), tuple(crossings))
-
-
-def set_common_delay(loop: LinearLoop, delay_s: float) -> LinearLoop:
-    """Returns a linear loop with one delay on all network links, for example to check a margin.
-
-    Args:
-        loop: The loop.
-        delay_s: The delay, in s. With 0 the loop has no delayed terms.
-    """
-    if not loop.delayed:
-        return loop
-    state_matrices = [term.A for term in loop.delayed]
-    input_matrices = [term.B for term in loop.delayed]
-    delayed_A = np.sum(state_matrices, axis=0)
-    delayed_B = np.sum(input_matrices, axis=0)
-    if delay_s == 0.0:
-        A = loop.A + delayed_A
-        B = loop.B + delayed_B
-        return loop._replace(A=A, B=B, delayed=())
-    term = DelayedTerm(delay_s, delayed_A, delayed_B)
-    return loop._replace(delayed=(term,))
 
 
 def _count_unstable_roots(loop: LinearLoop) -> int:
@@ -257,7 +236,7 @@ def _find_axis_crossings(loop: LinearLoop) -> tuple[list[_AxisCrossing], bool]:
         True if the loop is lossless: its open-loop response G has an eigenvalue of modulus 1 at
         every frequency. Roots are then on the axis for every delay, and there are no crossings.
     """
-    common_loop = set_common_delay(loop, 1.0)
+    common_loop = loop.set_common_delay(1.0)
     pencil, *_ = characteristic_roots.find_moving_part(common_loop)
     if not len(pencil.delays):
         return [], False

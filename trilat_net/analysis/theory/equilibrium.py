@@ -21,7 +21,6 @@ import numpy as np
 from ...core import BUCKETS_PER_S, Array, Law, SiteSetup
 from ...errors import ScenarioError, UsageError, count_nouns
 from ...execution import FusedRun
-from ...own_code import ImportedLaw
 from ...scenario import Scenario
 from ..blas_threads import limit_blas_threads
 from ..run_end import EQUILIBRIUM_SPEED_RAD_S
@@ -697,12 +696,12 @@ def _find_at_run_end(scenario: Scenario, conditions: OperatingConditions) -> Equ
             "the equilibrium nearest to the mean of its last quarter"
         )
 
-    laws = scenario.controls
-    if any(isinstance(law, ImportedLaw) for law in laws):
+    user_laws = scenario.user_laws
+    if user_laws:
         # the memory of an imported law takes the position of its estimate
         rows = []
-        for law, estimate, memory in zip(laws, theta_hat, run.memories, strict=True):
-            rows.append(memory if isinstance(law, ImportedLaw) else estimate)
+        for site, estimate, memory in zip(scenario.names, theta_hat, run.memories, strict=True):
+            rows.append(memory if site in user_laws else estimate)
         theta_hat = pad_rows(rows)
 
     estimates = _complete_estimates(conditions, theta_hat)

@@ -48,9 +48,9 @@ from numpy.typing import NDArray
 from scipy.linalg import expm
 
 from ...core import Array, IntArray, Law, Scheme, SiteSetup
-from ...scenario import LinkBase, draw_used_samples
+from ...scenario import LinkBase
 from ..blas_threads import limit_blas_threads
-from ..delay_period import MAX_NEAR_PERIOD_S, find_delay_period
+from ..delay_period import MAX_NEAR_PERIOD_S, DelayPeriod
 from .characteristic_roots import (
     NAMED_SHARE,
     ZERO_SHARE,
@@ -352,7 +352,7 @@ class SamplesInUse(NamedTuple):
         links: list[LinkBase] = []
         if conditions.varying:
             links = [link for link, _ in conditions.links.values()]
-        period = find_delay_period(links, rates_hz)
+        period = DelayPeriod.of_links(links, rates_hz)
         period_s = period.span_s
         delays_ms = [sum(link.moments()) + link.playout_ms for link in links]
         reach_ms = max(delays_ms, default=0.0)
@@ -376,7 +376,7 @@ class SamplesInUse(NamedTuple):
             ticks = np.arange(round(span_s * hz))
             if conditions.varying:
                 link, key = conditions.links[i, j]
-                drawn = draw_used_samples(link, key, hz, peer_hz, start_s + span_s)
+                drawn = link.draw_used_samples(key, hz, peer_hz, start_s + span_s)
                 first_tick = round(start_s * hz)
                 first_sample = round(start_s * peer_hz)
                 samples = drawn[first_tick + ticks]

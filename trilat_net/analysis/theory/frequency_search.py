@@ -44,7 +44,7 @@ _SETTLED = 0.01
 """A minimum is resolved if its neighbours lie above it by at most this share of its depth."""
 
 
-class FrequencyBand(NamedTuple):
+class _FrequencyBand(NamedTuple):
     """A range of frequencies, in Hz, for example the range in which a system is not passive."""
 
     from_hz: float
@@ -64,7 +64,7 @@ class Minima(NamedTuple):
 
     w_rad_s: Array
     values: Array
-    below: tuple[FrequencyBand, ...]
+    below: tuple[_FrequencyBand, ...]
 
     @property
     def least(self) -> float:
@@ -296,7 +296,7 @@ def _find_bands_below(
     w_rad_s: Array,
     values: Array,
     level: float,
-) -> tuple[FrequencyBand, ...]:
+) -> tuple[_FrequencyBand, ...]:
     """Returns the frequency bands in which a curve is below a level, such as zero.
 
     The edges of the bands are located by bisection.
@@ -328,4 +328,4 @@ def _find_bands_below(
         band_edges.append(float(w_rad_s[-1]))
     edges_hz = [edge / (2.0 * np.pi) for edge in band_edges]
     pairs = zip(edges_hz[::2], edges_hz[1::2], strict=True)
-    return tuple(FrequencyBand(from_hz, to_hz) for from_hz, to_hz in pairs)
+    return tuple(_FrequencyBand(from_hz, to_hz) for from_hz, to_hz in pairs)

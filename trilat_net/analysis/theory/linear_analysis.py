@@ -32,7 +32,7 @@ from ...errors import ScenarioError, UsageError
 from ...execution import FusedRun
 from ...log import Log
 from ...results import Result
-from ...scenario import IRREVERSIBLE_SHARES, Scenario, describe_law_conditions, load_scenario
+from ...scenario import IRREVERSIBLE_SHARES, Scenario, load_scenario
 from ..blas_threads import limit_blas_threads
 from ..stability_decision import NEAR_REST_RAD
 from .characteristic_roots import CharacteristicRoot, Spectrum
@@ -41,7 +41,7 @@ from .equilibrium import add_limit_notes, find_equilibrium
 from .floquet import SamplesInUse, compute_sampled_spectrum
 from .linear_edge import EdgeScan, iterate_linear_edges, parse_edge_range
 from .linear_loop import LinearLoop, compute_shared_poses
-from .loop_roots import find_log_loop, find_run_loop, resolve_final_scenario
+from .loop_roots import EndLoop, resolve_final_scenario
 from .numeric_law import NumericLaw
 from .operating_point import Equilibrium, OperatingConditions
 from .port_analysis import PortAnalysis
@@ -163,7 +163,7 @@ class LinearAnalysis(Result):
         if self.scenario.has_irreversible_shares:
             notes.append(IRREVERSIBLE_SHARES.removeprefix("note: "))
         ticks_grow = self.sampled is not None and self.sampled.verdict == "unstable"
-        return (*notes, *describe_law_conditions(self.scenario, ticks_grow=ticks_grow))
+        return (*notes, *self.scenario.describe_law_conditions(ticks_grow=ticks_grow))
 
     def headline(self) -> str:
         """The scenario, the verdict and the delay margin in one line, for the user.
@@ -307,11 +307,11 @@ def _find_end_loop(scenario: Scenario, log: Log | None) -> _AnalysedLoop:
     try:
         if log is not None:
             scenario = resolve_final_scenario(log)
-            end = find_log_loop(log, own_laws=True)
+            end = EndLoop.of_log(log, own_laws=True)
         else:
             run = FusedRun(scenario)
             run.advance_to(scenario.duration_s)
-            end = find_run_loop(scenario, run)
+            end = EndLoop.of_run(scenario, run)
     except ScenarioError:
         return _AnalysedLoop(scenario, conditions, find_equilibrium(scenario))
 
@@ -333,7 +333,7 @@ def analyse_linear_loop(
     roots: int = DEFAULT_ROOTS,
     over: Sequence[str] = (),
     ports: bool = False,
-    hands: Sequence[HandMatrices] = (),
+    operators: Sequence[str | Path] = (),
 ) -> LinearAnalysis:
     """Predicts whether small motions of the coupled arms of a scenario die away.
 
@@ -350,12 +350,14 @@ def analyse_linear_loop(
         over: Ranges of settings in which to search for the values at which stability changes,
             such as "control.d=0.1:3".
         ports: True to analyse also what operators feel when they hold an arm.
-        hands: Measured impedances of operators. Any of them may hold the arm of any master.
+        operators: Files of measured operators, from `trilat identify hand --json`. Any of them
+            may hold the arm of any master.
 
     Raises:
         ScenarioError: The scenario is not valid, or cannot be linearised.
         UsageError: Another argument is not valid.
     """
+    hands = [HandMatrices.read(Path(file)) for file in operators]
     ranges = [parse_edge_range(text) for text in over]
     if not 1 <= roots <= MAX_ROOTS:
         raise UsageError(f"--roots must be from 1 to {MAX_ROOTS}, not {roots}")

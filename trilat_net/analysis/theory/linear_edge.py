@@ -453,35 +453,35 @@ class GrowthColumn(NamedTuple):
 
         return column
 
+    @staticmethod
+    def find_crossings(
+        scenario: Scenario,
+        key: str,
+        low: float,
+        high: float,
+    ) -> tuple[tuple[float, ...], str]:
+        """Finds the values of one setting at which coupled arms become stable or unstable.
 
-def find_root_crossings(
-    scenario: Scenario,
-    key: str,
-    low: float,
-    high: float,
-) -> tuple[tuple[float, ...], str]:
-    """Finds the values of one setting at which coupled arms become stable or unstable.
+        An example is the smallest damping gain with which the arms are stable.
 
-    An example is the smallest damping gain with which the arms are stable.
+        Args:
+            scenario: Description of the experiment. The pose of rest is determined with its own
+                value of the setting.
+            key: Name of the setting, such as "control.d".
+            low: Smallest value to examine.
+            high: Largest value to examine.
 
-    Args:
-        scenario: Description of the experiment. The pose of rest is determined with its own
-            value of the setting.
-        key: Name of the setting, such as "control.d".
-        low: Smallest value to examine.
-        high: Largest value to examine.
-
-    Returns:
-        The values at which stability changes, rising. If the scenario cannot be linearised,
-        there are none.
-        A remark for the user on the analysis. Empty if there is none.
-    """
-    try:
-        rest, remark = _assume_equilibrium(scenario, None)
-        edges = iterate_linear_edges(scenario, key, low=low, high=high, rest=rest)
-        return tuple(edge.value for edge in edges), remark
-    except ScenarioError as error:
-        return (), f"no linear analysis: {error.problem}"
+        Returns:
+            The values at which stability changes, rising. If the scenario cannot be linearised,
+            there are none.
+            A remark for the user on the analysis. Empty if there is none.
+        """
+        try:
+            rest, remark = _assume_equilibrium(scenario, None)
+            edges = iterate_linear_edges(scenario, key, low=low, high=high, rest=rest)
+            return tuple(edge.value for edge in edges), remark
+        except ScenarioError as error:
+            return (), f"no linear analysis: {error.problem}"
 
 
 def _assume_equilibrium(

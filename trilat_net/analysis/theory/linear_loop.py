@@ -184,6 +184,31 @@ class LinearLoop(NamedTuple):
         delayed = [term.A for term in self.delayed]
         return sum(delayed, self.A)
 
+    @property
+    def longest_delay_s(self) -> float:
+        """The longest delay of any network link or signal, in s. 0 if there are no delays."""
+        delays_s = [term.delay_s for term in self.delayed]
+        return max(delays_s, default=0.0)
+
+    def set_common_delay(self, delay_s: float) -> "LinearLoop":
+        """Returns the loop with one delay on all network links, for example to check a margin.
+
+        Args:
+            delay_s: The delay, in s. With 0 the loop has no delayed terms.
+        """
+        if not self.delayed:
+            return self
+        state_matrices = [term.A for term in self.delayed]
+        input_matrices = [term.B for term in self.delayed]
+        delayed_A = np.sum(state_matrices, axis=0)
+        delayed_B = np.sum(input_matrices, axis=0)
+        if delay_s == 0.0:
+            A = self.A + delayed_A
+            B = self.B + delayed_B
+            return self._replace(A=A, B=B, delayed=())
+        term = DelayedTerm(delay_s, delayed_A, delayed_B)
+        return self._replace(delayed=(term,))
+
     @classmethod
     def of_conditions(
         cls,

@@ -38,9 +38,8 @@ from ...core import (
 from ...errors import ScenarioError, count_nouns
 from ...files import find_page
 from ...laws import LinearForm, LinearSituation
-from ...own_code import ImportedLaw
 from ...records import NS_PER_S
-from ...scenario import LinkBase, Scenario, draw_used_samples
+from ...scenario import LinkBase, Scenario
 from ..delay_period import (
     MAX_PERIOD_TICKS,
     find_final_link,
@@ -290,16 +289,15 @@ def _describe_laws(scenario: Scenario) -> list[str]:
         scenario: The experiment.
     """
     notes = []
-    laws = scenario.controls
-    law_codes = [law.code if isinstance(law, ImportedLaw) else "" for law in laws]
-    for code in filter(None, dict.fromkeys(law_codes)):
-        pairs = zip(scenario.names, law_codes, strict=True)
-        sites = [name for name, law_code in pairs if law_code == code]
+    sites_by_code: dict[str, list[str]] = {}
+    for name, law in scenario.user_laws.items():
+        sites_by_code.setdefault(law.code, []).append(name)
+    for code, sites in sites_by_code.items():
         notes.append(
             f"{code} of {', '.join(sites)} is differentiated numerically, "
             "and so is its memory: by central differences"
         )
-    notes += [law.linear_note for law in laws if law.linear_note]
+    notes += [law.linear_note for law in scenario.controls if law.linear_note]
     return notes
 
 
@@ -324,8 +322,8 @@ def _build_imported_law(scenario: Scenario, site: SiteSetup, alpha: Array) -> Si
     Returns:
         The setup with the law. The same setup if the law of the site is not imported.
     """
-    law = scenario.sites[site.name].control
-    if not isinstance(law, ImportedLaw):
+    law = scenario.user_laws.get(site.name)
+    if law is None:
         return site
     i = scenario.names.index(site.name)
     shares = np.delete(alpha[i], i).tolist()
@@ -347,10 +345,10 @@ def _find_linear_gains(scenario: Scenario, *, own_laws: bool) -> dict[str, Gains
         law = spec.control
         theta = scenario.arms[name].theta
         gains = law.linear_gains(theta)
-        if own_laws and isinstance(law, ImportedLaw):
+        if own_laws and spec.user_law is not None:
             gains = law.gains(theta)
         if gains is None:
-            reason = _explain_missing_gains(law)
+            reason = _explain_missing_gains(scenario, name)
             raise ScenarioError(
                 f"has no linear loop: {reason}",
                 path=f"sites.{name}.control.law",
@@ -362,22 +360,26 @@ def _find_linear_gains(scenario: Scenario, *, own_laws: bool) -> dict[str, Gains
     return gains_by_site
 
 
-def _explain_missing_gains(law: Any) -> str:
-    """Returns the reason why a control law cannot be linearised, as part of a sentence.
+def _explain_missing_gains(scenario: Scenario, site: str) -> str:
+    """Returns the reason why the control law of an arm cannot be linearised.
+
+    The reason is a part of a sentence.
 
     Args:
-        law: Settings of the control law.
+        scenario: The experiment.
+        site: Name of the site with the law.
     """
-    if isinstance(law, ImportedLaw):
+    spec = scenario.sites[site]
+    if spec.user_law is not None:
         return (
-            f"{law.code} is known by its code only, which may not run here; "
+            f"{spec.law_name} is known by its code only, which may not run here; "
             "trilat linear and trilat certify --law FILE run it"
         )
     others = (
         "adaptive, adaptive_box, p_d, pd_d, p_f and others have one, "
         f"see {find_page('laws.md')}"
     )
-    reason: str = law.explain_no_linear_form() or others
+    reason: str = spec.control.explain_no_linear_form() or others
     return reason
 
 
@@ -459,8 +461,7 @@ def compute_effective_delay(
         # ages are complete when the samples of a whole period have arrived
         longest_s = 2e-3 * sum(link.moments())
         duration_s = max(duration_s, period_s + longest_s)
-    used_samples = draw_used_samples(
-        link=link,
+    used_samples = link.draw_used_samples(
         key=link_key(scenario.seed, f"{peer}->{site}"),
         receiver_hz=site_hz,
         sender_hz=peer_hz,

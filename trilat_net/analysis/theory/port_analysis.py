@@ -163,7 +163,7 @@ def compute_proof_weights(conditions: OperatingConditions) -> Array:
     return compute_lyapunov_weights(conditions.alpha, Kd).beta
 
 
-class TwoPort(NamedTuple):
+class _TwoPort(NamedTuple):
     """Result of Llewellyn's stability criterion for one joint of two arms.
 
     The criterion says whether the arms are stable with every passive operator or wall at both
@@ -224,7 +224,7 @@ class PortAnalysis(NamedTuple):
     beta: Array
     estimates_true: bool
     absolute: frequency_search.Minima
-    two_ports: tuple[TwoPort, ...]
+    two_ports: tuple[_TwoPort, ...]
     transparency: tuple[Transparency, ...]
     clamped_verdict: str
     axes: Mapping[int, str] = MappingProxyType({})
@@ -250,6 +250,23 @@ class PortAnalysis(NamedTuple):
         It is "qd" for joints, and "xd" if end effectors follow each other.
         """
         return "xd" if self.axes else "qd"
+
+    def group_failing_two_ports(self, *, by_joint: bool) -> list[list[_TwoPort]]:
+        """Groups the two-ports for which Llewellyn's criterion fails.
+
+        The two-ports of a group have the same sites, and the same third site clamped, or no
+        clamped site.
+
+        Args:
+            by_joint: True to separate the joints too.
+        """
+        groups: dict[tuple[object, ...], list[_TwoPort]] = {}
+        for two_port in self.two_ports:
+            if two_port.minima.below:
+                joint = two_port.joint if by_joint else ""
+                key = (two_port.sites, two_port.clamped, joint)
+                groups.setdefault(key, []).append(two_port)
+        return list(groups.values())
 
     def name_port(self, number: int) -> str:
         """Returns a name for the user of the joint or axis at which an operator pushes an arm.
@@ -323,7 +340,7 @@ class PortAnalysis(NamedTuple):
         other_site = of or scenario.slave
 
         sites = port_response.list_port_sites(loop)
-        delay_s = port_response.find_longest_delay_s(loop)
+        delay_s = loop.longest_delay_s
         grid = frequency_search.build_frequency_grid(low, high, delay_s)
         Y = port_response.build_admittance(loop)
         w_rad_s = frequency_search.refine_frequencies(Y, grid)
@@ -540,7 +557,7 @@ def _check_two_ports(
     loop: LinearLoop,
     Y: port_response.PortResponse,
     w_rad_s: Array,
-) -> tuple[TwoPort, ...]:
+) -> tuple[_TwoPort, ...]:
     """Checks for every pair of arms whether they are stable with every passive user and wall.
 
     Llewellyn's criterion is evaluated at each joint that both arms have. With three arms, the
@@ -559,7 +576,7 @@ def _check_two_ports(
                 pair_ports = [port for port in ports if site_of_port[port] in pair]
                 if len(pair_ports) == len(pair):
                     minima = _check_llewellyn(Y, pair_ports, clamped_ports, w_rad_s)
-                    two_ports.append(TwoPort(pair, joint, clamped, minima))
+                    two_ports.append(_TwoPort(pair, joint, clamped, minima))
     return tuple(two_ports)
 
 

@@ -33,14 +33,17 @@ Invariant:
       necessary for up to three arms.
 """
 
+import json
 from collections.abc import Sequence
 from itertools import product
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ...core import Array
+from ...errors import UsageError
 from .characteristic_roots import Complex
 from .frequency_search import Minima
 from .port_response import PortResponse
@@ -141,6 +144,10 @@ class Passivity(NamedTuple):
         return cls(minima, size, lacking)
 
 
+_HAND_KEYS = ("mass_kg", "damping_n_s_m", "stiffness_n_m")
+"""Keys of the mass, damping and stiffness matrix in the file of a measured hand."""
+
+
 class HandMatrices(NamedTuple):
     """Measured impedance of an operator who holds the end effector.
 
@@ -156,6 +163,38 @@ class HandMatrices(NamedTuple):
     M: Array
     B: Array
     K: Array
+
+    @classmethod
+    def read(cls, file: Path) -> "HandMatrices":
+        """Reads the measured mass, damping and stiffness of a person's hand from a JSON file.
+
+        Stability can then be checked against this hand instead of every passive operator, which
+        is less strict.
+
+        Args:
+            file: Path of a file that `trilat identify hand --json` wrote.
+
+        Raises:
+            UsageError: The file does not contain the dynamics of a hand.
+        """
+        try:
+            values = json.loads(file.read_text(encoding="utf-8"))
+            M, B, K = (np.array(values[key], dtype=np.float64) for key in _HAND_KEYS)
+            have_same_shape = M.shape == B.shape == K.shape
+            if not have_same_shape or M.shape not in ((2, 2), (3, 3)):
+                raise ValueError("the matrices must all have 2 rows and columns, or all have 3")
+            if not np.isfinite([M, B, K]).all():
+                raise ValueError("a number is not finite")
+        except (OSError, ValueError, KeyError, TypeError) as error:
+            problem = str(error)
+            # The text of a KeyError is only the key.
+            if isinstance(error, KeyError):
+                problem = f"the key {error} is missing"
+            raise UsageError(
+                f"{file}: does not contain the output of `trilat identify hand --json`: "
+                f"{problem}"
+            ) from None
+        return cls(M, B, K)
 
     def compute_resistance(self, w_rad_s: Array) -> Complex:
         """Returns the resistive part of a human hand's impedance, shape (F, n, n), in N s/m.

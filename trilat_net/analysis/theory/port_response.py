@@ -361,15 +361,6 @@ def select_ports(response: PortResponse, ports: list[int]) -> PortResponse:
     return evaluate_selected
 
 
-def find_longest_delay_s(loop: LinearLoop) -> float:
-    """Returns the longest delay of any network link or signal in a linear loop, in s.
-
-    The result is 0 for a loop without delays.
-    """
-    delays_s = [term.delay_s for term in loop.delayed]
-    return max(delays_s, default=0.0)
-
-
 def clamp_site(loop: LinearLoop, site: str) -> LinearLoop:
     """Returns the linear model of the arms with one arm held still by a clamp.
 

@@ -70,7 +70,7 @@ class EnvelopeTrend(Enum):
 
 
 class EnvelopeFit(NamedTuple):
-    """Trend of an oscillation's amplitude: growing, decaying or constant. See `fit_envelopes`.
+    """Trend of an oscillation's amplitude: growing, decaying or constant. See `fit_columns`.
 
     The envelope is the largest magnitude of a signal in each short interval of time.
 
@@ -88,60 +88,61 @@ class EnvelopeFit(NamedTuple):
     rate_per_s: float
     calm: bool = False
 
+    @classmethod
+    def fit_columns(
+        cls,
+        t_s: Array,
+        values: Array,
+        floor: float = FLOOR_RAD,
+        *,
+        falls_first: bool = False,
+    ) -> "list[EnvelopeFit]":
+        """Determines whether oscillations grow, decay or persist in the second half of a run.
 
-def fit_envelopes(
-    t_s: Array,
-    values: Array,
-    floor: float = FLOOR_RAD,
-    *,
-    falls_first: bool = False,
-) -> list[EnvelopeFit]:
-    """Determines whether oscillations grow, decay or persist, over the second half of a run.
+        The module's docstring defines these classes of the trend.
 
-    The module's docstring defines these classes of the trend.
+        Args:
+            t_s: Ascending times, shape (K,), in s.
+            values: The C envelopes, shape (K, C). Each is the largest magnitude of a signal in
+                the interval that ends at a time.
+            floor: Value below which an envelope counts as zero. It has the unit of `values`.
+            falls_first: True if an envelope that first falls and then rises counts as growing.
+                By default the trend of such an envelope is undecided.
 
-    Args:
-        t_s: Ascending times, shape (K,), in s.
-        values: The C envelopes, shape (K, C). Each is the largest magnitude of a signal in the
-            interval that ends at a time.
-        floor: Value below which an envelope counts as zero. It has the unit of `values`.
-        falls_first: True if an envelope that first falls and then rises counts as growing. By
-            default the trend of such an envelope is undecided.
+        Returns:
+            The trend of each of the C envelopes.
+        """
+        envelopes = values.shape[1]
+        no_fit = cls(EnvelopeTrend.UNDECIDED, math.nan)
+        fits = [no_fit] * envelopes
+        undecided = list(range(envelopes))
+        for windows in _T_QUANTILES:
+            maxima = _find_window_maxima(t_s, values[:, undecided], windows, floor)
+            if maxima is None:
+                continue
+            half_s = 0.5 * (t_s[-1] - t_s[0])
+            window_fits = _fit_maxima(maxima, half_s / windows, math.log(floor))
+            for index, fit in zip(undecided, window_fits, strict=True):
+                fits[index] = fit
+            undecided = [
+                index for index in undecided if fits[index].trend is EnvelopeTrend.UNDECIDED
+            ]
+        growing = [index for index, fit in enumerate(fits) if fit.trend is EnvelopeTrend.GROWS]
+        if falls_first or not growing:
+            return fits
 
-    Returns:
-        The trend of each of the C envelopes.
-    """
-    envelopes = values.shape[1]
-    no_fit = EnvelopeFit(EnvelopeTrend.UNDECIDED, math.nan)
-    fits = [no_fit] * envelopes
-    undecided = list(range(envelopes))
-    for windows in _T_QUANTILES:
-        maxima = _find_window_maxima(t_s, values[:, undecided], windows, floor)
-        if maxima is None:
-            continue
-        half_s = 0.5 * (t_s[-1] - t_s[0])
-        window_fits = _fit_maxima(maxima, half_s / windows, math.log(floor))
-        for index, fit in zip(undecided, window_fits, strict=True):
-            fits[index] = fit
-        undecided = [
-            index for index in undecided if fits[index].trend is EnvelopeTrend.UNDECIDED
-        ]
-    growing = [index for index, fit in enumerate(fits) if fit.trend is EnvelopeTrend.GROWS]
-    if falls_first or not growing:
+        # growth after a fall in the first half is a V shape, in reversed time a rise
+        reversed_t_s = -t_s[::-1]
+        reversed_values = values[::-1, growing]
+        first_half = _find_window_maxima(reversed_t_s, reversed_values, 4, floor)
+        if first_half is None:
+            return fits
+        steps = np.diff(np.log(first_half), axis=0)
+        least_steps = steps.min(axis=0)
+        for index, least_step in zip(growing, least_steps, strict=True):
+            if least_step >= _LEAST_STEP:
+                fits[index] = fits[index]._replace(trend=EnvelopeTrend.UNDECIDED)
         return fits
-
-    # growth after a fall in the first half is a V shape; in reversed time the fall is a rise
-    reversed_t_s = -t_s[::-1]
-    reversed_values = values[::-1, growing]
-    first_half = _find_window_maxima(reversed_t_s, reversed_values, 4, floor)
-    if first_half is None:
-        return fits
-    steps = np.diff(np.log(first_half), axis=0)
-    least_steps = steps.min(axis=0)
-    for index, least_step in zip(growing, least_steps, strict=True):
-        if least_step >= _LEAST_STEP:
-            fits[index] = fits[index]._replace(trend=EnvelopeTrend.UNDECIDED)
-    return fits
 
 
 def _find_window_maxima(

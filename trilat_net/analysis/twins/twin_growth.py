@@ -44,10 +44,10 @@ from ...hooks import find_hook
 from ...log import Log, open_log
 from ...results import Result, finite_or_none
 from ...scenario import Scenario
-from ..delay_period import find_burst_interval_s, find_final_delay_period, find_final_link
+from ..delay_period import DelayPeriod, find_burst_interval_s, find_final_link
 from ..run_end import RunEnd, find_coupled_sites
 from ..torque_sources import VirtualWall
-from .envelope_trend import EnvelopeFit, EnvelopeTrend, fit_envelopes
+from .envelope_trend import EnvelopeFit, EnvelopeTrend
 
 LEAST_LEFT_S = 5.0
 """Shortest departure from a rest position that counts, in s."""
@@ -441,7 +441,7 @@ class TwinGrowth(NamedTuple):
             joints: list[int] = []
             for site in sites:
                 joints += range(first_joints[site], first_joints[site + 1])
-            amplitudes = [measure_amplitude(path, joints) for path in twins.paths]
+            amplitudes = [_measure_amplitude(path, joints) for path in twins.paths]
             for path, amplitude in zip(twins.paths, amplitudes, strict=True):
                 is_affected = np.isfinite(amplitude[first:end]).any()
                 if is_affected:
@@ -483,7 +483,7 @@ def _find_varying_period_s(scenario: Scenario) -> float | None:
     links = [find_final_link(scenario, name) for name in scenario.links]
     if all(link.to_core_model().kind == DelayKind.CONSTANT for link in links):
         return None
-    return find_final_delay_period(scenario).true_s
+    return DelayPeriod.of_scenario(scenario).true_s
 
 
 def _fit_to_period(counts_from_s: float, end_s: float, period_s: float | None) -> float:
@@ -506,7 +506,7 @@ def _fit_to_period(counts_from_s: float, end_s: float, period_s: float | None) -
     return end_s - 2.0 * whole_periods * period_s
 
 
-def measure_amplitude(path: TwinPath, group: Sequence[int]) -> Array:
+def _measure_amplitude(path: TwinPath, group: Sequence[int]) -> Array:
     """Computes the effect of a small push on a run over time, as a logarithm.
 
     A twin is a repetition of the run with a small push. The effect is the amplitude A of the
@@ -607,7 +607,7 @@ def _fit_trend(t_s: Array, amplitude: Array) -> EnvelopeFit:
     finite_log = np.where(is_finite, amplitude, -np.inf)
     scaled_amplitude = np.exp(finite_log - amplitude[is_finite].max())
     one_column = scaled_amplitude[:, np.newaxis]
-    (fit,) = fit_envelopes(t_s, one_column, _AMPLITUDE_FLOOR, falls_first=True)
+    (fit,) = EnvelopeFit.fit_columns(t_s, one_column, _AMPLITUDE_FLOOR, falls_first=True)
     return fit
 
 
@@ -697,7 +697,7 @@ def _judge_worst_joint(
     if len(joints) == 1 or worst.ended_s is not None:
         return worst
     for joint in joints:
-        joint_amplitude = measure_amplitude(path, [joint])
+        joint_amplitude = _measure_amplitude(path, [joint])
         unscaled_amplitude = joint_amplitude - path.scale
         # a difference of the size of the rounding errors says nothing about the push
         joint_amplitude[unscaled_amplitude < math.log(SMALLEST)] = -np.inf
@@ -831,6 +831,23 @@ class PushedTwins(Result):
     at_s: float
     growth: TwinGrowth
     linear: _LinearSizes | None = None
+
+    def measure_amplitudes(self, joints: Sequence[int]) -> list[Array]:
+        """Computes the effect of each push on some joints over time, as logarithms.
+
+        The module's docstring defines the amplitude A of the difference between a twin and the
+        run.
+
+        Args:
+            joints: Indices of the joints.
+
+        Returns:
+            log A for each twin, in the order of the pushes, shape (K,) each, with A in rad/s.
+            It is -inf where the difference is zero. Empty if there are no twins.
+        """
+        if self.growth.twins is None:
+            return []
+        return [_measure_amplitude(path, joints) for path in self.growth.twins.paths]
 
     def describe(self, pushed: PushGrowth) -> str:
         """Returns a sentence for the user on whether the effect of a push grows or dies away.
@@ -1012,7 +1029,7 @@ def _find_linear_sizes(
     assert growth.twins is not None
     paths = growth.twins.paths
     all_joints = range(len(growth.twins.joints))
-    envelopes = [_running_maximum(measure_amplitude(path, all_joints)) for path in paths]
+    envelopes = [_running_maximum(_measure_amplitude(path, all_joints)) for path in paths]
     unit = paths[0].push.name.partition(" ")[2]
     largest_linear = sizes[-1]
     beyond = None

@@ -17,7 +17,8 @@ Invariant:
       showing zeros.
 """
 
-from typing import Any
+from collections.abc import Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -42,6 +43,10 @@ If two samples arrive in the same tick of 1 ms, the age falls by about 1 ms, whi
 """
 NO_LOOP_CLOCK = "virtual time: no clock was read, so no loop was late and no tick was timed"
 NO_LOOP_TIMES = "no lateness and no computing time in this log"
+_SPREAD_BUCKETS = 120
+"""Number of intervals of time for which `_plot_spread` draws a median and a band."""
+_SPREAD: style.LineOptions = {"color": style.FAINT, "alpha": 0.35, "linewidth": 6.0}
+"""Options of the line that represents the band of a spread in a legend."""
 _BINS_PER_DECADE = 20
 """Number of bins of a histogram per decade, for example between 1 us and 10 us."""
 
@@ -70,9 +75,9 @@ def _draw_sample_age(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
             line_style = style.site_line(log, peer, 1.4)
             plot.mark(axes, [site], f"{peer}->{site}")
 
-            if is_unsteady(age_ms):
+            if _is_unsteady(age_ms):
                 has_bands = True
-                style.plot_spread(axes, log[site].t_s, age_ms, **line_style)
+                _plot_spread(axes, log[site].t_s, age_ms, **line_style)
             else:
                 plot.trace(axes, site, age_ms, **line_style)
 
@@ -88,7 +93,7 @@ def _draw_sample_age(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
         if np.any(np.isfinite(stated_ms)):
             entries.append(("mean delay as stated", style.LIMIT_LINE))
         if has_bands:
-            entries.append(("least to largest, with median", style.SPREAD))
+            entries.append(("least to largest, with median", _SPREAD))
         plot.finish(grid[-1], entries, links=True)
     return plot.figure
 
@@ -139,6 +144,59 @@ def has_varying_delay(log: Log) -> bool:
     return not all(link.has_one_constant_delay for link in links)
 
 
+class DelayAxis(NamedTuple):
+    """The axis of delays that the distributions of all links of a run share.
+
+    Attributes:
+        x_ms: Delays at which the curves have points, in ms, shape (P,). They reach up to the
+            longest delay or age. Their steps are equal, or equal on a logarithmic axis.
+        is_logarithmic: True if only few values are long, so that a linear axis would hide the
+            others.
+    """
+
+    x_ms: Array
+    is_logarithmic: bool
+
+    @classmethod
+    def of_links(cls, links: Sequence[DelayDistribution]) -> "DelayAxis":
+        """Chooses the axis for the delays and ages of links.
+
+        Args:
+            links: Delays and ages of all links that share the axis.
+        """
+        value_arrays: list[Array] = [np.zeros(0)]
+        for link in links:
+            value_arrays += [link.delay_ms, link.age_ms]
+        values_ms = np.concatenate(value_arrays)
+        known_ms = values_ms[np.isfinite(values_ms)]
+
+        longest_ms = float(known_ms.max(initial=0.0))
+        end_ms = 1.05 * max(longest_ms, 1.0)
+        if not needs_log_axis(known_ms):
+            return cls(np.linspace(0.0, end_ms, _POINTS), False)
+
+        # A logarithmic axis has no 0. It begins below nearly all values.
+        short_ms = float(np.percentile(known_ms, 1.0))
+        start_ms = max(0.5 * short_ms, 0.1)
+        return cls(np.geomspace(start_ms, end_ms, _POINTS), True)
+
+    def compute_percent(self, values_ms: Array) -> Array:
+        """Returns the percentage of values that do not exceed each delay of the axis.
+
+        The points are the cumulative distribution of the values, for example of ages.
+
+        Args:
+            values_ms: The values to count, in ms, shape (K,).
+
+        Returns:
+            Percentages, shape (P,). All are NaN if there are no values.
+        """
+        if not len(values_ms):
+            return np.full(len(self.x_ms), np.nan)
+        counts = np.searchsorted(np.sort(values_ms), self.x_ms, side="right")
+        return 100.0 * counts / len(values_ms)
+
+
 @draws(
     "delay_distributions",
     "distributions of delays and ages",
@@ -157,24 +215,23 @@ def _draw_delay_distributions(log: Log, form: FigureSize = REPORT_SIZE) -> Figur
         form: Width, type sizes and resolution of the figure.
     """
     links = DelayDistribution.list_of_log(log)
-    x_ms = choose_delay_axis_ms(links)
+    axis = DelayAxis.of_links(links)
     with style.styled_figure(form, 0.6 + 1.05 * len(log.sites)) as figure:
         grid, panels = _add_link_panels(figure, log)
         for link in links:
             axes = panels[link.peer, link.site]
-            age_percent = compute_cumulative_percent(link.age_ms, x_ms)
-            delay_percent = compute_cumulative_percent(link.delay_ms, x_ms)
-            axes.plot(x_ms, age_percent, **style.site_line(log, link.peer, 1.8))
-            axes.plot(x_ms, delay_percent, **style.LIMIT_LINE)
+            age_percent = axis.compute_percent(link.age_ms)
+            delay_percent = axis.compute_percent(link.delay_ms)
+            axes.plot(axis.x_ms, age_percent, **style.site_line(log, link.peer, 1.8))
+            axes.plot(axis.x_ms, delay_percent, **style.LIMIT_LINE)
         for axes in grid[:, 0]:
             axes.set_ylabel("cumulative (%)")
         for axes in grid[-1]:
             axes.set_xlabel("delay or age (ms)")
 
         first_panel = grid[0, 0]
-        first_panel.set(ylim=(0.0, 104.0), xlim=(x_ms[0], x_ms[-1]))
-        is_logarithmic = x_ms[0] > 0.0
-        if is_logarithmic:
+        first_panel.set(ylim=(0.0, 104.0), xlim=(axis.x_ms[0], axis.x_ms[-1]))
+        if axis.is_logarithmic:
             first_panel.set_xscale("log")
             labelled_digits = (1.0,) if form.narrow else (1.0, 2.0, 5.0)
             style.set_plain_log_axis(first_panel.xaxis, labelled_digits)
@@ -182,53 +239,6 @@ def _draw_delay_distributions(log: Log, form: FigureSize = REPORT_SIZE) -> Figur
         entries = [(f"age, {text}", line) for text, line in _list_sender_entries(log)]
         style.add_legend(figure, [*entries, ("delay of the samples", style.LIMIT_LINE)])
     return figure
-
-
-def choose_delay_axis_ms(links: list[DelayDistribution]) -> Array:
-    """Chooses the delays at which the curves of the distributions have points.
-
-    The delays reach up to the longest delay or age. Their steps are equal, or equal on a
-    logarithmic axis if only few values are long.
-
-    Args:
-        links: Delays and ages of all links that share the axis.
-
-    Returns:
-        The delays, in ms, shape (P,). The first one is 0 unless the axis is logarithmic.
-    """
-    value_arrays: list[Array] = [np.zeros(0)]
-    for link in links:
-        value_arrays += [link.delay_ms, link.age_ms]
-    values_ms = np.concatenate(value_arrays)
-    known_ms = values_ms[np.isfinite(values_ms)]
-
-    longest_ms = float(known_ms.max(initial=0.0))
-    end_ms = 1.05 * max(longest_ms, 1.0)
-    if not needs_log_axis(known_ms):
-        return np.linspace(0.0, end_ms, _POINTS)
-
-    # A logarithmic axis has no 0. It begins below nearly all values.
-    short_ms = float(np.percentile(known_ms, 1.0))
-    start_ms = max(0.5 * short_ms, 0.1)
-    return np.geomspace(start_ms, end_ms, _POINTS)
-
-
-def compute_cumulative_percent(values: Array, limits: Array) -> Array:
-    """Returns the percentage of values that do not exceed each limit.
-
-    The points are the cumulative distribution of the values, for example of ages.
-
-    Args:
-        values: The values to count, shape (K,).
-        limits: The limits, shape (P,).
-
-    Returns:
-        Percentages, shape (P,). All are NaN if there are no values.
-    """
-    if not len(values):
-        return np.full(len(limits), np.nan)
-    counts = np.searchsorted(np.sort(values), limits, side="right")
-    return 100.0 * counts / len(values)
 
 
 def trace_stated_delay(timeline: Timeline, link: str) -> tuple[Array, Array]:
@@ -274,7 +284,7 @@ def needs_log_axis(ages_ms: Array) -> bool:
     return bool(known_ms.max() > _RARE_RATIO * usual_ms)
 
 
-def is_unsteady(ages_ms: Array) -> bool:
+def _is_unsteady(ages_ms: Array) -> bool:
     """Returns True if ages fluctuate so often that a line would look like a filled area.
 
     The figure then draws the spread of the ages as a band.
@@ -284,7 +294,47 @@ def is_unsteady(ages_ms: Array) -> bool:
     """
     # The age falls whenever a newer message comes into use.
     falls = np.flatnonzero(np.diff(ages_ms) < -_STEP_MS)
-    return len(falls) > style.SPREAD_BUCKETS
+    return len(falls) > _SPREAD_BUCKETS
+
+
+def _plot_spread(axes: Axes, t_s: Array, values: Array, **options: Any) -> None:
+    """Draws a fluctuating signal as its median in a band from least to largest value.
+
+    The time is divided into `_SPREAD_BUCKETS` intervals with equal numbers of values. Each
+    interval gives a point of the median and of the edges of the band.
+
+    Args:
+        axes: Panel of the figure, as Matplotlib axes.
+        t_s: Times of the values, in s, shape (K,).
+        values: The values, shape (K,). NaN values are ignored.
+        **options: Options of the line of the median. They must include a "color", which also
+            applies to the band.
+    """
+    buckets = np.array_split(np.arange(len(values)), _SPREAD_BUCKETS)
+    points = []
+    for bucket in buckets:
+        if len(bucket):
+            middle_s = t_s[bucket].mean()
+            points.append((middle_s, *_compute_spread(values[bucket])))
+
+    middles_s, smallest, median, largest = np.array(points).reshape(-1, 4).T
+    axes.fill_between(
+        middles_s,
+        smallest,
+        largest,
+        color=options["color"],
+        alpha=_SPREAD["alpha"],
+        linewidth=0.0,
+    )
+    axes.plot(middles_s, median, **options)
+
+
+def _compute_spread(values: Array) -> tuple[float, float, float]:
+    """Returns the least, median and largest of the finite values, or NaN if there are none."""
+    # NumPy prints a warning if all values are NaN.
+    if not np.isfinite(values).any():
+        return np.nan, np.nan, np.nan
+    return np.nanmin(values), np.nanmedian(values), np.nanmax(values)
 
 
 def _scale_age_axis(axes: Axes, values_ms: Array) -> None:
@@ -325,43 +375,45 @@ def explain_missing_loop_times(log: Log) -> str:
     return NO_LOOP_CLOCK if log.driver == "virtual" else NO_LOOP_TIMES
 
 
-def choose_bin_edges_us(log: Log) -> Array:
-    """Chooses the bins for histograms of the lateness and computing time of control loops.
+class LoopTimeBins(NamedTuple):
+    """Bins for histograms of the lateness and the computing time of control loops.
 
-    The bins have equal widths on a logarithmic axis, from 1 us to just above the longest time
-    in the log.
+    The bins have equal widths on a logarithmic axis.
 
-    Args:
-        log: Log of the run.
-
-    Returns:
-        Edges of the bins in us, shape (B + 1,).
-    """
-    largest_us = 0
-    for site in log.sites:
-        for times_us in (log[site].late_us, log[site].busy_us):
-            largest_us = max(largest_us, int(times_us.max(initial=0)))
-
-    decades = np.log10(max(largest_us, 10) * 1.1)
-    bin_count = int(np.ceil(decades * _BINS_PER_DECADE))
-    exponents = np.arange(bin_count + 1) / _BINS_PER_DECADE
-    return np.power(10.0, exponents)
-
-
-def bin_loop_times(times_us: Ints, edges_us: Array) -> Ints:
-    """Counts how many times lie in each bin of a histogram of control loop timing.
-
-    Times below 1 us are counted in the first bin.
-
-    Args:
-        times_us: Times in us, shape (K,).
+    Attributes:
         edges_us: Edges of the bins in us, shape (B + 1,).
-
-    Returns:
-        Number of times in each bin, shape (B,).
     """
-    counts, _ = np.histogram(np.maximum(times_us, 1), edges_us)
-    return counts.astype(np.int64)
+
+    edges_us: Array
+
+    @classmethod
+    def of_log(cls, log: Log) -> "LoopTimeBins":
+        """Chooses the bins from 1 us to just above the longest time in a log.
+
+        Args:
+            log: Log of the run.
+        """
+        largest_us = 0
+        for site in log.sites:
+            for times_us in (log[site].late_us, log[site].busy_us):
+                largest_us = max(largest_us, int(times_us.max(initial=0)))
+
+        decades = np.log10(max(largest_us, 10) * 1.1)
+        bin_count = int(np.ceil(decades * _BINS_PER_DECADE))
+        exponents = np.arange(bin_count + 1) / _BINS_PER_DECADE
+        return cls(np.power(10.0, exponents))
+
+    def count_times(self, times_us: Ints) -> Ints:
+        """Counts how many times lie in each bin. Times below 1 us are in the first bin.
+
+        Args:
+            times_us: Times in us, shape (K,).
+
+        Returns:
+            Number of times in each bin, shape (B,).
+        """
+        counts, _ = np.histogram(np.maximum(times_us, 1), self.edges_us)
+        return counts.astype(np.int64)
 
 
 @draws(
@@ -379,7 +431,7 @@ def _draw_loop_timing(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
         log: Log of the run.
         form: Width, type sizes and resolution of the figure.
     """
-    edges_us = choose_bin_edges_us(log)
+    bins = LoopTimeBins.of_log(log)
     labels = ("wake-up after the deadline", "computing time of a tick")
     if form.narrow:
         labels = ("lateness", "computing time")
@@ -392,7 +444,7 @@ def _draw_loop_timing(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
             period_us = 1e6 / log.scenario.sites[site].rate_hz
 
             for axes, times_us in ((late_axes, records.late_us), (busy_axes, records.busy_us)):
-                _draw_histogram(axes, times_us, edges_us, colour)
+                _draw_histogram(axes, times_us, bins, colour)
                 axes.axvline(period_us, **style.LIMIT_LINE)
                 _title_histogram(axes, site, times_us, form)
             late_axes.set_ylabel("ticks (count)")
@@ -405,11 +457,11 @@ def _draw_loop_timing(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
     return figure
 
 
-def _draw_histogram(axes: Axes, times_us: Ints, edges_us: Array, colour: str) -> None:
+def _draw_histogram(axes: Axes, times_us: Ints, bins: LoopTimeBins, colour: str) -> None:
     """Draws the histogram of times on logarithmic axes."""
     axes.set(xscale="log", yscale="log")
-    counts = bin_loop_times(times_us, edges_us)
-    axes.stairs(counts, edges_us, baseline=0.5, fill=True, color=colour)
+    counts = bins.count_times(times_us)
+    axes.stairs(counts, bins.edges_us, baseline=0.5, fill=True, color=colour)
 
 
 def _title_histogram(axes: Axes, site: str, times_us: Ints, form: FigureSize) -> None:

@@ -20,10 +20,9 @@ from markupsafe import Markup
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from ...analysis import Timeline, joint_positions_m, site_signals, upright_axes
+from ...analysis import Timeline, build_arm_rows, site_signals
 from ...core import Array
 from ...log import Log
-from ...scenario import ArmModel
 from .. import style
 from ..appearance import REPORT_SIZE, FigureSize
 from ..html_templates import render_macro
@@ -115,14 +114,14 @@ class _ArmPose(NamedTuple):
 
 
 def trace_bodies_m(
-    arm: ArmModel, sizes_m: Iterable[Sequence[float]], poses: Array
+    upright_axes: Array | None, sizes_m: Iterable[Sequence[float]], poses: Array
 ) -> list[Array]:
     """Returns the edges of box-shaped bodies as paths in the plane of a picture.
 
     A path visits all edges of a box, so that one line draws the box.
 
     Args:
-        arm: Arm of the site, which determines the projection.
+        upright_axes: See `project_arm_m`.
         sizes_m: Size of each of the b bodies along its own axes, in m.
         poses: Poses of the bodies in K records, shape (K, 7 b): for each body the position in
             m, and the unit quaternion of its orientation with w first.
@@ -143,21 +142,24 @@ def trace_bodies_m(
         inner = np.cross(quaternion_v, corners) + quaternion_w * corners
         rotated = corners + 2.0 * np.cross(quaternion_v, inner)
         edges = rotated + position
-        if arm.chain is None:
+        if upright_axes is None:
             paths.append(edges[..., :2])  # a planar arm is drawn in its x-y plane
         else:
-            paths.append(project_arm_m(arm, edges))
+            paths.append(project_arm_m(upright_axes, edges))
     return paths
 
 
-def project_arm_m(arm: ArmModel, points: Array, *, onto_floor: bool = False) -> Array:
+def project_arm_m(
+    upright_axes: Array | None, points: Array, *, onto_floor: bool = False
+) -> Array:
     """Projects points of an arm to the plane of a picture, in m.
 
     A planar arm lies in the plane already. An arm in space is seen from one fixed direction,
     with "up" opposite to gravity.
 
     Args:
-        arm: Model of the arm.
+        upright_axes: Axes forward, sideways and up of an upright frame, in the frame of the
+            base, shape (3, 3). `None` for a planar arm.
         points: Points in the frame of the base, in m, shape (..., 3). Points of a planar arm
             have the shape (..., 2), and are returned unchanged.
         onto_floor: True to return the shadows of the points on a floor at the base.
@@ -165,10 +167,10 @@ def project_arm_m(arm: ArmModel, points: Array, *, onto_floor: bool = False) -> 
     Returns:
         Points in the picture, shape (..., 2), in m.
     """
-    if arm.chain is None:
+    if upright_axes is None:
         return points
 
-    upright_points = points @ upright_axes(arm.chain).T
+    upright_points = points @ upright_axes.T
     x, y, z = np.moveaxis(upright_points, -1, 0)
     # Rotate about the vertical axis by the azimuth, then tilt by the elevation of the viewer.
     across = y * np.cos(_AZIMUTH) - x * np.sin(_AZIMUTH)
@@ -178,7 +180,7 @@ def project_arm_m(arm: ArmModel, points: Array, *, onto_floor: bool = False) -> 
     return np.stack([across, up], axis=-1)
 
 
-def choose_instants_s(log: Log, count: int = INSTANTS) -> list[float]:
+def _choose_instants_s(log: Log, count: int = INSTANTS) -> list[float]:
     """Chooses the times at which to draw the arms, including the first and the last time.
 
     Equal steps of time would mostly show arms at rest. Therefore the times are equally spaced
@@ -234,7 +236,8 @@ def find_pose(log: Log, site: str, t_s: float) -> _ArmPose | None:
         The points to draw, in m. `None` if the site has no record up to this time.
     """
     records = log[site]
-    arm = log.scenario.arms[site]
+    arm = build_arm_rows(log.scenario, site)
+    axes = arm.upright_axes
     until_s = t_s + 1e-9  # tolerates rounding errors of the time
     last = int(np.searchsorted(records.t_s, until_s, side="right")) - 1
     if last < 0:
@@ -242,20 +245,20 @@ def find_pose(log: Log, site: str, t_s: float) -> _ArmPose | None:
 
     # Points of the path of the end effector. The last of them belongs to the last record.
     rows = np.unique(np.linspace(0, last, _PATH_POINTS).astype(np.int64))
-    positions = joint_positions_m(arm, records.q[rows])
-    actual = project_arm_m(arm, positions)
+    positions = arm.joint_positions_m(records.q[rows])
+    actual = project_arm_m(axes, positions)
 
     reference = reference_angles(records)[last : last + 1]
-    desired = project_arm_m(arm, joint_positions_m(arm, reference)[0])
+    desired = project_arm_m(axes, arm.joint_positions_m(reference)[0])
 
     shadow: Array = np.zeros((0, 2))
-    if arm.chain is not None:
-        shadow = project_arm_m(arm, positions[-1:], onto_floor=True)[0]
+    if axes is not None:
+        shadow = project_arm_m(axes, positions[-1:], onto_floor=True)[0]
 
     bodies: list[Array] = []
     sizes_m = log.scenario.bodies_m(site).values()
     if sizes_m:
-        paths = trace_bodies_m(arm, sizes_m, records.bodies[last : last + 1])
+        paths = trace_bodies_m(axes, sizes_m, records.bodies[last : last + 1])
         bodies = [path[0] for path in paths]
     return _ArmPose(
         actual=actual[-1], desired=desired, path=actual[:, -1], shadow=shadow, bodies=bodies
@@ -302,7 +305,7 @@ def _draw_arms(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
         form: Width, type sizes and resolution of the figure.
     """
     instants = _NARROW_INSTANTS if form.narrow else INSTANTS
-    times_s = choose_instants_s(log, instants)
+    times_s = _choose_instants_s(log, instants)
     poses = {}
     for site in log.sites:
         poses[site] = [find_pose(log, site, t_s) for t_s in times_s]
@@ -383,7 +386,7 @@ def render_arms_svg(log: Log, bounds_m: PictureBox, factor: float) -> Markup:
     left_m, right_m, bottom_m, top_m = bounds_m
     bounds = (factor * left_m, factor * right_m, factor * bottom_m, factor * top_m)
 
-    times_s = choose_instants_s(log)
+    times_s = _choose_instants_s(log)
     rows = []
     for index, site in enumerate(log.sites):
         if not len(log[site]):

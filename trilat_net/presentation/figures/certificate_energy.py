@@ -22,12 +22,12 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from ...analysis import Certificate, EnergyBalance, ObservedEnergy, certify_log
+from ...analysis import Certificate, EnergyBalance, ObservedEnergy
 from ...core import Array
 from ...log import Log
 from .. import style
 from ..appearance import REPORT_SIZE, FigureSize
-from ..premise_text import explain_no_functional
+from ..verdict_text import explain_no_functional
 from .figure_entry import draws, unless
 
 _PART_LABELS = {
@@ -127,7 +127,7 @@ def _draw_certificate(log: Log, form: FigureSize) -> Figure:
     figures.
     """
     own_laws = log.may_run_user_laws
-    return draw_functional(log, certify_log(log, own_laws=own_laws), form)
+    return draw_functional(log, Certificate.of_log(log, own_laws=own_laws), form)
 
 
 def draw_observed_energy(

@@ -18,7 +18,7 @@ from ...analysis import Timeline, site_signals
 from ...core import Array
 from ...errors import UsageError, count_nouns
 from ...log import Log, SiteLog
-from ...scenario import compare_scenarios
+from ...scenario import ScenarioDifference
 from .. import plot_signals, style
 from ..appearance import REPORT_SIZE, FigureSize
 from .joint_motion import add_joint_rows, choose_height_in
@@ -167,7 +167,9 @@ def label_runs(logs: Mapping[str, Log], form: FigureSize) -> dict[str, str]:
         form: Size of the figure, whose width limits the length of a line.
     """
     scenarios = [log.scenario for log in logs.values()]
-    differences = compare_scenarios(scenarios) if len(scenarios) > 1 else []
+    differences = []
+    if len(scenarios) > 1:
+        differences = ScenarioDifference.list_between(scenarios)
     first_scenario = scenarios[0]
     letters_per_line = round(_LETTERS_PER_IN * form.width_in)
     labels = {}

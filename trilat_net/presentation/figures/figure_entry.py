@@ -45,6 +45,17 @@ class FigureEntry(NamedTuple):
     absent: Absent
     in_report: bool
 
+    @staticmethod
+    def list_all() -> dict[str, "FigureEntry"]:
+        """Returns all registered figures by name, in the order of a paper.
+
+        Figures that are not in this order, such as those of a new file, are last, in the order
+        of their registration.
+        """
+        ranks = {name: rank for rank, name in enumerate(_PAPER_ORDER)}
+        names = sorted(_ENTRIES, key=lambda name: ranks.get(name, len(ranks)))
+        return {name: _ENTRIES[name] for name in names}
+
 
 _ENTRIES: dict[str, FigureEntry] = {}
 _PAPER_ORDER = (
@@ -103,14 +114,3 @@ def unless(shows: Callable[[Log], object], reason: str) -> Absent:
         something to draw.
     """
     return lambda log: "" if shows(log) else reason
-
-
-def list_figures() -> dict[str, FigureEntry]:
-    """Returns all registered figures by name, in the order in which a paper would have them.
-
-    Figures that are not in this order, such as those of a new file, are last, in the order of
-    their registration.
-    """
-    ranks = {name: rank for rank, name in enumerate(_PAPER_ORDER)}
-    names = sorted(_ENTRIES, key=lambda name: ranks.get(name, len(ranks)))
-    return {name: _ENTRIES[name] for name in names}

@@ -14,6 +14,7 @@ Invariant:
       arm. The log contains the opposite sign, the torque that the arm exerts on the operator.
 """
 
+import textwrap
 from collections.abc import Sequence
 from functools import partial
 from typing import Any
@@ -33,7 +34,6 @@ from ...analysis import (
 from ...core import LINK_PARAMETERS, Array
 from ...execution import SimulatedLog
 from ...log import Log
-from ...own_code import find_user_laws
 from .. import plot_signals, style
 from ..appearance import REPORT_SIZE, FigureSize
 from .figure_entry import draws, unless
@@ -94,7 +94,7 @@ def _explain_absent_displacement(log: Log) -> str:
     """
     if not any(site.hands for site in log.scenario.sites.values()):
         return NO_OPERATOR
-    for law in find_user_laws(log.scenario):
+    for law in log.scenario.inspect_user_laws():
         if not law.allowed:
             return str(law)
     return ""
@@ -181,8 +181,8 @@ def _draw_joints(
     joint_count = len(style.name_joints(log))
     row_count = len(style.arrange_joints(joint_count, form.narrow))
     with style.time_figure(log, form, 2.2 + _ROW_IN * (row_count - 1)) as plot:
-        panels = style.add_joint_panels(plot.figure, joint_count, form)
-        style.title_joints(log, panels.joints)
+        panels = plot.add_joint_panels(joint_count)
+        _title_joints(log, panels.joints)
         plot.joint_row(panels.joints, sites, signal)
         for joint, axes in enumerate(panels.joints):
             # Equal limits of several sites are drawn once. Arms may have fewer joints.
@@ -233,7 +233,7 @@ def add_joint_rows(
     titles = titles or style.name_joints(log)
     if len(titles) == 2:
         grid = style.add_panels(figure, len(labels), 2, sharex=True, sharey=sharey)
-        style.title_joints(log, grid[0], titles)
+        _title_joints(log, grid[0], titles)
         for row, label in zip(grid, labels, strict=True):
             row[0].set_ylabel(label)
         return [list(row) for row in grid], list(grid[-1])
@@ -242,7 +242,7 @@ def add_joint_rows(
         figure, len(titles), len(heads), sharex=True, sharey=_TRANSPOSED[sharey]
     )
     for row, title in zip(grid, titles, strict=True):
-        style.label_row(row[0], title, form)
+        _label_row(row[0], title, form)
     for axes, head in zip(grid[0], heads, strict=True):
         axes.set_title(head)
     # The caller gets the panels by quantity and joint, in either arrangement.
@@ -358,10 +358,10 @@ def _draw_tracking_errors(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
     unit = plot_signals.shared_unit(log)
     row_count = len(style.arrange_joints(len(titles), form.narrow))
     with style.time_figure(log, form, 3.6 + _ROW_IN * (row_count - 1)) as plot:
-        panels = style.add_joint_panels(plot.figure, len(titles), form, below="all")
+        panels = plot.add_joint_panels(len(titles), below="all")
         settling_panel = panels.below
         assert settling_panel is not None
-        style.title_joints(log, panels.joints, titles)
+        _title_joints(log, panels.joints, titles)
         error_signal = style.site_records(log, site_signals.joint_errors)
         plot.joint_row(panels.joints, log.sites, error_signal)
         first_in_rows = panels.joints[:: panels.columns]
@@ -517,7 +517,7 @@ def _draw_link_estimates(log: Log, form: FigureSize) -> Figure:
             plot.mark(axes, log.sites, numbered=False)
 
             # The panels are small. Therefore titles, ticks and labels are small too.
-            title = f"{style.typeset_symbol(symbol)} ({style.typeset_unit(unit)})"
+            title = f"{_typeset_symbol(symbol)} ({style.typeset_unit(unit)})"
             axes.set_title(title, fontsize=_LINK_PANEL_PT, pad=3.5)
             axes.tick_params(labelsize=5.0, length=1.5, pad=1.0)
             axes.locator_params(axis="y", nbins=2)
@@ -526,7 +526,7 @@ def _draw_link_estimates(log: Log, form: FigureSize) -> Figure:
             is_first_panel_of_link = index % LINK_PARAMETERS == 0
             if is_first_panel_of_link:
                 link_number = 1 + index // LINK_PARAMETERS
-                style.label_row(axes, f"{link_number}: {link}", form)
+                _label_row(axes, f"{link_number}: {link}", form)
 
         bottom_panels = grid[-1]
         plot.finish(list(bottom_panels), _list_estimate_entries(log))
@@ -611,7 +611,7 @@ def _draw_phase_portrait(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
                 path = np.stack([errors[:, joint], rates[:, joint]], axis=1)
                 _draw_path(axes, path, line_style)
 
-        style.title_joints(log, panels, titles)
+        _title_joints(log, panels, titles)
         for axes in panels:
             axes.set_xlabel(f"error ({unit})")
             if form.narrow:
@@ -712,7 +712,7 @@ def thin_path(path: Array) -> Array:
     return thinned
 
 
-def list_sites_with_changing_dominance(log: Log) -> list[str]:
+def _list_sites_with_changing_dominance(log: Log) -> list[str]:
     """Lists the arms whose dominance factors change during the run, in scenario order.
 
     A dominance factor is the weight with which an arm follows another arm.
@@ -727,7 +727,7 @@ def list_sites_with_changing_dominance(log: Log) -> list[str]:
 @draws(
     "authority",
     "shares that change, and the motion of the arms",
-    unless(list_sites_with_changing_dominance, "the shares of all sites are constant"),
+    unless(_list_sites_with_changing_dominance, "the shares of all sites are constant"),
 )
 def _draw_authority(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
     """Draws how the authority over the arms changes during a run, and how the arms move.
@@ -741,7 +741,7 @@ def _draw_authority(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
         log: Log of the run.
         form: Width, type sizes and resolution of the figure.
     """
-    changing_sites = list_sites_with_changing_dominance(log)
+    changing_sites = _list_sites_with_changing_dominance(log)
     titles = style.name_joints(log)
     row_count = len(changing_sites) + len(titles)
     has_low_rows = len(titles) > 2
@@ -765,7 +765,7 @@ def _draw_authority(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
 
         for title, axes in zip(titles, joint_panels, strict=True):
             if has_low_rows:
-                style.label_row(axes, title, form)
+                _label_row(axes, title, form)
             else:
                 axes.set_ylabel(f"{title} (rad)")
             plot.mark(axes, log.sites)
@@ -819,3 +819,47 @@ def _draw_contact(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
             plot.mark(axes, sites)
         plot.finish([depth_panel], style.site_legend_entries(log, sites))
     return plot.figure
+
+
+def _title_joints(log: Log, row: Sequence[Axes], titles: Sequence[str] = ()) -> None:
+    """Writes the name of a joint above each panel of a row, or another title.
+
+    Args:
+        log: Log with the joints.
+        row: A panel per title.
+        titles: The titles. Empty for the names of the joints.
+    """
+    for title, axes in zip(titles or style.name_joints(log), row, strict=True):
+        axes.set_title(title)
+
+
+def _label_row(axes: Axes, text: str, form: FigureSize) -> None:
+    """Writes a label beside a row of low panels of a figure, in several lines.
+
+    A low panel has no room beside it for a long label in one line.
+
+    Args:
+        axes: First panel of the row, beside which the label is written.
+        text: The label. It is wrapped after 12 characters.
+        form: Size of the figure, which determines the size of the text.
+    """
+    lines = textwrap.wrap(text, 12)
+    axes.set_ylabel("\n".join(lines), fontsize=form.tick_pt)
+
+
+def _typeset_symbol(parameter: str) -> str:
+    """Returns the symbol of an inertial parameter for Matplotlib, with its index below.
+
+    An adaptive control law estimates such parameters, for example a mass or an inertia.
+
+    Args:
+        parameter: Name of the parameter: a moment of inertia such as "Ixx", a first moment such
+            as "mc_x", or the mass.
+    """
+    if parameter[0] == "I":
+        stem = parameter[:1]
+        index = parameter[1:]
+    else:
+        stem = parameter[:2]
+        index = parameter[3:]  # behind the underscore
+    return f"${stem.strip()}_{{{index}}}$" if index else f"${stem}$"

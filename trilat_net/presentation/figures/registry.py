@@ -26,7 +26,7 @@ from ...log import Log, Progress, open_log
 from ..appearance import COLUMN_IN, REPORT_SIZE, FigureSize
 from ..style import DASHES, FIGURE_FORMATS, write_figure
 from .compared_runs import COMPARED_SIGNALS, draw_compared_runs, list_common_sites
-from .figure_entry import FigureEntry, list_figures
+from .figure_entry import FigureEntry
 from .joint_motion import draw_operator_displacement
 from .run_overview import draw_overlay
 from .twin_differences import draw_twins
@@ -35,7 +35,7 @@ from .twin_differences import draw_twins
 for _module in pkgutil.iter_modules(import_module(__package__).__path__):
     import_module(f"{__package__}.{_module.name}")
 
-FIGURES = list_figures()
+FIGURES = FigureEntry.list_all()
 """All figures by name, in the order in which they would appear in a paper."""
 
 

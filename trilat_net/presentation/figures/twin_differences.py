@@ -31,7 +31,6 @@ from ...analysis import (
     PushGrowth,
     RunEnd,
     TwinGrowth,
-    measure_amplitude,
 )
 from ...core import BUCKETS_PER_S, Array
 from ...execution import SMALLEST, FusedRun, TwinPath, Twins
@@ -73,13 +72,14 @@ class _DifferenceLine(NamedTuple):
     Attributes:
         label: Text of the line in the legend.
         path: Difference between the repetition (twin) and the run over time.
-        joints: Indices of the joints that the drawn amplitude covers.
+        log_amplitude: Logarithm of the drawn amplitude over time, which covers one joint or
+            all joints, shape (K,), with the amplitude in rad/s.
         options: Colour, width and dashes of the line.
     """
 
     label: str
     path: TwinPath
-    joints: list[int]
+    log_amplitude: Array
     options: dict[str, Any]
 
 
@@ -153,7 +153,7 @@ def _list_lines(pushed: PushedTwins, twins: Twins) -> Iterator[_DifferenceLine]:
         twins: The twins of `pushed`, each with its push and its difference from the run over
             time.
     """
-    all_joints = list(range(len(twins.joints)))
+    log_amplitudes = pushed.measure_amplitudes(range(len(twins.joints)))
     joint_styles = _style_joints(pushed.log, twins.joints)
     shades = colormaps["viridis"](np.linspace(0.9, 0.0, len(twins.paths)))
     has_several_sizes = pushed.linear is not None
@@ -163,7 +163,7 @@ def _list_lines(pushed: PushedTwins, twins: Twins) -> Iterator[_DifferenceLine]:
         size, _, pushed_joints = path.push.name.partition(" at ")
         if has_several_sizes:
             shade = {"color": tuple(shades[number]), "linewidth": 1.3}
-            yield _DifferenceLine(size, path, all_joints, shade)
+            yield _DifferenceLine(size, path, log_amplitudes[number], shade)
         elif len(twins.paths) > 1:
             style_without_joint = {
                 "color": _SEVERAL_JOINTS_COLOUR if pushed_joints else _ESTIMATES_COLOUR,
@@ -171,13 +171,14 @@ def _list_lines(pushed: PushedTwins, twins: Twins) -> Iterator[_DifferenceLine]:
                 "linestyle": style.DASHES[number % len(style.DASHES)],
             }
             options = joint_styles.get(pushed_joints, style_without_joint)
-            yield _DifferenceLine(path.push.name, path, all_joints, options)
+            yield _DifferenceLine(path.push.name, path, log_amplitudes[number], options)
         else:
             for joint, name in enumerate(twins.joints):
                 # The logarithm of the difference is -inf while the joint has not moved.
                 has_moved = np.isfinite(path.largest[:, joint]).any()
                 if has_moved:
-                    yield _DifferenceLine(name, path, [joint], joint_styles[name])
+                    (log_amplitude,) = pushed.measure_amplitudes([joint])
+                    yield _DifferenceLine(name, path, log_amplitude, joint_styles[name])
 
 
 def _style_joints(log: Log, joints: Sequence[str]) -> dict[str, dict[str, Any]]:
@@ -251,7 +252,7 @@ def _trace_amplitude(line: _DifferenceLine, to_s: float, step: int) -> tuple[Arr
         amplitude is NaN: at the end of each leg, and where the difference is 0.
     """
     path = line.path
-    log_amplitude = measure_amplitude(path, line.joints)
+    log_amplitude = line.log_amplitude
     end = int(np.searchsorted(path.t_s, to_s))
     end = max(end, path.pushed[-1] + 1)  # the last leg has at least one interval
     t_s = np.zeros(0)

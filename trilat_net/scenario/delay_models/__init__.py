@@ -17,6 +17,7 @@ Invariant:
 """
 
 import math
+from functools import lru_cache
 from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple, Union
 
 import numpy as np
@@ -26,7 +27,10 @@ from ...core import (
     LINK_MODEL_DTYPE,
     MAX_DELAY_US,
     DelayKind,
+    IntArray,
     LinkModel,
+    LinkSchedule,
+    LinkSetup,
     Points,
     UserModel,
 )
@@ -222,6 +226,23 @@ class LinkBase(Frozen, frozen=True, tag_field="model", omit_defaults=True):
             playout_us=ms_to_us(self.playout_ms),
         )
 
+    def find_effective_delay(self, receiver_hz: int) -> float:
+        """Returns the delay with which the receiver of the link uses samples, in s.
+
+        A constant delay is rounded up to whole control periods of the receiver. The result is
+        NaN for a delay that varies, and for a link that loses samples.
+
+        Args:
+            receiver_hz: Tick rate of the receiver, in Hz.
+        """
+        model = self.to_core_model()
+        if model.kind != DelayKind.CONSTANT or self.loss or self.measured:
+            return math.nan
+        delay_us = max(round(model.location), model.playout_us)
+        # rounded up, because without a delay a sample is used from the next tick on
+        ticks = max(1, -(-delay_us * receiver_hz // 1_000_000))
+        return ticks / receiver_hz
+
     def _loss_chain(self) -> _LossChain:
         """Computes the Markov chain that produces the stated losses.
 
@@ -297,6 +318,37 @@ class LinkBase(Frozen, frozen=True, tag_field="model", omit_defaults=True):
                 "loss_burst", f"{self.loss_burst:g} is too short for a loss of {self.loss:g}"
             )
         return None
+
+    @lru_cache(maxsize=256)  # noqa: B019 - a link is a small value that never changes
+    def draw_used_samples(
+        self, key: int, receiver_hz: int, sender_hz: int, duration_s: float
+    ) -> IntArray:
+        """Computes which message of another arm is in use in each control period of an arm.
+
+        Messages are delayed and lost by the network link between the two arms; other links of
+        the arm are not considered. A message is called a sample.
+
+        Args:
+            key: Key of the link's random draws.
+            receiver_hz: Tick rate of the site, in Hz.
+            sender_hz: Tick rate of the peer, in Hz.
+            duration_s: Duration of the run, in s.
+
+        Returns:
+            Number of the sample in every tick, shape (ticks,). -1 before the first sample.
+        """
+        setup = LinkSetup(
+            peer="peer",
+            alpha=1.0,
+            rate_hz=sender_hz,
+            q0=(),
+            key=key,
+            models=(self.to_core_model(),),
+            traces=(self.points,),
+        )
+        used = LinkSchedule(setup).draw_run(receiver_hz, duration_s)
+        used.flags.writeable = False
+        return used
 
     def describe(self) -> str:
         """Returns a short text for the user about the link.

@@ -290,6 +290,31 @@ class HandPlayer:
         self._rate_hz = scenario.sites[hand_site.name].rate_hz
         self.hand = hand_site.make_hand()
 
+    @staticmethod
+    def make_all(scenario: "Scenario") -> "dict[str, HandPlayer]":
+        """Creates the programs that operate arms, for all sites that have a program.
+
+        A site is the process that runs one arm. Its operator can be a program, which is a
+        user's Python class, in place of a person.
+
+        Args:
+            scenario: Description of the experiment.
+
+        Returns:
+            For each site with a program, by name, the object that calls the program. Empty if
+            no site has a program.
+
+        Raises:
+            CodeWithheld: Nobody has permitted the code of a class to run.
+            ScenarioError: A program cannot be created.
+        """
+        players = {}
+        for name in scenario.names:
+            hand_site = HandSite.find(scenario, name)
+            if hand_site is not None:
+                players[name] = HandPlayer(hand_site, hand_site.make_program())
+        return players
+
     def track(self, site: Site, k: int) -> list[float]:
         """Returns the action of the program that operates the arm, in one control period.
 
@@ -380,28 +405,3 @@ class HandPlayer:
         """Returns a sentence about the program, such as that it takes hold of the arm."""
         t_s = tick_ns(k, self._rate_hz) / NS_PER_S
         return f"{self._site}: {self._code} {change} at t = {t_s:.3f} s"
-
-
-def make_hand_players(scenario: "Scenario") -> dict[str, HandPlayer]:
-    """Creates the programs that operate arms, for all sites that have a program.
-
-    A site is the process that runs one arm. Its operator can be a program, which is a user's
-    Python class, in place of a person.
-
-    Args:
-        scenario: Description of the experiment.
-
-    Returns:
-        For each site with a program, by name, the object that calls the program. Empty if no
-        site has a program.
-
-    Raises:
-        CodeWithheld: Nobody has permitted the code of a class to run.
-        ScenarioError: A program cannot be created.
-    """
-    players = {}
-    for name in scenario.names:
-        hand_site = HandSite.find(scenario, name)
-        if hand_site is not None:
-            players[name] = HandPlayer(hand_site, hand_site.make_program())
-    return players

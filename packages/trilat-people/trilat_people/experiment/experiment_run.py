@@ -30,11 +30,10 @@ from trilat_net.scenario import parse_scenario
 from trilat_net.work import (
     Progress,
     RunJournal,
+    WorkerPool,
     Workers,
-    build_resume_hint,
     encode_csv,
     ignore_progress,
-    open_worker_pool,
 )
 
 from .completion_times import COMPLETION, find_median, is_completed
@@ -113,7 +112,7 @@ class Experiment(Result):
         self.folder = folder
         self.plan = plan
         self.unit = "pair" if len(plan.protocol.users) > 1 else "participant"
-        self._remedy = build_resume_hint("experiment", "run", str(folder))
+        self._remedy = RunJournal.build_resume_hint("experiment", "run", str(folder))
 
     def open_trials(self, *, people: bool | None = None) -> RunJournal[TrialEntry]:
         """Opens the journal with the results of the finished trials.
@@ -276,7 +275,7 @@ class Experiment(Result):
                     tasks.append((plan.protocol, text, trial, plan.digest, logs))
 
             most_workers = len(tasks) or 1
-            with open_worker_pool(jobs, on, most=most_workers, hint=self._remedy) as pool:
+            with WorkerPool.open(jobs, on, most=most_workers, hint=self._remedy) as pool:
                 journal.run_pending(
                     pool,
                     SyntheticTrial.run_task,

@@ -27,19 +27,17 @@ import numpy as np
 
 from trilat_net.analysis import (
     AlignedRecords,
-    BodyTurns,
     TorqueSplit,
     VirtualWall,
     build_arm_rows,
-    joint_positions_m,
-    upright_axes,
 )
 from trilat_net.core import Array, HandInForce, LifeAlarm
 from trilat_net.net import Event
 from trilat_net.presentation import describe_energy_obstacle
 from trilat_net.records import NS_PER_S
-from trilat_net.scenario import Scenario, describe_event
+from trilat_net.scenario import Change, Scenario
 
+from .body_turns import BodyTurns
 from .session_view import SessionView, SiteView, Tail
 
 POINTS_KEPT = 1200
@@ -98,13 +96,11 @@ class _ArmFrames:
         colours = self._scenario.assign_colours(COLOURS)
         site_number = self._scenario.names.index(self._site)
         colour = colours[site_number % len(colours)]
-        up = None
-        if model.chain is not None:
-            up_axes = upright_axes(model.chain)
-            up = _round(up_axes)
+        up_axes = self._rows.upright_axes
+        up = None if up_axes is None else _round(up_axes)
 
         q0 = np.array([settings.q0_rad], dtype=np.float64)
-        start_m = joint_positions_m(model, q0)[0]
+        start_m = self._rows.joint_positions_m(q0)[0]
         link_vectors_m = np.diff(start_m, axis=0)
         link_lengths_m = np.linalg.norm(link_vectors_m, axis=1)
         reach_m = float(link_lengths_m.sum())  # of the stretched arm
@@ -175,7 +171,7 @@ class _ArmFrames:
             values for JSON.
         """
         rows = q[np.newaxis]
-        points_m = joint_positions_m(self._model, rows)[0]
+        points_m = self._rows.joint_positions_m(rows)[0]
         return {
             "points": _round(points_m),
             "q": _round(q),
@@ -267,7 +263,7 @@ class _ArmFrames:
         else:
             last_row = len(records.known) - 1  # `known` has one entry per record
             last_reference = records.q_des[last_row:]  # shape (1, n), in rad or m
-            points_m = joint_positions_m(self._model, last_reference)[0]
+            points_m = self._rows.joint_positions_m(last_reference)[0]
         return points_m
 
     def _describe_grip(self, records: AlignedRecords, force: Array) -> Json:
@@ -848,7 +844,7 @@ def _render_event(event: Event) -> Json:
         The parts of its line, as plain values for JSON.
     """
     t_s = None if event.t_ns < 0 else event.t_ns / NS_PER_S
-    text = describe_event(event.kind, event.text, event.command)
+    text = Change.describe_event(event.kind, event.text, event.command)
     return {
         "t": t_s,
         "member": event.member,

@@ -42,10 +42,10 @@ from trilat_net.net import (
 )
 from trilat_net.records import NS_PER_S
 from trilat_net.scenario import (
+    Change,
     LinkTables,
     PictureDelay,
     Scenario,
-    find_requester,
     parse_core_change,
     parse_embedded,
 )
@@ -652,7 +652,7 @@ class SessionView:
                 site.holder = holder.removeprefix(f"{name}: ")
 
         if event.kind == "change":
-            site.stopped_by = find_requester(event.text) or site.stopped_by
+            site.stopped_by = Change.find_requester(event.text) or site.stopped_by
             if event.command:
                 self._apply_change(name, event.command)
 

@@ -20,7 +20,7 @@ from trilat_net.errors import SessionError
 from trilat_net.net import Bus, Clock, Connection, connect_to_session
 from trilat_net.presentation import describe_energy_obstacle
 from trilat_net.records import NS_PER_S
-from trilat_net.scenario import embedded_names_reader
+from trilat_net.scenario import parse_embedded
 from trilat_net.signals import Interrupt
 
 from .page_orders import OrderDesk
@@ -68,10 +68,15 @@ def watch_session(
         UsageError: A network address cannot be used.
     """
     with Interrupt() as interrupt:
-        names = embedded_names_reader(session)
         stopped = interrupt.is_requested
         connection_to_session = connect_to_session(
-            connection, clock, session, names, stopped=stopped, timeout_s=timeout_s, say=say
+            connection,
+            clock,
+            session,
+            lambda text: parse_embedded(text, session).names,
+            stopped=stopped,
+            timeout_s=timeout_s,
+            say=say,
         )
 
         with connection_to_session as bus:

@@ -34,7 +34,7 @@ import numpy as np
 from trilat_net.analysis import (
     SETTLED_ERROR_RAD,
     THROWN_RAD,
-    DominancePlan,
+    DominanceHistory,
     EndBehaviour,
     RunEnd,
     Stability,
@@ -44,19 +44,18 @@ from trilat_net.analysis import (
     decision_facts,
     judge_virtual_run,
 )
-from trilat_net.core import Array
+from trilat_net.core import Array, TorqueKind
 from trilat_net.errors import CodeFailed, UsageError
 from trilat_net.files import make_results_folder, refuse_link, write_whole
 from trilat_net.records import NS_PER_S
-from trilat_net.scenario import Scenario, ViscousEnvironment
+from trilat_net.scenario import Scenario
 from trilat_net.work import (
     Progress,
     RunJournal,
     StudyFolder,
+    WorkerPool,
     Workers,
-    build_resume_hint,
     ignore_progress,
-    open_worker_pool,
 )
 
 from ..measure_run import RecordBatch, WholeRun, describe_program
@@ -452,10 +451,10 @@ def _compute_hand_torque(scenario: Scenario, name: str, record: RecordBatch) -> 
         The torque in N m, shape (records, joints).
     """
     operator_torque: Array = -record.tau_x
-    for source in scenario.sites[name].environment:
-        if isinstance(source, ViscousEnvironment):
-            damping = np.array(source.damping_nm_s_rad)
-            operator_torque = operator_torque + damping * record.qd
+    for part in scenario.sites[name].environment:
+        source = part.actor
+        if source.kind is TorqueKind.VISCOUS:
+            operator_torque = operator_torque + np.array(source.B) * record.qd
     return operator_torque
 
 
@@ -803,7 +802,7 @@ def _measure_error_rad(scenario: Scenario, records: dict[str, RecordBatch]) -> f
     """
     slave = records[SLAVE]
     t_s = slave.t_ns / NS_PER_S
-    alpha = DominancePlan.of_scenario(scenario, SLAVE).evaluate(t_s).alpha
+    alpha = DominanceHistory.of_scenario(scenario, SLAVE, t_s).alpha
     reference: Array = np.zeros_like(slave.q)
     for index, peer in enumerate(scenario.peers(SLAVE)):
         weight = alpha[:, index, None]
@@ -846,7 +845,7 @@ def prepare_bench_folder(plan: BenchPlan, path: Path | None = None) -> BenchFold
         make_results_folder(path, "", force=None)
         write_whole(origin_file, origin)
 
-    remedy = build_resume_hint("bench", "--study", plan.study, "--out", str(path))
+    remedy = RunJournal.build_resume_hint("bench", "--study", plan.study, "--out", str(path))
     journal_file = path / JOURNAL_NAME
     return StudyFolder(
         path=path,
@@ -986,7 +985,7 @@ def _run_pending(
         return
     in_lanes = any(item.is_side_by_side for item in pending)
     hint = "; finished runs are kept: the same command continues"
-    with open_worker_pool(jobs, on, most=len(pending), hint=hint) as pool:
+    with WorkerPool.open(jobs, on, most=len(pending), hint=hint) as pool:
         journal.run_pending(
             pool,
             BenchRunItem.run,

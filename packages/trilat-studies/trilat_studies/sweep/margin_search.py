@@ -22,14 +22,13 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from trilat_net.analysis import find_root_crossings
+from trilat_net.analysis import GrowthColumn
 from trilat_net.errors import ScenarioError, UsageError, count_nouns
 from trilat_net.files import write_whole
-from trilat_net.own_code import list_imported_code
 from trilat_net.presentation import TextTable
 from trilat_net.results import Result
 from trilat_net.scenario import Scenario
-from trilat_net.work import Progress, Workers, ignore_progress, open_worker_pool
+from trilat_net.work import Progress, WorkerPool, Workers, ignore_progress
 
 from ..run_commands import format_override_value
 from . import sweep_cell
@@ -348,7 +347,7 @@ def _search_margin_task(task: _MarginItem) -> GridPointMargin:
     closed = StabilityCriterion.find_edge(
         lambda value: StabilityCriterion.evaluate(load(value)), low, high
     )
-    linear, remark = find_root_crossings(load(high), key, low, high)
+    linear, remark = GrowthColumn.find_crossings(load(high), key, low, high)
     return GridPointMargin(
         cell=task.cell,
         seed=task.seed,
@@ -428,8 +427,8 @@ class SweepMargins(Result):
             searches += [_MarginItem(plan, grid_point, seed, within) for seed in seeds]
 
         # The workers need the files of control laws that users wrote.
-        laws = list_imported_code([plan.base])
-        with open_worker_pool(jobs, on, most=len(searches), laws=laws) as pool:
+        laws = plan.base.imported_code
+        with WorkerPool.open(jobs, on, most=len(searches), laws=laws) as pool:
             found = pool.map(_search_margin_task, searches, progress)
         return cls(plan, within, found)
 

@@ -32,18 +32,17 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from trilat_net.analysis import GrowthColumn, PlacedArm
+from trilat_net.analysis import GrowthColumn, build_arm_rows
 from trilat_net.core import Array, DominanceMatrix
 from trilat_net.errors import ScenarioError, UsageError
 from trilat_net.laws import COMMON_MOTION_SHARE, PD, Adaptive
 from trilat_net.scenario import (
-    ArmModel,
     LinkBase,
     Scenario,
     SiteSpec,
     is_number,
 )
-from trilat_net.work import Progress, Workers, ignore_progress, open_worker_pool
+from trilat_net.work import Progress, WorkerPool, Workers, ignore_progress
 
 from ..run_commands import format_override_value
 from .fixed_gains import describe_fixed_gains
@@ -679,7 +678,8 @@ def _evaluate_damping_criterion(scenario: Scenario) -> StabilityCriterion | None
             return None
         K.append(gains[0])
         d.append(gains[1])
-    least_inertia = min(map(_bound_least_inertia, scenario.arms.values()))
+    arms = [build_arm_rows(scenario, site) for site in scenario.names]
+    least_inertia = min(arm.least_inertia_kg_m2 for arm in arms)
     if max(d) / rate_hz >= least_inertia:
         return None  # an arm is lighter than d h
 
@@ -855,21 +855,6 @@ def _compute_pair_excess(
     mean_stiffness = math.sqrt(K_1 * K_2)
     half_excess = np.sqrt(damping_1 * damping_2) - mean_stiffness * mean_delay_s
     return float(2.0 * np.min(half_excess))  # doubled, because the delay is the mean of two
-
-
-def _bound_least_inertia(arm: ArmModel) -> float:
-    """Returns a lower bound on the eigenvalues of the inertia matrix M(q), in kg m^2.
-
-    The bound holds for all poses q. For the planar arm with two joints, the least eigenvalue
-    occurs at cos q2 = 1 or -1. For any other arm, the inertia of the drives is a lower bound.
-    """
-    if arm.chain is not None:
-        return min(joint.armature_kg_m2 for joint in arm.chain.joints)
-    poses = np.array([[0.0, 0.0], [0.0, np.pi]])
-    extreme_poses = PlacedArm(0.0, arm.lengths_m, poses)
-    inertia_matrices = extreme_poses.inertia_matrix(arm.theta).T
-    eigenvalues = np.linalg.eigvalsh(inertia_matrices)
-    return float(eigenvalues.min())
 
 
 def _evaluate_sampling_criterion(scenario: Scenario) -> StabilityCriterion | None:
@@ -1367,7 +1352,7 @@ class StabilityMap(NamedTuple):
         # The cells of a sweep that is judged linearly have the growth rates already.
         if linearly and not plane.is_linear:
             tasks = [(load, x_value, y) for load in loaders for x_value in fine.values]
-            with open_worker_pool(jobs, on, most=len(tasks)) as pool:
+            with WorkerPool.open(jobs, on, most=len(tasks)) as pool:
                 columns = iter(pool.map(_analyse_column, tasks, progress))
             # The results come in the order of the tasks, panel by panel and column by column.
             for lines in panel_lines:

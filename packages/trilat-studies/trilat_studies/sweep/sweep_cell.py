@@ -26,13 +26,11 @@ from trilat_net.analysis import (
     EndBehaviour,
     GrowthColumn,
     RunEnd,
-    RunTrace,
     Stability,
     find_run_roots,
     judge_virtual_run,
 )
 from trilat_net.execution import FusedRun
-from trilat_net.own_code import ImportedLaw
 from trilat_net.results import finite_or_none
 from trilat_net.scenario import Scenario, parse_scenario
 
@@ -320,12 +318,11 @@ class _CellInProgress:
         A lasting motion under a user's law may be a decay that is too slow to show. The roots
         of the loop, which take longer than the measurement, are computed in this case only.
         """
-        run_trace = RunTrace(self.run.buckets, self.run.tau_x, self.run.diverged_s)
-        run_end = run_trace.classify_end(self._scenario)
+        run_end = RunEnd.of_run(self.run, self._scenario)
         self._outcome = _build_result(self.run, run_end, self._totals, self._extended)
         self._is_finished = self._outcome.is_conclusive
-        has_own_law = any(isinstance(law, ImportedLaw) for law in self._scenario.controls)
-        if self._is_finished and has_own_law and run_end.stability is Stability.NOT_STABLE:
+        has_user_law = bool(self._scenario.user_laws)
+        if self._is_finished and has_user_law and run_end.stability is Stability.NOT_STABLE:
             roots = find_run_roots(self._scenario, self.run)
             self._is_finished = roots.measure_decay_misfit(run_end) > 1.0
 

@@ -25,7 +25,7 @@ from typing import Any, NamedTuple
 
 import msgspec
 
-from trilat_net.analysis import SETTLED_ERROR_RAD, LogMetrics, RunTrace, TwinGrowth
+from trilat_net.analysis import SETTLED_ERROR_RAD, LogMetrics, RunEnd, TwinGrowth
 from trilat_net.errors import (
     CodeFailed,
     CodeWithheld,
@@ -38,7 +38,6 @@ from trilat_net.errors import (
 from trilat_net.execution import FusedRun, SimulatedLog
 from trilat_net.files import make_results_folder, write_whole
 from trilat_net.net import SystemClock
-from trilat_net.own_code import list_imported_code
 from trilat_net.scenario import Scenario
 from trilat_net.work import (
     Progress,
@@ -46,9 +45,7 @@ from trilat_net.work import (
     StudyFolder,
     WorkerPool,
     Workers,
-    build_resume_hint,
     ignore_progress,
-    open_worker_pool,
 )
 from trilat_net.workers import count_cores
 
@@ -98,7 +95,7 @@ def _build_folder(path: Path, plan: SweepPlan, facts: Mapping[str, Any]) -> Swee
         facts: The plan as plain values, with the arithmetic and the versions of the program.
     """
     plan_digest = hashlib.sha256(_encode_plan(facts).encode()).hexdigest()
-    remedy = build_resume_hint("sweep", "--resume", str(path))
+    remedy = RunJournal.build_resume_hint("sweep", "--resume", str(path))
 
     def open_journal() -> RunJournal[CellRun]:
         return RunJournal(path / JOURNAL_FILE, plan_digest, CellRun, remedy)
@@ -490,7 +487,7 @@ def _measure_exponent(scenario: Scenario) -> float | None:
     """
     run = FusedRun(scenario, SETTLED_ERROR_RAD)
     run.advance_to(scenario.duration_s)
-    end = RunTrace(run.buckets, run.tau_x, run.diverged_s).classify_end(scenario)
+    end = RunEnd.of_run(run, scenario)
     twins = TwinGrowth.of_scenario(scenario, end, run.ran_s, TWINS_OF_A_CELL)
     rates_per_s = [push.rate_per_s for push in twins.pushes]
     return max(filter(math.isfinite, rates_per_s), default=None)
@@ -609,9 +606,9 @@ def run_sweep(
                 tally.note(entry)
         started_ns = clock.monotonic_ns()
         left = plan.cells * len(plan.seeds) - len(journal.done)
-        laws = list_imported_code([plan.base])
+        laws = plan.base.imported_code
         workers = on if left else None  # no cluster is needed if nothing is left to run
-        with open_worker_pool(jobs, workers, most=left, laws=laws, hint=_RESUME_HINT) as pool:
+        with WorkerPool.open(jobs, workers, most=left, laws=laws, hint=_RESUME_HINT) as pool:
             count = pool.workers
             _SweepWork(plan, journal, pool, progress, tally).execute()
         wall_s = (clock.monotonic_ns() - started_ns) * 1e-9

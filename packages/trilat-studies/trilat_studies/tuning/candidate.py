@@ -43,15 +43,14 @@ import numpy as np
 
 from trilat_net.analysis import (
     SETTLED_ERROR_RAD,
-    DominancePlan,
+    DominanceHistory,
     EndBehaviour,
     RunEnd,
     SourceRows,
     Stability,
     build_arm_rows,
-    find_hanging_sites,
 )
-from trilat_net.core import Array, DominanceMatrix
+from trilat_net.core import Array, DominanceMatrix, TorqueKind
 from trilat_net.errors import CodeFailed, ScenarioError
 from trilat_net.laws import LawSettings, TuningRun
 from trilat_net.log import Log
@@ -59,9 +58,7 @@ from trilat_net.records import NS_PER_S
 from trilat_net.scenario import (
     END_WINDOW_S,
     ExperimentText,
-    JointSpring,
     Scenario,
-    Wall,
     parse_scenario,
 )
 from trilat_net.work import MeanInterval
@@ -144,8 +141,10 @@ def build_twin(scenario: Scenario) -> Scenario | None:
     """
     sites = {}
     for name, spec in scenario.sites.items():
-        hands = tuple(hand for hand in spec.hands if isinstance(hand, JointSpring))
-        environment = tuple(part for part in spec.environment if not isinstance(part, Wall))
+        hands = tuple(hand for hand in spec.hands if hand.actor.kind is TorqueKind.HAND)
+        environment = tuple(
+            part for part in spec.environment if part.actor.kind is not TorqueKind.WALL
+        )
         sites[name] = msgspec.structs.replace(spec, hands=hands, environment=environment)
     if sites == scenario.sites:
         return None
@@ -227,13 +226,14 @@ def _list_springs(scenario: Scenario, t_s: Array) -> Iterator[_SpringHistory]:
     """
     for name, spec in scenario.sites.items():
         for hand in spec.hands:
-            if not isinstance(hand, JointSpring):
+            source = hand.actor
+            if source.kind is not TorqueKind.HAND:
                 continue
-            acts = (t_s >= hand.start_s) & (t_s < hand.end_s)
-            target_rad, _ = SourceRows(hand.actor).find_target_motion(t_s)
+            acts = (t_s >= source.start_s) & (t_s < source.end_s)
+            target_rad, _ = SourceRows(source).find_target_motion(t_s)
             yield _SpringHistory(
                 site=name,
-                stiffness_nm_rad=np.array(hand.stiffness_nm_rad),
+                stiffness_nm_rad=np.array(source.K),
                 acts=acts[:, np.newaxis].astype(np.float64),
                 target_rad=target_rad,
             )
@@ -368,7 +368,7 @@ def check_final_posture(log: Log) -> list[str]:
     for site, site_log in site_logs.items():
         in_last_second = site_log.t_s > site_log.t_s[-1] - END_WINDOW_S
         end_poses_rad[site] = site_log.q[in_last_second].mean(axis=0)
-    hanging = find_hanging_sites(log.scenario, end_poses_rad)
+    hanging = RunEnd.find_hanging_sites(log.scenario, end_poses_rad)
     if hanging:
         verb = "hangs" if len(hanging) == 1 else "hang"
         warnings.append(
@@ -646,7 +646,7 @@ def _compute_promised_motion(
     alpha = np.zeros((len(t_s), len(laws), len(laws)))
     for site, name in enumerate(scenario.names):
         peers = [scenario.names.index(peer) for peer in scenario.peers(name)]
-        alpha[:, site, peers] = DominancePlan.of_scenario(scenario, name).evaluate(t_s).alpha
+        alpha[:, site, peers] = DominanceHistory.of_scenario(scenario, name, t_s).alpha
     run = TuningRun(laws=laws, t_s=t_s, q=q, outside_nm=-tau_x, alpha=alpha)
     return laws[0].target_motion(run)
 

@@ -34,7 +34,7 @@ from trilat_net.net import SystemClock
 from trilat_net.own_code import name_law_classes
 from trilat_net.results import Result
 from trilat_net.scenario import Scenario, parse_scenario
-from trilat_net.work import Progress, Workers, ignore_progress, open_worker_pool
+from trilat_net.work import Progress, WorkerPool, Workers, ignore_progress
 from trilat_net.workers import count_cores
 
 from ..side_by_side import RunKind, prepare_kinds
@@ -505,7 +505,7 @@ class TuningPlan(NamedTuple):
         if not is_core_cached():
             # A short run compiles the simulation kernel once, before the processes start.
             FusedRun(self.base.scenario).advance_to(_PROBE_S)
-        with open_worker_pool(jobs, on, most=total) as pool:
+        with WorkerPool.open(jobs, on, most=total) as pool:
             for round_number in range(len(searches[0].rounds)):
                 proposals = [search.propose_candidates(round_number) for search in searches]
                 items_of_laws = [

@@ -1,9 +1,9 @@
-"""Computes which messages of other arms a controller used and a user saw, without a run.
+"""Computes which states of the other arms the user of an arm sees, without a run.
 
-In each control period, an arm sends its state to the other arms. These messages are delayed and
-lost at random, but the random numbers follow from a seed in the scenario, the description of
-the experiment. They can therefore be drawn again. For example, a report can show what a user
-saw although the log does not contain it.
+In each control period, an arm sends its state to the other arms. The picture that shows these
+states to a user is delayed and lost at random, but the random numbers follow from a seed in the
+scenario, the description of the experiment. They can therefore be drawn again. For example, a
+report can show what a user saw although the log does not contain it.
 
 Invariant:
     - The picture that a user sees depends only on the scenario, its seed and the number of the
@@ -11,67 +11,11 @@ Invariant:
 """
 
 from collections.abc import Mapping
-from functools import lru_cache
 
 import numpy as np
 
 from ..core import IntArray, LinkSchedule, LinkSetup, link_key
-from ..records import NS_PER_S
-from .delay_models import LinkBase
 from .scenario_types import Scenario
-
-
-@lru_cache(maxsize=256)
-def draw_used_samples(
-    link: LinkBase, key: int, receiver_hz: int, sender_hz: int, duration_s: float
-) -> IntArray:
-    """Computes which message of another arm is in use in each control period of an arm.
-
-    Messages are delayed and lost by the network link between the two arms; other links of the
-    arm are not considered. A message is called a sample.
-
-    Args:
-        link: Link over which the samples arrive.
-        key: Key of the link's random draws.
-        receiver_hz: Tick rate of the site, in Hz.
-        sender_hz: Tick rate of the peer, in Hz.
-        duration_s: Duration of the run, in s.
-
-    Returns:
-        Number of the sample in every tick, shape (ticks,). -1 before the first sample.
-    """
-    setup = LinkSetup(
-        peer="peer",
-        alpha=1.0,
-        rate_hz=sender_hz,
-        q0=(),
-        key=key,
-        models=(link.to_core_model(),),
-        traces=(link.points,),
-    )
-    used = LinkSchedule(setup).draw_run(receiver_hz, duration_s)
-    used.flags.writeable = False
-    return used
-
-
-def count_silences(used: IntArray, receiver_hz: int, silence_ns: int) -> int:
-    """Counts how often an arm receives nothing new from another arm for longer than a limit.
-
-    The time before the first message does not count.
-
-    Args:
-        used: Number of the sample in use in every tick. -1 before the first sample.
-        receiver_hz: Tick rate of the site, in Hz.
-        silence_ns: Longest time without a new sample that is not counted as a silence, in ns.
-    """
-    new_sample_ticks = np.flatnonzero(np.diff(used, prepend=-1) > 0)
-    if not len(new_sample_ticks):
-        return 0
-    gap_ticks = np.diff(new_sample_ticks, append=len(used))
-    gaps_ns = gap_ticks * NS_PER_S // receiver_hz
-    # Without a silence, the distance between new samples is one period.
-    period_ns = NS_PER_S // receiver_hz
-    return int(np.count_nonzero(gaps_ns - period_ns > silence_ns))
 
 
 class PictureDelay:

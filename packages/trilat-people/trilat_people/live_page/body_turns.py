@@ -10,8 +10,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from ..core import POSITION, Array
-from ..log import QUATERNION_AXES, QuaternionSigns
+from trilat_net.core import POSITION, Array
+from trilat_net.log import QUATERNION_AXES, QuaternionSigns
 
 
 class BodyTurns:
