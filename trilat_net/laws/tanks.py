@@ -77,8 +77,7 @@ class Tanks(EnergyLaw):
         the gravity torque of the previous control period.
 
         Args:
-            facts: Facts about the site (the process that runs the arm) that are known before
-                the run.
+            facts: Facts about the site that are known before the run.
         """
         # Whether the tank limits the torque, as a bool of this instance.
         self.guarded = bool(self.guarded)
@@ -169,7 +168,7 @@ class Tanks(EnergyLaw):
           come from the tank, so it is subtracted from the torque.
 
         Args:
-            seen: Records of the site (the process that runs the arm) in the run.
+            seen: Records of the site in the run.
 
         Returns:
             The energy sent to each peer (`gave`) and received from it (`took`), the energy that

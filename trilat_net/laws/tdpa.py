@@ -765,8 +765,7 @@ class Tdpa(EnergyLaw):
         index j n + i, where n is the number of joints.
 
         Args:
-            facts: Facts about the site (the process that runs the arm) that are known before
-                the run.
+            facts: Facts about the site that are known before the run.
         """
         n = facts.joints
         couplings = n * len(facts.peers)

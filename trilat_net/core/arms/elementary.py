@@ -1,17 +1,17 @@
-"""Computes sine, cosine and hyperbolic tangent with the same bits on every machine.
+"""Sine, cosine and hyperbolic tangent with bit-identical results on every machine.
 
-The functions of the C library differ in the last bit from one platform to the next. A run that
-is executed again from its log on another machine would then differ too. The functions of this
-module give the same bits everywhere.
+The functions of the C library differ in the last bit between platforms, so a run repeated from
+its log on another machine would differ too. The functions of this module give the same bits
+everywhere.
 
 - The angle is reduced by multiples of pi/2, which is stored in three parts (Cody and Waite,
   "Software Manual for the Elementary Functions", 1980).
-- The polynomials of sine and cosine, for up to an eighth of a turn in either direction, and the
-  rational functions of the hyperbolic tangent are those of S. Moshier's Cephes library.
+- The polynomials for sine and cosine, valid up to an eighth of a turn in either direction, and
+  the rational functions for the hyperbolic tangent are those of S. Moshier's Cephes library.
 
 Invariant:
-    - All results are sums, products and quotients in a fixed order, without the mathematics
-      library of the platform. An arm therefore moves alike on each machine with IEEE doubles.
+    - All results are sums, products and quotients in a fixed order. The platform's mathematics
+      library is not used. An arm therefore moves identically on all machines with IEEE doubles.
 """
 
 import math
@@ -30,11 +30,11 @@ LARGEST_RAD = 2.0**30
 
 @leaf
 def sincos(x: float) -> tuple[float, float]:
-    """Computes the sine and the cosine of an angle in rad, with equal bits on every machine.
+    """Computes the sine and cosine of an angle in rad, bit-identical on every machine.
 
-    The absolute error is at most 2^-52. For angles beyond 1e5 rad, the rounding of the angle
-    itself causes an error of similar size. Both results are NaN if the angle is not finite or
-    is beyond `LARGEST_RAD`.
+    The absolute error is at most 2^-52. Beyond 1e5 rad, rounding of the angle itself causes an
+    error of similar size. Both results are NaN if the angle is not finite or its magnitude
+    exceeds `LARGEST_RAD`.
     """
     # The nearest quarter turn, and the angle y from there. `round_down` returns a float, so
     # that computing y need not wait for conversions to an integer and back.
@@ -79,7 +79,7 @@ _LARGE = 20.0
 
 @leaf
 def tanh(x: float) -> float:
-    """Returns the hyperbolic tangent, with equal bits on every machine; NaN for NaN.
+    """Returns the hyperbolic tangent, bit-identical on every machine (NaN for NaN).
 
     The error is at most two units in the last place. The method and the coefficients of all
     polynomials are those of Cephes (`tanh` and `exp`). Arguments with |x| < 0.625 use a

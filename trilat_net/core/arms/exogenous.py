@@ -1,18 +1,18 @@
-"""Computes the torques that operators and environments exert on an arm.
+"""Torques that operators and environments exert on an arm.
 
-An operator is a human or a program that moves the arm, for example a model of a human hand. An
-environment is, for example, a wall that the arm touches. The code calls both of them actors,
-because their torque is computed in the same way.
+An operator is a person or program that moves the arm, for example a model of a human hand. An
+environment is an object that the arm touches, for example a wall. The code calls both of them
+actors, because their torques are computed in the same way.
 
 Sign: This module computes the torque ON the arm. Records and the equations of the control laws
-use tau_x, the negative of this torque. The total torque of the joints is tau - tau_x, where tau
-is the torque of the motors.
+use tau_x, the negative of this torque. The total joint torque is tau - tau_x, where tau is the
+motor torque.
 
 Invariant:
-    - The torque depends on time and on the state of the arm. Therefore it is computed anew at
-      each evaluation of the integrator, several times per period of the control loop.
-    - An actor that is marked `sampled` is evaluated once per period, and its torque is then
-      constant. A digital haptic device renders a wall in this way.
+    - The torque depends on time and on the state of the arm. It is therefore recomputed at each
+      evaluation of the integrator, several times per control period.
+    - An actor marked as `sampled` is evaluated once per period, and its torque is then held
+      constant. This is how a digital haptic device renders a wall.
 """
 
 import math
@@ -34,18 +34,17 @@ from .two_link_arm import end_effector_jacobian, forward_kinematics
 class TorqueKind(IntEnum):
     """The kinds of operators and environments.
 
-    - PULSE is a scripted torque, smooth at both ends.
-    - HAND and TASK_HAND are a spring and a damper towards a target that moves along a
-      minimum-jerk path, of the joints or of the end effector.
+    - PULSE is a scripted torque with a smooth start and end.
+    - HAND and TASK_HAND are a spring and a damper that pull the joints or the end effector
+      towards a target on a minimum-jerk path.
     - RECORDED interpolates a table of torques.
-    - VISCOUS resists motion of the joints.
+    - VISCOUS damps the motion of the joints.
     - WALL pushes the end effector out of a half-space, and never pulls.
-    - CHIRP is a sine whose frequency changes linearly with time, in repeated sweeps.
-    - MULTISINE is a sum of sines with the same amplitude.
-    - OWN_JOINTS and OWN_TIP call a user's compiled function, of the joints or of the end
-      effector.
-    - LIVE_TIP and LIVE_JOINT are a spring and a damper towards a target that a person moves
-      during the run; LIVE_FORCE is a force that a person sets, see `live_hand`.
+    - CHIRP is a repeated sweep: a sine whose frequency changes linearly with time.
+    - MULTISINE is a sum of sines of equal amplitude.
+    - OWN_JOINTS and OWN_TIP call a user's compiled function for the joints or the end effector.
+    - LIVE_TIP and LIVE_JOINT are a spring and a damper that pull towards a target moved by a
+      person during the run. LIVE_FORCE is a force set by a person. See `live_hand`.
     """
 
     PULSE = 0
@@ -76,36 +75,35 @@ OWN_KINDS = (TorqueKind.OWN_JOINTS, TorqueKind.OWN_TIP)
 
 
 class TorqueSource(NamedTuple):
-    """Settings of one operator or environment, which exerts a torque on an arm.
+    """Settings of one operator or environment that exerts a torque on an arm.
 
-    An operator is a model of a person who moves the arm, and an environment a wall or a damper.
-    `kind` decides which of the other settings are used, and what the vectors `a` and `b` mean.
-    For a wall, for example, they are a point and a normal; for an operator, start and target.
+    `kind` determines which of the other settings are used, and what the vectors `a` and `b`
+    mean. For a wall they are a point and a normal; for an operator, the start and the target.
 
     Attributes:
         kind: The kind of operator or environment.
         start_s: Start of the action, s since the start of the session.
         end_s: End of the action, s.
-        move_start_s: Start of the target's motion, s; CHIRP: start of the first sweep.
-        move_end_s: End of the target's motion, s; CHIRP: end of the first sweep.
+        move_start_s: Start of the target's motion, s. CHIRP: start of the first sweep.
+        move_end_s: End of the target's motion, s. CHIRP: end of the first sweep.
         a: PULSE, CHIRP: peak, N m. MULTISINE: amplitude of each sine, N m. HAND, TASK_HAND:
             target before the motion, rad or m. WALL: a point of the wall, m. Live hand: target
             or force.
-        b: HAND, TASK_HAND: target after the motion. WALL: the normal that points away from the
-            wall, length 1. CHIRP: frequencies at the start and the end of a sweep, Hz. Live
-            hand: Position of the target one second later.
-        K: Stiffness: HAND N m/rad, TASK_HAND N/m per axis, WALL N/m (first number).
+        b: HAND, TASK_HAND: target after the motion. WALL: unit normal, pointing away from the
+            wall. CHIRP: frequencies at the start and the end of a sweep, Hz. Live hand:
+            position of the target one second later.
+        K: Stiffness: HAND N m/rad, TASK_HAND N/m per axis, WALL N/m (first element).
         B: Damping: HAND and VISCOUS N m s/rad, TASK_HAND N s/m per axis, WALL N s/m (first
-            number).
-        sampled: True if the torque is evaluated once per tick (period of the control loop), and
-            constant until the next tick.
+            element).
+        sampled: True if the torque is evaluated once per tick and held constant until the next
+            tick.
         table: RECORDED: rows of time, s, and torque ON each joint, N m, shape (rows, 1 + n).
-            MULTISINE: Rows of frequency, Hz, and phase at the start, turns; further columns are
-            not used.
+            MULTISINE: rows of frequency, Hz, and initial phase, turns; any further columns are
+            ignored.
         limit: Live hand: the largest norm of its force, N, or torque, N m.
-        grip: Live hand: factor of its force, 0 to 1.
-        model: User's kind: the object with its parameters and its function `act`, see
-            `plugged`.
+        grip: Live hand: factor applied to its force, 0 to 1.
+        model: User-defined kind: the object that holds the parameters and the function `act`.
+            See `plugged`.
     """
 
     kind: TorqueKind
@@ -130,17 +128,16 @@ _NUMBERS = ("a", "b", "K", "B")
 
 @cache
 def torque_source_dtype(width: int) -> np.dtype[np.void]:
-    """Returns the NumPy data type that stores the parameters of an operator or an environment.
+    """Returns the NumPy dtype of the parameters of an operator or environment.
 
-    There is one row per operator or environment. It contains the fields of `TorqueSource`, and
-    in addition:
+    A row contains the fields of `TorqueSource` and the following:
 
     - `table_first` and `table_count` select the rows of the common table that belong to this
       operator or environment: recorded torques, sines, or parameters of a user's function.
-    - The other additional fields serve a function that a user wrote. `call` is its address. The
-      function reads its input from `t_s` (time since the start of the session, s),
-      `coordinates` (their number), `at` (position of the arm, rad or m) and `speed` (derivative
-      of `at`), and writes the force or torque into `effort`, N or N m.
+    - `call` is the address of a function written by a user. The function reads its input from
+      `t_s` (time since the start of the session, s), `coordinates` (their number), `at`
+      (position of the arm, rad or m) and `speed` (derivative of `at`), and writes the force or
+      torque into `effort`, N or N m.
 
     Args:
         width: Largest length of the vectors of all operators and environments.
@@ -177,21 +174,19 @@ _LIVE_TIP, _LIVE_FORCE, _LIVE_JOINT = map(int, LIVE_KINDS)
 def torque_source_rows(
     actors: tuple[TorqueSource, ...], joints: int = 2, axes: int = 2
 ) -> tuple[TorqueSourceRows, TorqueTable]:
-    """Converts operators and environments to two NumPy arrays, which compiled code can read.
+    """Converts operators and environments to two NumPy arrays that compiled code can read.
 
-    An operator is a model of a person who moves an arm, and an environment a wall or a damper.
     Compiled code cannot read Python objects. Lists of different lengths, such as recorded
-    torques, are joined into one table.
+    torques, are concatenated into one table.
 
     Args:
-        actors: Operators and environments of the arm, one row for each.
+        actors: Operators and environments of the arm.
         joints: Number of joints of the arm.
         axes: Number of Cartesian axes: 2 for the planar arm, 3 for a chain of joints.
 
     Returns:
-        An array with one row per operator or environment, and a table. The table contains
-        recorded torques and other lists of numbers. A row states which rows of the table belong
-        to it.
+        An array with one row per operator or environment, and the common table of recorded
+        torques and other lists. Each row states which rows of the table belong to it.
     """
     width = 1 + joints
     rows = np.zeros(len(actors), torque_source_dtype(max(joints, axes)))
@@ -232,7 +227,7 @@ def torque_source_rows(
 
 @leaf
 def minimum_jerk(t_s: float, start_s: float, end_s: float) -> Pair:
-    """Returns the progress of a minimum-jerk motion, as smooth as the motion of a human arm.
+    """Returns the progress of a minimum-jerk motion, which is as smooth as a human reach.
 
         10 x^3 - 15 x^4 + 6 x^5,    x = (t - start) / (end - start)
 
@@ -537,7 +532,6 @@ def _is_at_end_effector(actor: Row) -> bool:
 def _call_user_function(actor: Row, t_s: float, table: TorqueTable) -> None:
     """Calls the compiled function of an operator or environment that a user wrote.
 
-    An operator is a model of a person who moves an arm, and an environment a wall or a damper.
     The program and the function exchange values through the fields of the row `actor`. The
     program has written the position (`at`) and the velocity (`speed`) before the call, and has
     set `effort` to zero. The function writes the resulting torque or force into `effort`.
@@ -618,8 +612,7 @@ def source_torque(
 ) -> SourceTorque:
     """Computes the joint torque that one operator or environment exerts on the planar arm.
 
-    An operator is a model of a person who moves the arm, and an environment a wall or a damper.
-    A force at the end effector is converted to joint torques by the transposed Jacobian.
+    A force at the end effector is mapped to joint torques by the transposed Jacobian.
 
     Args:
         t_s: Time since the start of the session, s.
@@ -627,11 +620,11 @@ def source_torque(
         qd: Joint velocities, rad/s.
         lengths: Lengths of the two links, m.
         actor: Parameters of the operator or environment.
-        table: Recorded torques and other numbers of all operators and environments.
+        table: Recorded torques and other data of all operators and environments.
 
     Returns:
-        The torques on the two joints, N m, and the force of the wall, N. The force is 0 if the
-        environment is not a wall.
+        The torques on the two joints, N m, and the force exerted by the wall, N (0 if the
+        environment is not a wall).
     """
     is_active = actor.start_s <= t_s < actor.end_s
     if not is_active:
@@ -671,21 +664,19 @@ def add_source_torque(
 ) -> SourceTorque:
     """Adds the joint torque of one operator or environment to a running sum.
 
-    An operator is a model of a person who moves the arm, and an environment a wall or a damper.
-
     Args:
-        total: Torque on the joints so far, N m, and the largest force of a wall so far, N.
+        total: Sum of the joint torques so far, N m, and the largest wall force so far, N.
         t_s: Time since the start of the session, s.
         q: Joint angles, rad.
         qd: Joint velocities, rad/s.
         lengths: Lengths of the two links, m.
         actor: Parameters of the operator or environment.
-        table: Recorded torques and other numbers of all operators and environments.
-        sampled: 1 to add the torque only if it is constant during a control period (sampled). 0
-            to add it only if it acts continuously.
+        table: Recorded torques and other data of all operators and environments.
+        sampled: 1 to add the torque only if the actor is sampled (held constant during a
+            control period), 0 to add it only if the actor acts continuously.
 
     Returns:
-        The new total. It equals `total` if `sampled` excludes the actor.
+        The new total, equal to `total` if `sampled` excludes the actor.
     """
     if actor.sampled != sampled:
         return total
@@ -705,22 +696,20 @@ def torque_on_arm(
 ) -> SourceTorque:
     """Computes the joint torque that all operators and environments exert on the planar arm.
 
-    An operator is a model of a person who moves the arm, and an environment a wall or a damper.
-    Some are sampled: their torque is evaluated once per period of the control loop and constant
-    until the next period. One call computes the torque of either the sampled ones or all
-    others.
+    Some of them are sampled: their torque is evaluated once per control period and held
+    constant. All others act continuously. One call covers one of the two groups.
 
     Args:
         t_s: Time since the start of the session, s.
         q: Joint angles, rad.
         qd: Joint velocities, rad/s.
         lengths: Lengths of the two links, m.
-        actors: Operators and environments, one row for each.
-        table: Recorded torques and other numbers of all actors.
+        actors: Operators and environments, one row each.
+        table: Recorded torques and other data of all actors.
         sampled: 1 for the torque of the sampled actors, 0 for all others.
 
     Returns:
-        The torques on the two joints, N m, and the largest force of a wall, N.
+        The torques on the two joints, N m, and the largest wall force, N.
     """
     total = NO_TORQUE
     for n in range(actors.shape[0]):
@@ -891,25 +880,23 @@ def put_torque_on_chain(
 ) -> float:
     """Computes the joint torque that operators and environments exert on a chain of joints.
 
-    An operator is a model of a person who moves the arm, and an environment a wall or a damper.
-    Some are sampled: their torque is evaluated once per period of the control loop and constant
-    until the next period. One call computes the torque of either the sampled ones or all
-    others.
+    Some of them are sampled: their torque is evaluated once per control period and held
+    constant. All others act continuously. One call covers one of the two groups.
 
     Args:
         t_s: Time since the start of the session, s.
         q: Joint positions, shape (n,), rad or m.
         qd: Joint velocities, shape (n,), rad/s or m/s.
         tip: Position of the end effector in the last link's frame, m.
-        chain: Data of the n joints, one row per joint. `place_joints` must have been called for
-            the same positions.
-        actors: Operators and environments, one row for each.
-        table: Recorded torques and other numbers of all actors.
+        chain: Joint data, one row per joint. `place_joints` must have been called for the same
+            positions.
+        actors: Operators and environments, one row each.
+        table: Recorded torques and other data of all actors.
         sampled: 1 for the torque of the sampled actors, 0 for all others.
         torque: Receives the torque on the arm, shape (n,), N m.
 
     Returns:
-        The largest force of a wall, N. 0 if no wall is touched.
+        The largest wall force, N (0 if no wall is touched).
     """
     n = chain.shape[0]
     for i in range(n):

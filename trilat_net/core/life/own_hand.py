@@ -130,9 +130,8 @@ class HandProgram(Protocol):
 class OwnHand:
     """Runs a user's program that moves an arm during a simulation or a live session.
 
-    At regular times, the program gets a view of what the site (the process that runs the arm)
-    knows, and decides where to pull the arm. The decision acts after a delay, like the reaction
-    time of a person.
+    At regular times, the program gets a view of what the site knows, and decides where to pull
+    the arm. The decision acts after a delay, like the reaction time of a person.
 
     Args:
         rules: Limits of the program's actions.
@@ -183,7 +182,7 @@ class OwnHand:
 
         Args:
             k: Control period of the decision. Its results have not been computed yet.
-            arrays: State of the site (the process that runs the arm) after the previous period.
+            arrays: State of the site after the previous period.
             layout: Lengths of the site's vectors.
         """
         # NumPy reads fields of plain arrays faster than those of records.

@@ -1,8 +1,8 @@
 """Brings an arm to rest where it is, and keeps it there.
 
-An arm rests while its site (the process that runs the arm) waits for other sites, is stopped,
-or has a fault. Each joint follows a reference, the position q_ref with the velocity qd_ref,
-which slows down smoothly to zero.
+An arm rests while its site waits for other sites, is stopped, or has a fault. Each joint
+follows a reference, the position q_ref with the velocity qd_ref, which slows down smoothly to
+zero.
 
 Reference: It starts at the angle q and the velocity qd of the joint. In each period h of the
 control loop, its speed falls by the factor
@@ -23,9 +23,9 @@ terms are added:
 - B is the damping in N m s/rad, and k = 1 / (4 `RestGains.time_s`). Lambda is the convergence
   rate, in 1/s: the rate of the adaptive law in joint space, otherwise `REST_RATE_1_S`.
 - w carries a constant load, for example unknown gravity. It starts as the difference between
-  the last torque and the torque of the law for the rest reference, times
-  1 - max B |qd| / tau_limit. While the arm brakes, w loses B |qd| in each period in which it
-  acts in the direction of motion.
+  the last torque and the torque of the law for the rest reference, times 1 - max B |qd| /
+  tau_limit. While the arm brakes, w loses B |qd| in each period in which it acts in the
+  direction of motion.
 
 An arm is fast while B |qd| of some joint exceeds its torque limit `tau_limit`. The limit on the
 rate of the torque does not delay braking: against the motion, the torque may change by B |qd|
@@ -135,7 +135,7 @@ def enter_rest(t_ns: int, mode: int, reason: int, site: SiteRow) -> None:
         t_ns: Time, ns since the epoch, the common start of the session.
         mode: The mode to enter.
         reason: Reason of the change of mode, a `LifeReason`.
-        site: State of the site (the process that runs the arm); changed.
+        site: State of the site; changed.
     """
     failed = reason == _NOT_FINITE or site.reason == _NOT_FINITE
     keeps_reference = rests(site) and not failed
@@ -172,7 +172,7 @@ def _write_rest_reference(site: SiteRow, i: int, q: float, qd: float) -> None:
     joints need `q_rest` and `qd_rest`. `_read_rest_reference` reads the same fields.
 
     Args:
-        site: State of the site (the process that runs the arm); changed.
+        site: State of the site; changed.
         i: Index of the joint.
         q: Position of the reference, rad.
         qd: Velocity of the reference, rad/s.
@@ -194,8 +194,7 @@ def _find_remaining_s(elapsed_s: float, site: SiteRow) -> float:
 
     Args:
         elapsed_s: Time since the start of the rest, s.
-        site: State of the site (the process that runs the arm), with the velocity of the
-            reference.
+        site: State of the site, with the velocity of the reference.
     """
     remaining_s = LEAST_STOP_S - elapsed_s
     for i in range(site.joints):
@@ -213,8 +212,8 @@ def advance_rest_reference(t_ns: int, ticks: int, site: SiteRow) -> None:
 
     Args:
         t_ns: Time of the present period of the control loop, ns since the start of the session.
-        ticks: Number of periods since the last call. It is more than 1 if the site (the process
-            that runs the arm) was too slow and missed periods.
+        ticks: Number of periods since the last call. It is more than 1 if the site was too slow
+            and missed periods.
         site: State of the site; the reference is changed.
     """
     if t_ns == site.return_from_ns:
@@ -263,8 +262,8 @@ def _brakes(t_ns: int, site: SiteRow) -> bool:
 
     Args:
         t_ns: Time, ns since the epoch, the common start of the session.
-        site: State of the site (the process that runs the arm). While the arm is at rest,
-            `return_from_ns` is the start of the rest.
+        site: State of the site. While the arm is at rest, `return_from_ns` is the start of the
+            rest.
     """
     elapsed_ns = t_ns - site.return_from_ns
     brakes = elapsed_ns < LEAST_STOP_S * NS_PER_S or _is_fast(site)
@@ -289,8 +288,8 @@ def put_rest_reference(site: SiteRow, q: Array, qd: Array) -> None:
     resting arm.
 
     Args:
-        site: State of the site (the process that runs the arm). `task` is 1 in task space, and
-            0 in joint space. `felt`, the weighted forces on the other arms, is cleared.
+        site: State of the site. `task` is 1 in task space, and 0 in joint space. `felt`, the
+            weighted forces on the other arms, is cleared.
         q: Receives the reference, one number per coordinate, rad or m.
         qd: Receives the velocity of the reference, rad/s or m/s.
     """
@@ -359,8 +358,8 @@ def add_rest_torque(k: int, t_ns: int, site: SiteRow) -> None:
     Args:
         k: Number of the control period.
         t_ns: Time of the period, ns since the start of the session.
-        site: State of the site (the process that runs the arm); changed. `tau_held` is w, and
-            `return_from_ns` the start of the rest.
+        site: State of the site; changed. `tau_held` is w, and `return_from_ns` the start of the
+            rest.
     """
     starts_to_rest = t_ns == site.return_from_ns
     brakes = _brakes(t_ns, site)
@@ -404,9 +403,9 @@ def advance_rest(site: SiteRow) -> None:
     part. Otherwise it would grow without effect (windup).
 
     Args:
-        site: State of the site (the process that runs the arm). For each joint, `tau_held` is w
-            in N m, which is changed, and `integral` is k B in N m/rad. `u` is the torque before
-            its limits and `tau` after them, N m.
+        site: State of the site. For each joint, `tau_held` is w in N m, which is changed, and
+            `integral` is k B in N m/rad. `u` is the torque before its limits and `tau` after
+            them, N m.
     """
     for i in range(site.joints):
         slip = _find_slip(site, i)
@@ -426,7 +425,7 @@ def limit_torque_rate(site: SiteRow) -> None:
     rest in N m s/rad, and qd the velocity of the joint in rad/s.
 
     Args:
-        site: State of the site (the process that runs the arm); its torque `tau` is limited.
+        site: State of the site; its torque `tau` is limited.
     """
     braking = rests(site)
     for i in range(site.joints):

@@ -35,7 +35,7 @@ def limit_reference(k: int, site: SiteRow) -> None:
 
     Args:
         k: Number of the tick (control period).
-        site: State of the site (the process that runs the arm), whose reference is changed.
+        site: State of the site, whose reference is changed.
     """
     if k == site.first:
         for i in range(site.shared):
@@ -70,10 +70,10 @@ def _limit_turn(site: SiteRow) -> None:
     of the shortened turn.
 
     Args:
-        site: State of the site (the process that runs the arm). Its coordinates 0 to 2 are a
-            position, and 3 to 5 a rotation vector in rad. `q_followed` is the reference in the
-            previous tick. `q_des` and `qd_des`, the new reference and its velocity, are
-            limited. `qd_des_limit` contains the limits of the velocity, rad/s.
+        site: State of the site. Its coordinates 0 to 2 are a position, and 3 to 5 a rotation
+            vector in rad. `q_followed` is the reference in the previous tick. `q_des` and
+            `qd_des`, the new reference and its velocity, are limited. `qd_des_limit` contains
+            the limits of the velocity, rad/s.
     """
     vector_before = read_three(site.q_followed[3:])
     orientation_before = rotation_matrix(vector_before)
@@ -122,7 +122,7 @@ def return_to_law(t_ns: int, site: SiteRow) -> None:
 
     Args:
         t_ns: Time, ns since the epoch, the common start of the session.
-        site: State of the site (the process that runs the arm), whose torque `tau` is changed.
+        site: State of the site, whose torque `tau` is changed.
     """
     elapsed_s = (t_ns - site.return_from_ns) * 1e-9
     progress = min(elapsed_s / BLEND_S, 1.0)

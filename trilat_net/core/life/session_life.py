@@ -136,10 +136,9 @@ def _alignment_s(site: SiteRow) -> float:
     the offset is no faster than the limit `align_speed`. T is at least MIN_ALIGN_NS.
 
     Args:
-        site: State of the site (the process that runs the arm). `q_held` is the start value of
-            the offset, rad or m. For a pose, its last three coordinates are a rotation vector,
-            rad. `align_speed` applies to each linear coordinate, rad/s or m/s, and to the angle
-            of the rotation, rad/s.
+        site: State of the site. `q_held` is the start value of the offset, rad or m. For a
+            pose, its last three coordinates are a rotation vector, rad. `align_speed` applies
+            to each linear coordinate, rad/s or m/s, and to the angle of the rotation, rad/s.
     """
     longest_distance = 0.0
     for i in range(count_linear_coordinates(site)):
@@ -280,7 +279,7 @@ def latch_mode(t_ns: int, site: SiteRow, mode: int, reason: int) -> None:
 
     Args:
         t_ns: Time, ns since the epoch, the common start of the session.
-        site: State of the site (the process that runs the arm); changed.
+        site: State of the site; changed.
         mode: The mode to enter.
         reason: Reason of the change of mode, a `LifeReason`.
     """
@@ -320,8 +319,7 @@ def _apply_order(t_ns: int, site: SiteRow) -> None:
 
     Args:
         t_ns: Time, ns since the epoch, the common start of the session.
-        site: State of the site (the process that runs the arm), with the order and the number
-            of missed ticks.
+        site: State of the site, with the order and the number of missed ticks.
     """
     order = site.order
     skipped = site.skipped
@@ -466,8 +464,8 @@ def _find_offset(t_ns: int, duration_s: float, site: SiteRow, i: int) -> tuple[f
     Args:
         t_ns: Time, ns since the epoch, the common start of the session.
         duration_s: Duration T of the alignment, s.
-        site: State of the site (the process that runs the arm). The alignment started at
-            `return_from_ns`, with D in `q_held` and D' in `qd_held`.
+        site: State of the site. The alignment started at `return_from_ns`, with D in `q_held`
+            and D' in `qd_held`.
         i: Index of the coordinate.
 
     Returns:

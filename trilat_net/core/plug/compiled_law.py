@@ -97,8 +97,7 @@ def finish_law(s: Row, law: Array, sent: Array) -> None:
     """Checks the results of a user's control law, and limits its torque to the motors' range.
 
     Args:
-        s: State of the site (the process that runs the arm), with the torque and the estimate;
-            the torque is limited.
+        s: State of the site, with the torque and the estimate; the torque is limited.
         law: Memory and gains of the law. The memory, which the law keeps from tick to tick
             (control period), comes first and is checked too.
         sent: Vectors that the law sends to other arms.
@@ -139,7 +138,7 @@ def law_stage(
         t_ns: Nominal time of the tick, ns since the epoch, the common start of the session.
         address: Address of the law's machine code.
         law: Memory of the law, which it keeps from tick to tick, and its gains; changed.
-        site: State of the site (the process that runs the arm), in which the torque is written.
+        site: State of the site, in which the torque is written.
         links: State of each link from another site, one row per link.
         chain: Data of the joints, one row per joint. None for the planar two-link arm.
         channel: Vectors that the peers' laws sent.
@@ -217,7 +216,7 @@ def collect_law_input(s: Row, links: Any, received: Any, sent: Any, to_all: Any)
     every period.
 
     Args:
-        s: State of the site (the process that runs the arm).
+        s: State of the site.
         links: State of each link, one row per peer.
         received: Vectors that came from each peer.
         sent: Vectors that go to each peer alone.
@@ -576,7 +575,7 @@ class CompiledLaw:
         """Computes the torque of one control period by a call of the compiled law.
 
         The torque and the vectors that the law sends to other sites are written into the arrays
-        of this site (the process that runs the arm).
+        of this site.
 
         Args:
             k: Number of the control period.

@@ -40,7 +40,7 @@ def _update_model(s: Row, chain: RowArray | None) -> None:
     even without acceleration.
 
     Args:
-        s: State of the site (the process that runs the arm).
+        s: State of the site.
         chain: Data of the joints, one row per joint. None for the planar two-link arm.
     """
     if chain is None:
@@ -61,7 +61,7 @@ def update_law_view(
     Args:
         k: Number of the control period.
         t_ns: Nominal time of the period, ns since the start of the session.
-        site: State of the site (the process that runs the arm), shape (1,); written.
+        site: State of the site, shape (1,); written.
         links: States of the links from the other sites, one row per link; written.
         chain: Data of the joints, one row per joint. None for the planar two-link arm.
     """
@@ -169,7 +169,7 @@ class PlainLaw:
         """Computes the torque of one control period by a call of the user's law.
 
         The torque, the parameter estimate and the vectors for other sites are written into the
-        arrays of this site (the process that runs the arm).
+        arrays of this site.
 
         Args:
             k: Number of the control period.
