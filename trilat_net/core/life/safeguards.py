@@ -1,16 +1,15 @@
-"""Limits the speed of the position that an arm follows, and avoids a jump of the torque.
+"""Limits the speed of the reference, and prevents jumps of the torque.
 
 A network fault or a sudden motion of another arm must not make an arm jump.
 
-- `limit_reference` limits the speed of the reference, the position at which the control law
-  aims.
-- `return_to_law` is used when an arm begins to move after a rest. It changes the torque
-  gradually from the torque that held the arm to the torque of the control law.
+- `limit_reference` limits the speed of the reference that the control law follows.
+- `return_to_law` is used when a resting arm begins to move. It blends from the torque that held
+  the arm to the torque of the control law.
 
 Invariant:
 
-- The reference moves no faster than its speed limit, whatever the other arms do.
-- A reference without a speed limit is not changed.
+- The reference never moves faster than its speed limit, whatever the other arms do.
+- A reference without a speed limit is not modified.
 """
 
 from math import inf, isfinite
@@ -29,13 +28,13 @@ BLEND_S = 0.1
 def limit_reference(k: int, site: SiteRow) -> None:
     """Limits the speed of the reference, the position that the arm follows.
 
-    The reference moves from its value in the previous tick (period of the control loop) by at
-    most the permitted step. A reference that was held back catches up later. At the first tick
-    it starts from the pose of the arm.
+    Starting from its value in the previous tick, the reference moves by at most the permitted
+    step. If the limit has delayed it, it catches up later. In the first tick, it starts at the
+    pose of the arm.
 
     Args:
-        k: Number of the tick (control period).
-        site: State of the site, whose reference is changed.
+        k: Number of the tick.
+        site: State of the site, whose reference is modified.
     """
     if k == site.first:
         for i in range(site.shared):
@@ -102,10 +101,10 @@ def _limit_turn(site: SiteRow) -> None:
 
 @leaf
 def is_torque_finite(site: SiteRow) -> bool:
-    """Returns True if the torque of each joint that the control law wrote is finite.
+    """Returns True if the control law wrote a finite torque for every joint.
 
-    The torque is NaN before the law is called. Therefore the function also notices a law that
-    wrote no torque at all.
+    The torque is set to NaN before the law is called, so a law that writes no torque is also
+    detected.
     """
     finite = True
     for i in range(site.joints):
@@ -117,12 +116,11 @@ def is_torque_finite(site: SiteRow) -> bool:
 def return_to_law(t_ns: int, site: SiteRow) -> None:
     """Blends from the torque that held an arm at rest to the torque of its control law.
 
-    The blend is linear and takes BLEND_S, because a sudden change of torque would make the arm
-    jerk.
+    The blend is linear and takes BLEND_S. A sudden change of torque would make the arm jerk.
 
     Args:
-        t_ns: Time, ns since the epoch, the common start of the session.
-        site: State of the site, whose torque `tau` is changed.
+        t_ns: Time, ns since the start of the session.
+        site: State of the site, whose torque `tau` is modified.
     """
     elapsed_s = (t_ns - site.return_from_ns) * 1e-9
     progress = min(elapsed_s / BLEND_S, 1.0)

@@ -1,39 +1,38 @@
 """Decides when an arm waits, follows other arms, comes to rest, or stops after a fault.
 
-A site is a process that runs one arm, and its peers are the other sites, whose states it
-receives. A peer is heard while its states arrive, and silent otherwise. The rules of this
-module are called `glide`. They let an arm start and stop smoothly when its peers appear or fall
-silent. A site has one of these modes:
+A peer is heard while its samples arrive, and silent otherwise. The rules of this module, called
+`glide`, make an arm start and stop smoothly when its peers appear or fall silent. A site is
+always in one of these modes:
 
-- WAITING: The arm is at rest, until all peers that it follows are heard. Then the mode becomes
+- WAITING: The arm rests until all peers that it follows are heard. Then the mode becomes
   RETURN.
-- RETURN: The arm moves smoothly to the peers. After that, the mode becomes RUN.
-- RUN: The arm follows the peers. If a peer that it follows falls silent, the mode becomes
-  HOLD.
+- RETURN: The arm aligns smoothly with the peers. Then the mode becomes RUN.
+- RUN: The arm follows the peers. If a peer that it follows falls silent, the mode becomes HOLD.
 - HOLD: The arm comes to rest. If all peers are heard again, the mode becomes RETURN.
-- FAULT: A limit was exceeded, a number was not finite, or the arm was lost. The arm comes to
-  rest. Only the order RESET leads back to WAITING.
-- STOPPED: The arm was stopped by order, or its dead-man switch was released. The arm comes to
-  rest. The order ENABLE leads back to WAITING. If the switch was the only cause, holding the
-  switch again does so too.
+- FAULT: A limit was exceeded, a value was not finite, or the connection to the arm was lost.
+  The arm comes to rest. Only the RESET command leads back to WAITING.
+- STOPPED: The arm was stopped by a command, or its dead-man switch was released. The arm comes
+  to rest. The ENABLE command leads back to WAITING, and so does holding the switch again if its
+  release was the only cause.
 
-The reference of a site is the position that its arm follows. In RUN, it is the weighted mean of
-the positions of the peers. In RETURN, an offset is added, which falls from its start value D to
-zero within the time T:
+The reference of a site is the position that its arm follows. In RUN, the reference is the
+weighted mean of the peers' positions. In RETURN, an offset is added that decays from its
+initial value D to zero within the time T:
 
     offset(x) = D (1 - 3 x^2 + 2 x^3) + T D' x (1 - x)^2,    x = t / T from 0 to 1
     T = max(MIN_ALIGN_NS, 1.5 |D| / align_speed)
 
-Here t is the time since the start of RETURN, and D' the start value of the rate of the offset.
-The factor 1.5 is the largest slope of the polynomial. Therefore the offset is no faster than
-`align_speed`, apart from the effect of D'. For an orientation, the offset is a rotation vector.
+Here t is the time since the start of RETURN, and D' the initial rate of the offset. The factor
+1.5 is the maximum slope of the polynomial, so the offset changes no faster than `align_speed`,
+apart from the effect of D'. For an orientation, the offset is a rotation vector.
 
 Invariant:
-    - In WAITING, HOLD, STOPPED and FAULT, the arm comes to rest in the same way, see `resting`.
-    - In RETURN and RUN neither the reference nor its velocity jumps, and the velocity is always
-      the derivative of the reference.
-    - A peer that is at rest is followed like any other peer.
-    - Messages of peers neither cause nor end FAULT and STOPPED.
+    - In WAITING, HOLD, STOPPED and FAULT, the arm comes to rest in the same way (see
+      `resting`).
+    - In RETURN and RUN, neither the reference nor its velocity jumps, and the velocity is
+      always the derivative of the reference.
+    - A resting peer is followed like any other peer.
+    - Messages from peers neither cause nor end FAULT and STOPPED.
 """
 
 from math import isfinite
@@ -253,15 +252,15 @@ def _extrapolate_reference(site: SiteRow) -> None:
 
 @leaf
 def is_law_returning(t_ns: int, site: SiteRow) -> bool:
-    """Returns True while the torque blends from the torque at rest to the torque of the law.
+    """Returns True while the torque blends from the rest torque to the torque of the law.
 
-    The blend starts when the arm begins to move from rest towards the other arms, and takes
-    `RETURN_NS`. An arm that aligns with the others because one of them was lost or came back
+    The blend starts when a resting arm begins to move towards the other arms, and takes
+    `RETURN_NS`. An arm that realigns with the others because one of them was lost or came back
     was not at rest, and needs no blend.
 
     Args:
         t_ns: Time, ns since the start of the session.
-        site: State of the site, the process that runs the arm.
+        site: State of the site.
     """
     # A site that drops or restores a peer aligns without a rest before.
     rested = site.reason != _DROPPED and site.reason != _RESTORED
@@ -272,16 +271,17 @@ def is_law_returning(t_ns: int, site: SiteRow) -> bool:
 
 @leaf
 def latch_mode(t_ns: int, site: SiteRow, mode: int, reason: int) -> None:
-    """Stops an arm for good: enters the mode FAULT or STOPPED, which only an order can end.
+    """Enters FAULT or STOPPED, which only a command can end.
 
-    The arm comes to rest and is then held against gravity. Estimates of its parameters that are
-    not finite become zero, because the gravity torque is computed from them and must be finite.
+    The arm comes to rest and is then held against gravity. Parameter estimates that are not
+    finite are reset to zero, because the gravity torque is computed from them and must be
+    finite.
 
     Args:
-        t_ns: Time, ns since the epoch, the common start of the session.
-        site: State of the site; changed.
+        t_ns: Time, ns since the start of the session.
+        site: State of the site; modified.
         mode: The mode to enter.
-        reason: Reason of the change of mode, a `LifeReason`.
+        reason: Reason for the change of mode, a `LifeReason`.
     """
     for p in range(site.theta_hat.shape[0]):
         if not isfinite(site.theta_hat[p]):
@@ -412,21 +412,19 @@ def _update_mode(t_ns: int, site: SiteRow, links: RowArray) -> None:
 
 @leaf
 def update_session_life(t_ns: int, site: SiteRow, links: RowArray) -> None:
-    """Decides whether an arm waits, follows, comes to rest or stops, and computes its goal.
+    """Updates the mode of an arm (such as waiting, following or resting) and its reference.
 
-    What the arm does is called its mode, for example RUN while it follows the other arms, its
-    peers. The mode changes by an order of a person or of the arm's own control process (site),
-    by a fault of the arm, or because peers fall silent or are heard again. The goal is called
-    the reference, the position that the arm follows.
+    The mode changes on a command of a person or of the site itself, on a fault of the arm, or
+    when peers fall silent or are heard again.
 
     Before the call, `q_des` and `qd_des` contain the weighted mean of the other arms' positions
-    and its derivative. After the call, they contain the reference: this mean in the mode RUN,
-    the mean plus an offset in RETURN, and the reference that brings the arm to rest otherwise.
-    The reference of the previous control period is in `q_followed` and `qd_followed`.
+    and its derivative. After the call, they contain the reference: this mean in RUN, the mean
+    plus an offset in RETURN, and the rest reference in all other modes. The reference of the
+    previous tick is in `q_followed` and `qd_followed`.
 
     Args:
         t_ns: Time, ns since the start of the session.
-        site: State of the site; changed.
+        site: State of the site; modified.
         links: States of the links from the other sites, one row per link.
     """
     if site.mode == _DIVERGED:

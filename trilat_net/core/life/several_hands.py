@@ -1,13 +1,14 @@
 """Computes how programs move the planar arms of several simulated runs at once.
 
-A program may act as the operator of an arm, for example a policy in training. It decides at a
-fixed rate where it pulls the arm. `OwnHand` computes the motion for one run. This module
-computes it for all runs of a training environment in one call, with the decisions of all
-programs as one array, so that no Python code runs for a single run.
+A program, for example a policy in training, can act as the operator of an arm. It decides at a
+fixed rate where to pull the arm. `OwnHand` computes the resulting motion for one run. This
+module computes it for all runs of a training environment in one call, with the decisions of all
+programs in one array. No Python code runs per simulation.
 
 Invariant:
-    - The results are those of `OwnHand.advance_span`, bit for bit, if each program decides in
-      time. `SeveralHands.explain` names the programs that this module cannot compute.
+    - The results are bit-identical to those of `OwnHand.advance_span`, provided that each
+      program decides in time. `SeveralHands.explain` tells which programs this module does not
+      support.
 """
 
 import math
@@ -186,19 +187,19 @@ def _advance_hands(
 class SeveralHands:
     """Computes how programs pull the arms in several simulations at once.
 
-    A training environment, for example, simulates many runs side by side, and in each run one
-    program moves an arm. One compiled call then replaces a call per run.
+    A training environment, for example, simulates many runs in parallel, with one program
+    moving one arm in each run. One compiled call then replaces one call per run.
 
     Args:
         count: Number L of runs.
         most_ticks: Largest number of ticks of a span.
         rate_hz: Tick rate of the sites, Hz.
-        period_ticks: Time from one decision to the next, ticks.
+        period_ticks: Time between decisions, ticks.
 
     Attributes:
         arrays: State and limits of the hands.
-        actions: For each tick of the latest span and each run the grip, the target, and the
-            target one second later, shape (ticks, 5, L).
+        actions: Grip, target, and target one second later, for each tick of the latest span and
+            each run, shape (ticks, 5, L).
     """
 
     axes = AXES
@@ -236,18 +237,16 @@ class SeveralHands:
 
     @staticmethod
     def explain(rules: HandRules, period_ticks: int, largest_action: float) -> str:
-        """Returns why a program's pulls cannot be computed for several simulations at once.
+        """Returns why a program is not supported by `SeveralHands`, or an empty string if it
+        is.
 
-        The result is empty if they can. Otherwise the caller computes each simulation alone, by
+        For a program that is not supported, the caller computes each simulation separately with
         `OwnHand`.
 
         Args:
-            rules: Limits of the program's actions.
-            period_ticks: Time from one decision to the next, ticks.
-            largest_action: Largest absolute value of a number of an action.
-
-        Returns:
-            The reason. Empty if the pulls can be computed together.
+            rules: Limits on the program's actions.
+            period_ticks: Time between decisions, ticks.
+            largest_action: Largest absolute value of any component of an action.
         """
         if rules.size != AXES:
             return "actions that do not have two numbers"
@@ -258,14 +257,13 @@ class SeveralHands:
         return ""
 
     def begin(self, run: int, rules: HandRules) -> None:
-        """Resets the state of one simulation, whose program does not hold its arm yet.
+        """Resets the state of one simulation, in which the program does not yet hold its arm.
 
-        The method is called for each simulation before its first tick (period of the control
-        loop).
+        Must be called for each simulation before its first tick.
 
         Args:
             run: Index of the run.
-            rules: Limits of the program's actions.
+            rules: Limits on the program's actions.
         """
         hands = self.arrays
         reach = rules.reach
@@ -293,17 +291,17 @@ class SeveralHands:
         goals: Array,
         poses: Array,
     ) -> None:
-        """Computes how each program pulls its arm during the next control periods (ticks).
+        """Computes how each program pulls its arm during the next ticks, for all simulations.
 
-        Each simulation has one program and one arm, and one call advances all simulations.
+        Each simulation has one program and one arm.
 
         Args:
-            runs: Number of runs that are advanced. They are the first rows of the arrays.
+            runs: Number of runs to advance, which are the first rows of the arrays.
             first: First tick of each run, shape (L,).
             count: Number of ticks.
             is_idle: 1 for runs that are not advanced, shape (L,).
-            acts: 1 for runs in which a decision begins to act at the first tick, shape (L,).
-            goals: The decisions that begin to act, shape (L, 2).
+            acts: 1 for runs in which a decision takes effect at the first tick, shape (L,).
+            goals: The decisions that take effect, shape (L, 2).
             poses: Pose of the arm at the first tick, m or rad, shape (L, 2).
         """
         _advance_hands(

@@ -1,12 +1,12 @@
-"""Gives a control law its input in each period: the motion of its arm and of the other arms.
+"""Provides the input of a control law in each tick: the motion of its own and the other arms.
 
-The compiled code of a control period stores the state of an arm in rows of arrays. A compiled
-control law reads these rows directly. For a law in plain Python, this module copies the rows to
-lists and writes the results of the law back.
+The compiled control loop stores the state of an arm in rows of arrays, which a compiled control
+law reads directly. For a law in plain Python, this module copies the rows to lists and writes
+the results of the law back.
 
 Invariant:
-    - A law receives the same numbers whether it is compiled or runs in plain Python.
-    - A vector that the law sends to other arms keeps its numbers until the law writes it again.
+    - A law receives the same values whether it is compiled or runs in plain Python.
+    - A vector that the law sends to other arms keeps its values until the law overwrites it.
 """
 
 from collections.abc import Sequence
@@ -55,15 +55,15 @@ def update_law_view(
 ) -> None:
     """Prepares the input of a user's control law: time, arm model and ages of the samples.
 
-    A sample is the state that another arm sends. All other parts of the input exist already.
-    The torque is set to NaN, so that a law that does not write its torque is noticed.
+    The rest of the input is already in place. The torque is set to NaN, so that a law that does
+    not write its torque is detected.
 
     Args:
-        k: Number of the control period.
-        t_ns: Nominal time of the period, ns since the start of the session.
-        site: State of the site, shape (1,); written.
-        links: States of the links from the other sites, one row per link; written.
-        chain: Data of the joints, one row per joint. None for the planar two-link arm.
+        k: Number of the tick.
+        t_ns: Nominal time of the tick, ns since the start of the session.
+        site: State of the site, shape (1,); modified.
+        links: States of the links from the other sites, one row per link; modified.
+        chain: Joint data, one row per joint. None for the planar two-link arm.
     """
     s: Row = site[0]
     s.k = k
@@ -110,14 +110,14 @@ def _name_vectors(vectors: Sequence[SentVector], numbers: list[float]) -> Simple
 class PlainLaw:
     """A user's control law in plain Python, with the arrays of the arm that it controls.
 
-    In each control period, the law receives lists of numbers, and its results are written into
-    the arrays.
+    In each tick, the law receives lists of numbers, and its results are written into the
+    arrays.
 
     Args:
         law: The law.
         setup: Setup of the site.
         arrays: Arrays of the site. Their vectors may be longer than this site needs.
-        sent: Part of the site's record for the vectors that the law sends, see `LawChannel`.
+        sent: Part of the site's record for the vectors that the law sends. See `LawChannel`.
     """
 
     def __init__(self, law: UserLaw, setup: SiteSetup, arrays: SiteArrays, sent: Array) -> None:
@@ -160,23 +160,23 @@ class PlainLaw:
     def bind(self) -> None:
         """Compiles the function that collects the input of the control law.
 
-        Without this call, the first period of the control loop would wait for the compilation.
+        Without this call, the compilation would take place in the first tick.
         """
         a = self._arrays
         self._update = bind_leaf(update_law_view, 0, 0, a.site, a.links, a.chain)
 
     def compute(self, k: int, t_ns: int) -> list[float]:
-        """Computes the torque of one control period by a call of the user's law.
+        """Computes the torque of one tick with the user's law.
 
         The torque, the parameter estimate and the vectors for other sites are written into the
         arrays of this site.
 
         Args:
-            k: Number of the control period.
-            t_ns: Nominal time of the period, ns since the start of the session.
+            k: Number of the tick.
+            t_ns: Nominal time of the tick, ns since the start of the session.
 
         Returns:
-            The numbers that the law remembers for the next period.
+            The law's memory after the tick.
 
         Raises:
             LawFailed: The law raised an exception, or returned an invalid result.
@@ -196,23 +196,23 @@ class PlainLaw:
 
     @property
     def memory(self) -> list[float]:
-        """Numbers that the law remembers for the next period of the control loop.
+        """State vector that the law keeps from this tick to the next.
 
-        They are stored with the results of each period. `restore` can continue the run from
-        them.
+        The vector is stored with the results of each tick, which allows `restore` to continue
+        the run.
         """
         return self._law.memory
 
     @property
     def memory_names(self) -> tuple[str, ...]:
-        """A name for each number of `memory`, as "error[1]"."""
+        """Name of each entry of `memory`, for example "error[1]"."""
         return self._law.memory_names
 
     def restore(self, memory: Sequence[float]) -> None:
-        """Restores the control law to its state after a recorded control period.
+        """Restores the control law to its state after a recorded tick.
 
         Args:
-            memory: Numbers that `memory` returned after the tick.
+            memory: State vector returned by `memory` after that tick.
         """
         self._law.restore(memory)
 

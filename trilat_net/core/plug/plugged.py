@@ -1,16 +1,16 @@
 """Compiles models that users write in Python, so that the simulation can call them.
 
 A model describes an operator who moves an arm, an environment that the arm touches, or the
-delays of a network. It consists of numbers, its parameters, and of a function. The simulation
-calls the function with the parameters and with a row of an array. The function reads its input
-from the row and writes its result into it.
+delays of a network. It consists of numerical parameters and a function. The simulation calls
+the function with the parameters and a row of an array. The function reads its input from the
+row and writes its result into it.
 
 Invariant:
-    - A function is compiled again only if the shapes of its parameters or the fields of the row
-      change. The values of the parameters are stored in a table, so new values need no
+    - A function is recompiled only if the shapes of its parameters or the fields of the row
+      change. The parameter values are stored in a table, so changing them requires no
       compilation.
-    - The simulation itself is never compiled again for a new function, because it calls the
-      function by its address.
+    - The simulation itself is never recompiled for a new function, because it calls the
+      function by address.
 """
 
 import hashlib
@@ -53,10 +53,10 @@ def _call_compiled(_context: Any, address: Any, arguments: Any) -> Any:
     def generate(context: Any, builder: Any, signature: Any, values: Any) -> Any:
         """Generates the LLVM code of the call `function(*arguments)` by the function's address.
 
-        The address is a value at run time. Therefore the compiled caller does not depend on the
-        function, and is not compiled again for another function. Numba calls `generate` while
-        it compiles the caller. Arguments, result and exceptions are passed as in all functions
-        that Numba compiles.
+        Because the address is a runtime value, the compiled caller does not depend on the
+        function and need not be recompiled for another function. Numba calls `generate` while
+        compiling the caller. Arguments, result and exceptions are passed as in any function
+        compiled by Numba.
 
         Args:
             context: Numba's description of the target processor.
@@ -67,7 +67,7 @@ def _call_compiled(_context: Any, address: Any, arguments: Any) -> Any:
                 tuple of its arguments.
 
         Returns:
-            The LLVM value of None, which is the result of the call in Python.
+            The LLVM value of None, the result of the call in Python.
         """
         convention = context.call_conv
         address_value, tuple_value = values
@@ -110,17 +110,17 @@ call_address: Any = _call_plain if _config.DISABLE_JIT else _call_compiled
 
 
 def digest_sibling_sources(function: Callable[..., Any]) -> str:
-    """Returns a hash of all source files in the folder of a function.
+    """Returns a hash of all source files in a function's folder.
 
-    Compiled code is stored on disk under this hash. After a change of a source file, the hash
-    is different, and the function is compiled again.
+    Compiled code is cached on disk under this hash. A change to any of the files changes the
+    hash, and the function is recompiled.
 
     Args:
         function: A function.
 
     Returns:
-        The hash. Empty if the function is not part of this package, because its code is not
-        stored then.
+        The hash, or an empty string if the function is not part of this package, in which case
+        its code is not cached.
     """
     folder = Path(function.__code__.co_filename).parent
     if not folder.is_relative_to(Path(__file__).parents[2]):
@@ -131,10 +131,10 @@ def digest_sibling_sources(function: Callable[..., Any]) -> str:
 
 
 def find_address(compiled: Any) -> int:
-    """Returns the memory address of a compiled function, at which machine code can call it.
+    """Returns the memory address at which machine code can call a compiled function.
 
     Args:
-        compiled: Function that Numba compiled for one signature.
+        compiled: Function compiled by Numba for exactly one signature.
     """
     result = compiled.get_compile_result(compiled.nopython_signatures[0])
     return int(result.library.get_pointer_to_function(result.fndesc.llvm_func_name))
@@ -167,11 +167,11 @@ def _compile(
         """Calls the user's function with the parameters of its model as a record.
 
         The simulation stores the parameters of all models as floats in one table. The record is
-        a view of the model's part of this table, with the names of the parameters.
+        a view of this model's part of the table, with the parameter names as field names.
 
         Args:
             numbers: The parameters, possibly followed by other floats.
-            now: Row with the input of the function, into which it writes its result.
+            now: Row that contains the input of the function and receives its result.
         """
         model = numbers[:count].view(form)[0]
         compute(model, now)
@@ -204,7 +204,7 @@ class UserModel:
 
     @property
     def numbers(self) -> Array:
-        """All numerical parameters of the model, one after another.
+        """All numerical parameters of the model, concatenated into one array.
 
         The compiled simulation stores the parameters of all models in this form. The array is
         empty if the model has no parameters.
@@ -216,8 +216,8 @@ class UserModel:
     def compile_to_address(self, name: str, row: np.dtype[np.void]) -> int:
         """Compiles a function of the model, and returns the address of its machine code.
 
-        The compiled simulation then calls the function by this address, without Python. The
-        function is called with the parameters of the model and with a row of an array.
+        The compiled simulation uses the address to call the function without Python. The
+        arguments of the function are the parameters of the model and a row of an array.
 
         Args:
             name: Name of the function in the class of the model.
