@@ -1,7 +1,7 @@
 """trilat-net: dual-user (trilateral) teleoperation over a real network.
 
-Two users each move a master arm, and a slave arm follows both of them. Each arm has a control
-loop of its own, and the loops exchange their states over a network with delay.
+Two users each move a master arm, and a slave arm follows both masters. Each arm has its own
+control loop, and the loops exchange their states over a network with delay.
 
     import trilat_net as tn
 
@@ -10,9 +10,9 @@ loop of its own, and the loops exchange their states over a network with delay.
     tn.certify(log)
 
 The control loop of an arm is the function `Site.step`. The same function runs live over a
-network, in virtual time, and again from the log of a run, so the numbers are the same to the
-last bit. Functions of this package return objects with `summary()`, `to_frame()` and
-`to_dict()`. docs/studies/python.md lists them all.
+network, in virtual time, and when a run is repeated from its log, so the results are
+bit-identical. The functions of this package return objects with `summary()`, `to_frame()` and
+`to_dict()`. They are listed in docs/studies/python.md.
 """
 
 import os as _os

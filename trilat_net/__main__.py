@@ -1,12 +1,12 @@
 """Runs the command `trilat`, also as `python -m trilat_net`.
 
-`trilat stop` runs before the modules of the other commands are loaded, so that arms stop
+`trilat stop` is executed before the modules of the other commands are loaded, so arms stop
 without delay.
 
 Invariant:
-    - Text that is printed into a file or pipe is UTF-8 with POSIX line ends on every system, as
-      in all files that the program writes.
-    - A character that a terminal cannot show is replaced by its number.
+    - Output to a file or pipe is UTF-8 with POSIX line endings on every system, like all files
+      written by the program.
+    - A character that a terminal cannot display is replaced by its code.
 """
 
 import atexit
@@ -18,10 +18,10 @@ from contextlib import suppress
 
 
 def main() -> None:
-    """Runs the command given on the command line. This is the entry point of `trilat`.
+    """Runs the command given on the command line (entry point of `trilat`).
 
-    The command `trilat stop` is executed before the rest of the program is loaded, so that it
-    stops arms without delay.
+    The command `trilat stop` is executed before the rest of the program is loaded, so arms stop
+    without delay.
     """
     # With Python's default thresholds, garbage collection takes a ninth of the start-up time.
     gc.set_threshold(100_000, 20, 20)

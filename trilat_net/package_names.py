@@ -1,8 +1,8 @@
 """Lists the commands and functions of the optional packages, such as trilat-studies.
 
-If a user calls `trilat sweep` and trilat-studies is missing, this program must know the command
-to say what to install. The lists also give the order of the commands in the help. The packages
-register the commands themselves (`entry_points`).
+If a user calls `trilat sweep` and trilat-studies is not installed, the program needs to
+recognise the command to tell the user what to install. The lists also define the order of the
+commands in the help. The packages register the commands themselves (see `entry_points`).
 """
 
 PACKAGE_COMMANDS = {

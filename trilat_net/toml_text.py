@@ -1,7 +1,8 @@
-"""Parses TOML texts from sources that are not trusted, such as logs and other computers.
+"""Parses TOML from untrusted sources, such as logs and other computers.
 
 Invariant:
-    - The time for a text is at most proportional to its length, times the depth of its tables.
+    - The parsing time is at most proportional to the length of the text times the depth of its
+      tables.
 """
 
 import re
@@ -20,10 +21,10 @@ _KEY_PART = re.compile(
 
 
 def parse_toml(text: str) -> dict[str, Any]:
-    """Returns the tables of a TOML text.
+    """Parses a TOML document, and returns its tables.
 
     Raises:
-        ScenarioError: The text is not TOML, or has a key of very many parts.
+        ScenarioError: The text is not valid TOML, or a key has too many parts.
         RecursionError: The tables are nested too deeply.
     """
     _refuse_long_keys(text)

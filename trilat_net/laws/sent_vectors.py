@@ -1,13 +1,13 @@
-"""Reads and checks which vectors a control law sends to other arms, besides the motion.
+"""Reads and checks the declaration of the vectors that a control law sends.
 
-Some laws send vectors, for example waves or energies. The class of the law declares their names
-and lengths in the class variable `sends`. The receivers need the declaration to read the
-messages.
+Some laws send vectors such as waves or energies in addition to the motion. The class of the law
+declares their names and lengths in the class variable `sends`, which the receivers need to
+decode the messages.
 
 Invariant:
-    - A declaration is a literal in the source of the law, so reading it runs no user code.
-    - The declaration is stored with the resolved scenario, the complete description of an
-      experiment. No other file is needed to read what the law sent in a run.
+    - A declaration is a literal in the source of the law, so no user code is run to read it.
+    - The declaration is stored with the resolved scenario. No other file is needed to decode
+      the vectors sent in a run.
 """
 
 from typing import Annotated, Any, Literal
@@ -45,7 +45,7 @@ SentVectorSpecs = dict[str, _SentVectorSpec]
 def convert_sends(sends: Any, code: str, path: str) -> SentVectorSpecs:
     """Checks and converts the declaration of the vectors that a control law sends.
 
-    The class variable `sends` declares vectors, each with its name, unit and length.
+    The class variable `sends` declares the name, unit and length of each vector.
 
     Args:
         sends: Value of the class variable.
@@ -53,10 +53,10 @@ def convert_sends(sends: Any, code: str, path: str) -> SentVectorSpecs:
         path: Path of the key in the scenario, for error messages.
 
     Returns:
-        A specification for each vector, by its name.
+        A mapping from vector name to specification.
 
     Raises:
-        ScenarioError: The value does not describe vectors.
+        ScenarioError: The value is not a valid declaration.
     """
     try:
         return msgspec.convert(sends, SentVectorSpecs)

@@ -1,27 +1,27 @@
-"""Couples arms by time-domain passivity control (TDPA): delays cannot create energy.
+"""Time-domain passivity control (TDPA) of coupled arms: delays cannot create energy.
 
 A coupling connects two arms, a leader and a follower. Each end of a coupling keeps an account
-of the energy that went in and out. If an end is about to take out more energy than the other
-end has reported as put in, its controller reduces the torque or the velocity.
+of the energy that enters and leaves it. If an end would extract more energy than the other end
+has reported as input, its controller reduces the torque or the velocity.
 
-A follower is pulled to a moving goal by a spring K and a damper B with the torque F:
+A spring K and a damper B pull a follower towards a moving goal with the torque F:
 
     F = K (goal - q) + B (v - qd)
     rate of goal = v = sum_j alpha_j v_j
 
-q and qd are position and velocity of the follower, v_j the velocity of leader j and alpha_j the
-weight with which the follower follows it. Leader j feels -alpha_j F. Two arms that follow each
-other have two couplings. While an arm waits or is being aligned with its leaders, the goal is
-shifted, which costs no energy.
+q and qd are the position and velocity of the follower, v_j the velocity of leader j, and
+alpha_j its dominance factor. Leader j feels -alpha_j F. Two arms that follow each other have
+two couplings. While an arm waits or is being aligned with its leaders, the goal is shifted,
+which costs no energy.
 
-Names: E is a sum of energy that an end has put in or taken out, and W the energy that an end
-may still use. "led" stands for the leader's end and "followed" for the follower's end. The work
-in a control period is the torque times the motion of the joint (`energy` = "step") or times its
-velocity and the period ("velocity", as in the publication of Ryu and others).
+Names: E is the cumulative energy that an end has put in or extracted, and W the energy that an
+end may still use. "led" denotes the leader's end and "followed" the follower's end. The work in
+a control period is the torque times the motion of the joint (`energy` = "step"), or the torque
+times velocity times period ("velocity", as published by Ryu and others).
 
 Invariant:
-    - In each coupling and at each joint, each end adds up the energy that it puts in.
-    - The other end takes no more energy out than it knows to have been put in.
+    - In each coupling and for each joint, each end accumulates the energy that it puts in.
+    - The other end never extracts more energy than it knows to have been put in.
 """
 
 import math
@@ -696,28 +696,28 @@ def _follow_peers(law: Any, now: LawInput, i: int) -> None:
 
 @compiled
 class Tdpa(EnergyLaw):
-    """Couples arms so that no end of a coupling takes out more energy than was put in.
+    """Couples arms such that no end of a coupling extracts more energy than was put in.
 
-    The method is time-domain passivity control. A spring K and a damper B move each arm towards
+    The method is time-domain passivity control. A spring K and a damper B pull each arm towards
     the integral of the velocities of the arms that it follows, weighted by the dominance
-    factors, and these arms feel the torque of K and B. With K = 0 and B = 0 an arm only leads.
+    factors. These arms feel the torque of K and B. An arm with K = 0 and B = 0 only leads.
 
     Source: Ryu, Artigas and Preusche (2010); for several arms Panzirsch and others (2012).
 
     Attributes:
-        K: Stiffness of the spring by which the site follows, per joint, N m/rad. 0 if the site
-            follows no other site.
+        K: Stiffness of the spring with which the site follows, per joint, N m/rad. 0 if the
+            site follows no other site.
         B: Damping with which the site follows, per joint, N m s/rad.
-        acceleration_rad_s2: Largest change of a joint's acceleration per tick (period of the
-            control loop) for which the leaders' controllers plan, caused by other torques than
-            those of the law. Half of the reserve covers larger changes.
-        drift_rad_s: Largest velocity with which positions that have drifted apart are brought
-            together again. With 0, positions drift.
-        reserve_J: Initial energy of an end per joint and peer, J.
-        energy: How work is computed. "step": energy that the arm receives, torque times the
-            step in q; "velocity": torque times velocity times period, as published.
-        beta: Divisor of the site's torque, dimensionless; it scales the forces that the users
-            feel relative to each other.
+        acceleration_rad_s2: Largest change of a joint's acceleration per tick, due to torques
+            other than those of the law, that the leaders' controllers allow for. Larger changes
+            are covered by half of the reserve.
+        drift_rad_s: Largest velocity used to realign positions that have drifted apart. If 0,
+            drift is not corrected.
+        reserve_J: Initial energy of an end, per joint and peer, J.
+        energy: How work is computed. "step": torque times the change of q, which is the energy
+            that the arm receives. "velocity": torque times velocity times period, as published.
+        beta: Divisor of the site's torque, dimensionless, which scales the forces that the
+            users feel relative to each other.
     """
 
     K: NotNegativeJoints = (100.0,)
@@ -756,16 +756,16 @@ class Tdpa(EnergyLaw):
     """False switches the controllers off, for comparison: energies are only observed."""
 
     def begin(self, facts: LawContext) -> None:
-        """Prepares the law before a run: creates its energy accounts and its work space.
+        """Prepares the law before a run by creating its energy accounts and work space.
 
-        This arm has two couplings with each peer, another arm: one as the leader of the peer,
-        and one as its follower. As a follower, the arm is pulled to a moving goal by a spring
-        and a damper. Each end of a coupling keeps an account of the energy that it may take
-        out. Lists with one number per coupling and joint are flat: joint i of peer j has the
-        index j n + i, where n is the number of joints.
+        This arm has two couplings with each peer: one as the leader of the peer, and one as its
+        follower. As a follower, the arm is pulled towards a moving goal by a spring and a
+        damper. Each end of a coupling keeps an account of the energy that it may extract. Lists
+        with one entry per coupling and joint are flat: joint i of peer j has the index j n + i,
+        where n is the number of joints.
 
         Args:
-            facts: Facts about the site that are known before the run.
+            facts: Facts about the arm and the other arms that are known before the run.
         """
         n = facts.joints
         couplings = n * len(facts.peers)
@@ -806,10 +806,10 @@ class Tdpa(EnergyLaw):
         self.inverse = [0.0] * (n * n)  # inverse of the inertia matrix, row by row
 
     def torque(self, now: LawInput) -> None:
-        """Computes the torque of a control period, and sends torques and energies to others.
+        """Computes the torque of one tick, and sends torques and energies to the peers.
 
-        The arm first acts as a follower, then as a leader. The torque that it feels as a leader
-        is reduced if the torque of a joint would otherwise exceed its limit.
+        The arm acts first as a follower and then as a leader. The torque that it feels as a
+        leader is reduced if a joint would otherwise exceed its torque limit.
 
         Args:
             now: Inputs and outputs of the law in this tick.
@@ -874,16 +874,16 @@ class Tdpa(EnergyLaw):
     def energies(self, seen: LawRecords) -> LawEnergies:
         """Computes the energies that show whether the law was passive in a run.
 
-        A coupling connects an arm to a peer, another arm, which leads or follows. The result
-        contains, for each peer, the energy that this arm put into its two couplings, the energy
-        that it took out, and the energy that it observed. It also contains the energy of the
-        springs and the energy that the arm gave to its controller.
+        For each peer, the result contains the energy that this arm put into the two couplings
+        with this peer, the energy that it extracted, and the energy that it observed. The
+        result also contains the energy of the springs and the energy that the arm supplied to
+        its controller.
 
-        The energies of the follower are one period old, because the work of a period is known
-        only at its end.
+        The energies of the follower lag by one tick, because the work of a control period is
+        known only at its end.
 
         Args:
-            seen: Records of the arm in the run, one per control period.
+            seen: Records of the arm in the run, one per tick.
         """
         gave = []
         took = []
@@ -924,8 +924,8 @@ class Tdpa(EnergyLaw):
     def explain_idle_shares(self, situation: LawSituation) -> str:  # noqa: ARG002
         """Explains to the user that the dominance factors of an arm have no effect.
 
-        A dominance factor is the weight with which an arm follows another arm. If the stiffness
-        K and the damping B are zero, the arm does not follow the others.
+        This is the case if the stiffness K and the damping B are both zero, because the arm
+        then does not follow the others.
 
         Returns:
             A sentence for the user. Empty if K or B is not zero.
@@ -934,23 +934,23 @@ class Tdpa(EnergyLaw):
         return "" if follows else "with K = 0 and B = 0, an arm does not follow others"
 
     def condition(self, situation: LawSituation) -> StabilityCondition | None:  # noqa: ARG002
-        """States under which assumptions the law keeps the session passive.
+        """Returns the assumptions under which the law keeps the session passive.
 
-        Passive means that the law never gives more energy than it received. The law has this
-        property for all gains, delays, lost messages and shares (the weights with which the
-        arms follow each other), so the condition is always met. Only the assumptions differ:
+        Passive means that the law never supplies more energy than it received. The law has this
+        property for all gains, delays, lost messages and dominance factors, so the condition is
+        always satisfied. Only the assumptions differ:
 
-        - With `energy` = "step", work is torque times motion, which is exact. But energy is
-          paid before a tick (a period of the control loop), and the motion in it is predicted.
-          If another torque changes the acceleration, the prediction is wrong, and half of
-          `reserve_J` covers the difference. Changes of up to `acceleration_rad_s2` are planned
-          for.
-        - With `energy` = "velocity", as the law was published, work is torque times velocity
-          times the period h. This leaves out the acceleration qdd within a tick, and with it a
-          work of up to tau qdd h^2 / 2, where tau is the torque.
+        - With `energy` = "step", work is torque times motion, which is exact. However, energy
+          is paid in advance for each control period, based on the predicted motion. If another
+          torque changes the acceleration, the prediction is wrong. Changes of up to
+          `acceleration_rad_s2` are allowed for, and half of `reserve_J` covers the difference
+          beyond that.
+        - With `energy` = "velocity", as in the original publication, work is torque times
+          velocity times the control period h. This neglects the acceleration qdd within a
+          period, and therefore work of up to tau qdd h^2 / 2, where tau is the torque.
 
         Returns:
-            The assumptions as a string, with a condition that holds.
+            A condition that holds, with the assumptions as text.
         """
         passive_coupling = (
             "motion stays bounded (decay is not proved): couplings are passive for any delays, "

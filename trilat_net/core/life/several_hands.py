@@ -237,8 +237,7 @@ class SeveralHands:
 
     @staticmethod
     def explain(rules: HandRules, period_ticks: int, largest_action: float) -> str:
-        """Returns why a program is not supported by `SeveralHands`, or an empty string if it
-        is.
+        """Returns why a program is not supported by `SeveralHands`, or "" if it is supported.
 
         For a program that is not supported, the caller computes each simulation separately with
         `OwnHand`.
