@@ -58,12 +58,12 @@ from .elementary import sincos
 
 LINK_PARAMETERS = 10
 COULOMB_SPEED = 0.01
-"""Speed at which the smoothed Coulomb friction has 71 % of its full value, rad/s or m/s."""
+"""Speed at which the smoothed Coulomb friction reaches 71 % of its full value, rad/s or m/s."""
 
 Three = tuple[float, float, float]
 Matrix = tuple[Three, Three, Three]
 Spatial = tuple[Three, Three]
-"""A spatial vector: its linear half and its angular half."""
+"""A spatial vector, as a pair of its linear and its angular part."""
 
 
 class ChainJoint(NamedTuple):
@@ -289,9 +289,9 @@ def rotate_by_matrix(R: Array, a: Three) -> Three:
 
 @leaf
 def _rotate_back(R: Array, a: Three) -> Three:
-    """Returns the product R' a: a 3D vector rotated by the inverse of a rotation matrix R.
+    """Returns R' a: a 3D vector rotated by the inverse of the rotation matrix R.
 
-    The inverse of a rotation matrix is its transpose, so no equations need to be solved.
+    The inverse of a rotation matrix is its transpose.
 
     Args:
         R: Rotation matrix, shape (3, 3).
@@ -366,15 +366,14 @@ def place_joints(chain: RowArray, q: Vector) -> None:
 
 @leaf
 def _move(row: Row, linear: Three, angular: Three, rate: float) -> Spatial:
-    """Returns the spatial velocity of a link: that of the previous link plus that of the joint.
+    """Returns the spatial velocity of a link from the velocities of its parent and its joint.
 
-    In the notation of spatial vectors this is X V_p + S rate. Accelerations are transformed in
-    the same way.
+    In spatial notation, this is X V_p + S rate. Accelerations are transformed in the same way.
 
     Args:
-        row: Data of the joint between the two links.
-        linear: Linear part of the previous link's velocity V_p, in the previous link's frame.
-        angular: Angular part of V_p, in the previous link's frame.
+        row: Row of the joint between the two links.
+        linear: Linear part of the parent's velocity V_p, in the parent's frame.
+        angular: Angular part of V_p, in the parent's frame.
         rate: Velocity of the joint, rad/s or m/s.
 
     Returns:
@@ -398,12 +397,12 @@ def _move(row: Row, linear: Three, angular: Three, rate: float) -> Spatial:
 def _momentum(pi: Vector, first: int, linear: Three, angular: Three) -> Spatial:
     """Returns the linear and angular momentum of a link about the origin of its frame.
 
-    It is the product I(pi) V, where V is the spatial velocity of the link and I(pi) its spatial
-    inertia.
+    This is the product I(pi) V, where V is the spatial velocity of the link and I(pi) its
+    spatial inertia.
 
     Args:
-        pi: Inertial parameters of the links: per link its mass m, m times its centre of mass,
-            and its moments of inertia Ixx, Ixy, Iyy, Ixz, Iyz, Izz.
+        pi: Inertial parameters of all links. For each link: the mass m, m times the centre of
+            mass, and the moments of inertia Ixx, Ixy, Iyy, Ixz, Iyz, Izz.
         first: Index of the link's first parameter in `pi`.
         linear: Linear velocity of the link's origin, m/s.
         angular: Angular velocity of the link, rad/s.
@@ -436,11 +435,11 @@ def _momentum(pi: Vector, first: int, linear: Three, angular: Three) -> Spatial:
 def _along_axis(row: Row, linear: Three, angular: Three) -> float:
     """Returns the component of a spatial force along the axis of a joint, S' f.
 
-    A spatial force f is a force together with a torque, and S is the axis. The result is the
-    torque of a revolute joint, N m, or the force of a prismatic (sliding) joint, N.
+    A spatial force f combines a force and a torque, and S is the joint axis. The result is the
+    torque of a revolute joint, N m, or the force of a prismatic joint, N.
 
     Args:
-        row: Data of the joint.
+        row: Row of the joint.
         linear: Linear part of f, the force.
         angular: Angular part of f, the torque.
     """
@@ -471,14 +470,14 @@ def friction_torque(row: Row, speed: float) -> float:
 
 @leaf
 def _pass_force(row: Row, before: Row) -> None:
-    """Adds the force on a link to the force on the previous link, which has to carry both.
+    """Adds the force on a link to the force on its parent, which has to support both.
 
-    The inverse dynamics add up forces in this way from the last link of an arm to its base. The
-    force and its torque are first transformed to the frame of the previous link.
+    The inverse dynamics accumulates forces in this way from the tip of an arm to its base. The
+    force and its torque are first transformed to the parent's frame.
 
     Args:
-        row: Data of the joint that moves the link.
-        before: Data of the previous joint; changed.
+        row: Row of the joint that moves the link.
+        before: Row of the previous joint; modified.
     """
     R = row.R
     p = read_three(row.p)
@@ -544,9 +543,10 @@ def propagate_motion(
 
 @leaf
 def _motion_cross(V: Spatial, W: Spatial) -> Spatial:
-    """Returns the spatial cross product V x W, the rate at which W changes if it moves with V.
+    """Returns the spatial cross product V x W, the rate of change of W as it moves with V.
 
-    For V = (v, w) and W = (v', w') in (linear, angular) parts it is (w x v' + v x w', w x w').
+    For V = (v, w) and W = (v', w'), with the linear part first, this is (w x v' + v x w', w x
+    w').
     """
     V_lin, V_ang = V
     W_lin, W_ang = W
@@ -559,9 +559,9 @@ def _motion_cross(V: Spatial, W: Spatial) -> Spatial:
 
 @leaf
 def _force_cross(V: Spatial, f: Spatial) -> Spatial:
-    """Returns the spatial cross product V x* f, the rate at which f changes if it moves with V.
+    """Returns the spatial cross product V x* f, the rate of change of f as it moves with V.
 
-    For V = (v, w) and f = (force, torque) it is (w x force, w x torque + v x force).
+    For V = (v, w) and f = (force, torque), this is (w x force, w x torque + v x force).
     """
     V_lin, V_ang = V
     force, torque = f
@@ -644,23 +644,23 @@ def _add_products(factor: float, x: Spatial, y: Spatial, first: int, gradient: A
 
         pi = (m, m c, Ixx, Ixy, Iyy, Ixz, Iyz, Izz),
 
-    the mass m, the vector m c with the centre of mass c, and the moments of inertia J. With the
-    linear parts x_lin and y_lin and the angular parts x_ang and y_ang, the term is
+    namely the mass m, the vector m c with the centre of mass c, and the moments of inertia J.
+    With the linear parts x_lin and y_lin and the angular parts x_ang and y_ang, the term is
 
         x' I y = m x_lin' y_lin
                + (m c)' (cross_product(y_lin, x_ang) + cross_product(x_lin, y_ang))
                + x_ang' J y_ang
 
-    The factors of the parameters in this sum are the derivatives with respect to them. J is
-    symmetric. Therefore Ixy, Ixz and Iyz appear in two elements each, and have two products.
+    The coefficients of the parameters in this sum are the derivatives with respect to them.
+    Because J is symmetric, Ixy, Ixz and Iyz each appear in two elements and have two products.
 
     Args:
         factor: Factor of the term.
-        x: A spatial velocity: its linear part in m/s, then its angular part in rad/s.
-        y: A spatial velocity or acceleration, also with its linear part first.
-        first: Index of the link's first parameter, its mass, in `gradient`.
+        x: A spatial velocity: the linear part, m/s, followed by the angular part, rad/s.
+        y: A spatial velocity or acceleration, also with the linear part first.
+        first: Index of the link's first parameter (the mass) in `gradient`.
         gradient: Gradient for all links, shape (10 n,). `factor` times the ten derivatives is
-            added to the entries from `first`, in the order of pi.
+            added to the entries starting at `first`, in the order of pi.
     """
     x_lin, x_ang = x
     y_lin, y_ang = y
@@ -742,16 +742,16 @@ def parameter_gradient(chain: RowArray, gradient: Array) -> None:
 
 @leaf
 def _add_composite(row: Row, before: Row) -> None:
-    """Adds the mass and inertia of a composite body to those of the previous link.
+    """Adds the mass and inertia of a composite body to those of the parent link.
 
-    A composite body is a link together with all links after it, as if they were rigidly
-    connected. The inertia matrix of an arm is computed from such bodies. The parallel-axis
-    theorem moves the inertia to the origin of the previous link; it is written out for the ten
-    parameters of a body (mass, first moments, moments of inertia).
+    A composite body consists of a link and all later links, as if they were rigidly connected.
+    The inertia matrix of an arm is computed from such bodies. The inertia is moved to the
+    origin of the parent link with the parallel axis theorem, written out for the ten parameters
+    of a body (mass, first moments, moments of inertia).
 
     Args:
-        row: Data of the joint that moves the body.
-        before: Data of the previous joint, whose composite body is changed.
+        row: Row of the joint that moves the body.
+        before: Row of the previous joint, whose composite body is modified.
     """
     pi = row.composite
     total = before.composite
@@ -860,11 +860,11 @@ def mass_matrix(chain: RowArray, theta: Vector) -> None:
 def _stop_torque(row: Row, q: float, qd: float) -> float:
     """Returns the torque of the mechanical stops at the ends of a joint's range, N m.
 
-    A stop acts only beyond the end of the range: a spring and a damper push the joint back, and
-    never pull. Within the range the torque is 0. For a sliding joint, it is a force, N.
+    Beyond the end of the range, a spring and a damper push the joint back, and never pull.
+    Within the range, the torque is 0. For a prismatic joint, the result is a force, N.
 
     Args:
-        row: Data of the joint.
+        row: Row of the joint.
         q: Position of the joint, rad or m.
         qd: Velocity of the joint, rad/s or m/s.
     """
@@ -881,7 +881,7 @@ def _stop_torque(row: Row, q: float, qd: float) -> float:
 
 @leaf
 def _bias(chain: RowArray, theta: Vector, gravity: Vector, q: Vector, qd: Vector) -> None:
-    """Computes the bias torque, which the motion of the joints requires without acceleration.
+    """Computes the bias torque, which is required even if the joints do not accelerate.
 
         bias = C qd + G + friction - stops
 

@@ -39,12 +39,12 @@ def _put_torques(
     a: Array,
     torque: Array,
 ) -> None:
-    """Writes the joint torques that a motion requires in each of K poses into `torque`.
+    """Writes the joint torques required for a motion in each of K poses into `torque`.
 
-    The torque is M a + C(q, qd) v + G + armature a + friction(v), with the inertia matrix M,
-    the Coriolis matrix C, the gravity torque G and the inertia of the drives (armature). Joint
-    arrays have the shape (K, n). theta has the shape (K, 10 n), or (1, 10 n) if all poses share
-    it.
+    The torque is M a + C(q, qd) v + G + armature a + friction(v), where M is the inertia
+    matrix, C the Coriolis matrix, G the gravity torque and `armature` the inertia of the
+    drives. Joint arrays have the shape (K, n). theta has the shape (K, 10 n), or (1, 10 n) if
+    all poses share the same parameters.
     """
     last = theta.shape[0] - 1
     for k in range(q.shape[0]):
@@ -78,8 +78,8 @@ def _put_gradients(
 ) -> None:
     """Writes Y'r for each of K poses into `gradient`, shape (K, 10 n).
 
-    Y'r is the direction in which the adaptive law changes the parameter estimates, with the
-    regressor Y and the velocity error r = qd - v. The motion has the shape (K, n).
+    Y'r, where Y is the regressor and r = qd - v the velocity error, is the direction in which
+    the adaptive law changes the parameter estimates. The motion arrays have the shape (K, n).
     """
     for k in range(q.shape[0]):
         place_joints(chain, q[k])
@@ -106,9 +106,9 @@ def _put_end_effectors(
 ) -> None:
     """Writes the end effector's position and Jacobian, and the potential energy, in K poses.
 
-    The results go into `position`, shape (K, 3), `J`, shape (K, 6, n), and `energy`, shape
-    (K,). The potential energy of a link is -g'(m p + R mc), with its mass m and its first
-    moment mc, and its position p and orientation R in the base's frame.
+    The results are written into `position`, shape (K, 3), `J`, shape (K, 6, n), and `energy`,
+    shape (K,). The potential energy of a link is -g'(m p + R mc), where m is its mass, mc its
+    first moment, and p and R are its position and orientation in the base frame.
     """
     n = chain.shape[0]
     g = read_three(gravity)

@@ -79,8 +79,8 @@ def _update_joint_errors(s: Row, joints: int) -> None:
     law acts.
 
     Args:
-        s: State of the site, with the angles q, velocities qd, the reference q_des with its
-            rate qd_des, and the gain Lambda, 1/s; written.
+        s: State of the site, with the angles q, the velocities qd, the reference q_des and its
+            rate qd_des, and the gain Lambda, 1/s; modified.
         joints: Number of joints.
     """
     for i in range(joints):
@@ -357,7 +357,7 @@ def put_stage_acceleration(s: Row, chain: RowArray) -> None:
 def _put_acceleration(
     t_s: float, s: Row, chain: RowArray, actors: TorqueSourceRows, table: TorqueTable
 ) -> None:
-    """Computes the external torques and then the joint accelerations for an integrator stage.
+    """Computes the external torques and the joint accelerations at an integrator stage.
 
     A stage is one of the four states at which the Runge-Kutta method evaluates the
     accelerations of the arm in a control period.

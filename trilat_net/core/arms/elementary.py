@@ -25,7 +25,9 @@ _PART_1 = 1.5707963267341256
 _PART_2 = 6.077100506303966e-11
 _PART_3 = 2.0222662487959506e-21
 LARGEST_RAD = 2.0**30
-"""Largest angle, rad. Above it, a double resolves angles to only a tenth of a microradian."""
+"""Largest supported angle, rad. Beyond it, a double resolves angles only to a tenth of a
+microradian.
+"""
 
 
 @leaf
@@ -70,11 +72,11 @@ def sincos(x: float) -> tuple[float, float]:
 
 _LOG_2_HIGH = 6.93145751953125e-1
 _LOG_2_LOW = 1.42860682030941723212e-6
-"""The natural logarithm of 2 in two parts. The first part has few bits."""
+"""The natural logarithm of 2, split into two parts. The first part has few bits."""
 _LOG_2_OF_E = 1.4426950408889634
 _SMALL = 0.625
 _LARGE = 20.0
-"""For arguments from this value on, the hyperbolic tangent is 1 to the last bit."""
+"""Argument above which the hyperbolic tangent is 1 to the last bit."""
 
 
 @leaf

@@ -63,15 +63,14 @@ class TorqueKind(IntEnum):
 
 
 SCRIPTED_KINDS = (TorqueKind.PULSE, TorqueKind.RECORDED, TorqueKind.CHIRP, TorqueKind.MULTISINE)
-"""The kinds whose torque is a function of time alone."""
+"""Kinds whose torque depends only on time."""
 LIVE_KINDS = (TorqueKind.LIVE_TIP, TorqueKind.LIVE_FORCE, TorqueKind.LIVE_JOINT)
-"""The kinds that act only while a hand holds the arm.
+"""Kinds that act only while a hand holds the arm.
 
-Their numbers are the largest, so
-compiled functions can recognise them by `>=`.
+They have the largest numbers, so compiled functions can recognise them with `>=`.
 """
 OWN_KINDS = (TorqueKind.OWN_JOINTS, TorqueKind.OWN_TIP)
-"""The kinds that call a user's function."""
+"""Kinds that call a user's function."""
 
 
 class TorqueSource(NamedTuple):
@@ -156,9 +155,9 @@ def torque_source_dtype(width: int) -> np.dtype[np.void]:
 TorqueSourceRows = NDArray[np.void]
 TorqueTable = Array
 SourceTorque = tuple[float, float, float]
-"""Torque ON each joint, N m, and the largest force of a wall that contributes to it, N."""
+"""Torque ON each joint, N m, and the largest wall force that contributes to it, N."""
 NO_TORQUE: SourceTorque = (0.0, 0.0, 0.0)
-"""The torque on an arm without operators and environments."""
+"""Torque on an arm with no operators or environments."""
 
 _PULSE = int(TorqueKind.PULSE)
 _HAND = int(TorqueKind.HAND)
@@ -258,14 +257,14 @@ def minimum_jerk(t_s: float, start_s: float, end_s: float) -> Pair:
 def _spring_along(
     actor: Row, i: int, progress: float, rate: float, at: float, speed: float
 ) -> float:
-    """Returns the force of the spring and damper by which an operator pulls the arm.
+    """Returns the force of the spring and damper with which an operator pulls the arm.
 
-    It is the force or torque along one coordinate, N or N m:
+    The result is the force or torque along one coordinate, N or N m:
 
         K (target - at) + B (target_speed - speed),    target = a + progress (b - a)
 
     Args:
-        actor: Data of the operator, with the stiffness K, the damping B and the path of the
+        actor: Row of the operator, with the stiffness K, the damping B and the path of the
             target from a to b.
         i: Index of the coordinate.
         progress: Progress of the target from a to b, 0 to 1.
@@ -284,19 +283,19 @@ def _spring_along(
 
 @leaf
 def _target_progress(actor: Row, t_s: float) -> Pair:
-    """Returns how far the target of an operator is on its path from `a` to `b`, and its rate.
+    """Returns the progress of an operator's target along its path from `a` to `b`.
 
-    The spring of the operator pulls the arm to this target. A scripted operator moves the
-    target along a minimum-jerk path. If a person or program moves the arm (live hand), the
-    target is at `a`, and moves by b - a per second.
+    The operator's spring pulls the arm towards this target. A scripted operator moves the
+    target along a minimum-jerk path. The target of a live hand (a person or program) is at `a`,
+    and moves by b - a per second.
 
     Args:
-        actor: Data of the operator, see `torque_source_dtype`.
+        actor: Row of the operator. See `torque_source_dtype`.
         t_s: Time since the start of the session, s.
 
     Returns:
-        The progress, 0 to 1, for the position a + progress (b - a) of the target, and its
-        derivative, for the velocity rate (b - a).
+        The progress, 0 to 1, and its rate, 1/s. The target is at a + progress (b - a), and its
+        velocity is rate (b - a).
     """
     is_live_hand = actor.kind >= _LIVE_TIP  # the live kinds have the largest numbers
     if is_live_hand:
@@ -307,13 +306,13 @@ def _target_progress(actor: Row, t_s: float) -> Pair:
 
 @leaf
 def _live_share(actor: Row, square: float) -> float:
-    """Returns the factor that reduces the force of a person who moves the arm (live hand).
+    """Returns the factor that reduces the force of a live hand.
 
-    The norm of the force is first limited, because a human hand has limited strength. Then the
-    force is multiplied by the grip: 1 for a firm grip, 0 after the hand has let go.
+    The norm of the force is limited first, because a human hand has limited strength. The force
+    is then multiplied by the grip, from 1 (firm) to 0 (released).
 
     Args:
-        actor: Data of the live hand, with `grip`, 0 to 1, and `limit`, N or N m.
+        actor: Row of the live hand, with `grip`, 0 to 1, and `limit`, N or N m.
         square: Square of the norm of the force, N^2 or N^2 m^2.
     """
     factor: float = actor.grip
@@ -324,14 +323,14 @@ def _live_share(actor: Row, square: float) -> float:
 
 @leaf
 def _spring_force(actor: Row, t_s: float, at: Vector, speed: Vector) -> Pair:
-    """Returns the force of an operator, who pulls the arm to a target, N or N m.
+    """Returns the force of an operator who pulls the arm towards a target, N or N m.
 
     A spring and a damper act between the arm and the target along two coordinates. The force of
-    a person who moves the arm during the run (live hand) is limited, and smaller while the grip
-    is not firm. The kind LIVE_FORCE has no spring: its force is given.
+    a live hand is limited, and reduced while the grip is not firm. For the kind LIVE_FORCE, the
+    force is set directly, without a spring.
 
     Args:
-        actor: Data of the operator, see `torque_source_dtype`.
+        actor: Row of the operator. See `torque_source_dtype`.
         t_s: Time since the start of the session, s.
         at: Position of the arm along the coordinates, rad or m.
         speed: Derivative of the position, rad/s or m/s.
@@ -358,16 +357,16 @@ def _spring_force(actor: Row, t_s: float, at: Vector, speed: Vector) -> Pair:
 def _find_table_rows(actor: Row, t_s: float, table: TorqueTable) -> tuple[int, int, float]:
     """Finds the two recorded torques between which to interpolate at time t.
 
-    The recording is a table with a row per time, in which a bisection finds the neighbours.
+    The recording is a table with one row per time, which is searched by bisection.
 
     Args:
-        actor: Data of the operator, with the position of its rows in the common table.
+        actor: Row of the operator, with the position of its data in the common table.
         t_s: Time since the start of the session, s.
         table: Tables of all operators and environments. Column 0 is the time of a row, s.
 
     Returns:
-        The indices of the rows before and after the time, and the position of the time between
-        these rows, from 0 to 1. The indices are -1 if the time is outside the recording.
+        The indices of the rows before and after t, and the relative position of t between these
+        rows, from 0 to 1. The indices are -1 if t is outside the recording.
     """
     first = actor.table_first
     count = actor.table_count
@@ -387,12 +386,12 @@ def _find_table_rows(actor: Row, t_s: float, table: TorqueTable) -> tuple[int, i
 
 @leaf
 def _recorded_torque(actor: Row, t_s: float, table: TorqueTable) -> Pair:
-    """Returns the torque of an operator whose torques were recorded, by linear interpolation.
+    """Returns the recorded torque of an operator at time t, by linear interpolation.
 
     The torque is zero before and after the recording.
 
     Args:
-        actor: Data of the operator.
+        actor: Row of the operator.
         t_s: Time since the start of the session, s.
         table: Tables of all operators and environments, for example of recorded torques.
     """
@@ -410,7 +409,7 @@ def _recorded_torque(actor: Row, t_s: float, table: TorqueTable) -> Pair:
 def _sine_of_turns(turns: float) -> float:
     """Returns sin(2 pi turns) for any number of turns.
 
-    The whole turns are removed first, because the sine of a large angle would lose digits.
+    Complete turns are removed first, because the sine of a large angle would lose precision.
     """
     fraction = turns - math.floor(turns)
     s, _ = sincos(2.0 * math.pi * fraction)
@@ -419,16 +418,16 @@ def _sine_of_turns(turns: float) -> float:
 
 @leaf
 def _chirp_size(actor: Row, t_s: float) -> float:
-    """Returns the present value of a chirp, a sine whose frequency rises or falls with time.
+    """Returns the current value of a chirp, a sine whose frequency changes with time.
 
     Such a torque excites the arm at all frequencies of a range, one after another, in repeated
     sweeps. With the frequencies f0 and f1 at the start and the end of a sweep, the duration
-    `span` of a sweep, and the time x since the present sweep began, the value is
+    `span` of a sweep, and the time x since the current sweep began, the value is
 
         sin(2 pi x (f0 + (f1 - f0) x / (2 span)))
 
     Args:
-        actor: Data of the operator, with the frequencies in `b`, Hz.
+        actor: Row of the operator, with the frequencies in `b`, Hz.
         t_s: Time since the start of the session, s.
     """
     first_hz = actor.b[0]
@@ -445,12 +444,12 @@ def _chirp_size(actor: Row, t_s: float) -> float:
 
 @leaf
 def _multisine_size(actor: Row, t_s: float, table: TorqueTable) -> float:
-    """Returns the present value of a multisine, a sum of sines that each have the amplitude 1.
+    """Returns the current value of a multisine, a sum of sines of amplitude 1.
 
     Such a torque excites the arm at several frequencies at once.
 
     Args:
-        actor: Data of the operator.
+        actor: Row of the operator.
         t_s: Time since the start of the session, s.
         table: Tables of all actors, here with rows of frequency, Hz, and phase, turns.
     """
@@ -467,17 +466,17 @@ def _multisine_size(actor: Row, t_s: float, table: TorqueTable) -> float:
 
 @leaf
 def _scripted_size(actor: Row, t_s: float, table: TorqueTable) -> float:
-    """Returns the present value of a scripted torque, as a multiple of its amplitude `a`.
+    """Returns the current value of a scripted torque, as a multiple of its amplitude `a`.
 
     The torque is a pulse, a chirp or a multisine. A pulse is
 
         sin^2(pi (t - start) / (end - start))
 
-    which is smooth at both ends as in Fig. 3 of the paper. The paper does not give the
+    which is smooth at both ends, as in Fig. 3 of the paper. The paper does not state the
     parameters of its pulses.
 
     Args:
-        actor: Data of the operator.
+        actor: Row of the operator.
         t_s: Time since the start of the session, s.
         table: Tables of all operators and environments, for example of recorded torques.
     """
@@ -498,7 +497,7 @@ def _wall_force(actor: Row, at: Pair, speed: Pair) -> Pair:
     The wall is a spring and a damper. The force acts along the wall's normal and never pulls.
 
     Args:
-        actor: Data of the wall: a point of it in `a`, m, and its outward normal in `b`.
+        actor: Row of the wall: a point of the wall in `a`, m, and the outward normal in `b`.
         at: Position of the end effector, m.
         speed: Velocity of the end effector, m/s.
     """
@@ -521,8 +520,7 @@ def _wall_force(actor: Row, at: Pair, speed: Pair) -> Pair:
 def _is_at_end_effector(actor: Row) -> bool:
     """Returns True if the force of an actor acts on the end effector, False if on the joints.
 
-    An actor is an operator or an environment. A force at the end effector has to be converted
-    to joint torques by the transposed Jacobian.
+    A force at the end effector must be mapped to joint torques by the transposed Jacobian.
     """
     kind: int = actor.kind
     return kind in (_TASK_HAND, _WALL, _OWN_TIP, _LIVE_TIP, _LIVE_FORCE)
@@ -530,15 +528,15 @@ def _is_at_end_effector(actor: Row) -> bool:
 
 @leaf
 def _call_user_function(actor: Row, t_s: float, table: TorqueTable) -> None:
-    """Calls the compiled function of an operator or environment that a user wrote.
+    """Calls a user's compiled function of an operator or environment.
 
-    The program and the function exchange values through the fields of the row `actor`. The
-    program has written the position (`at`) and the velocity (`speed`) before the call, and has
-    set `effort` to zero. The function writes the resulting torque or force into `effort`.
+    Values are exchanged through the fields of the row `actor`. Before the call, the position
+    (`at`) and the velocity (`speed`) have been written, and `effort` has been set to zero. The
+    function writes the resulting torque or force into `effort`.
 
     Args:
-        actor: Data of the operator or environment. `call` is the address of the function.
-        t_s: Time since the epoch (the common start of the session), s.
+        actor: Row of the operator or environment. `call` is the address of the function.
+        t_s: Time since the start of the session, s.
         table: Tables of all actors. The rows `table_first` to `table_first + table_count` hold
             the parameters of the user's model.
     """
@@ -553,12 +551,12 @@ def _call_user_function(actor: Row, t_s: float, table: TorqueTable) -> None:
 
 @leaf
 def _user_effort(actor: Row, t_s: float, at: Vector, speed: Vector, table: TorqueTable) -> Pair:
-    """Returns the torque or force of an operator or environment that a user programmed.
+    """Returns the torque or force of a user-defined operator or environment.
 
     The result acts on the two joints of the planar arm, N m, or along two axes, N.
 
     Args:
-        actor: Data of the operator or environment.
+        actor: Row of the operator or environment.
         t_s: Time since the start of the session, s.
         at: Position along the joints or axes, rad or m.
         speed: Derivative of the position, rad/s or m/s.
@@ -577,11 +575,11 @@ def _end_effector_torque(
 ) -> SourceTorque:
     """Returns the joint torque of an operator or environment that acts at the end effector.
 
-    Its force F has the effect of the joint torque J' F, where J is the Jacobian of the end
-    effector. The third number is the norm of F for a wall, N, and 0 otherwise.
+    A force F is equivalent to the joint torque J' F, where J is the Jacobian of the end
+    effector. The third value is the norm of F for a wall, N, and 0 otherwise.
 
     Args:
-        actor: Data of the operator or environment.
+        actor: Row of the operator or environment.
         t_s: Time since the start of the session, s.
         q: Joint angles, rad.
         qd: Joint velocities, rad/s.
@@ -732,11 +730,11 @@ def _force_in_space(
 ) -> Three:
     """Returns the force of an operator or environment on the end effector of a chain, N.
 
-    The force comes from a user's function, from an operator who pulls the end effector by a
-    spring, or from a wall that pushes the end effector.
+    The force is exerted by a user's function, by an operator who pulls the end effector with a
+    spring, or by a wall that pushes it.
 
     Args:
-        actor: Data of the operator or environment.
+        actor: Row of the operator or environment.
         t_s: Time since the start of the session, s.
         at: Position of the end effector, m.
         speed: Velocity of the end effector, m/s.
@@ -794,17 +792,17 @@ def _add_joint_torque(
 ) -> None:
     """Adds the torque of an operator or environment that acts directly on joints of a chain.
 
-    Examples are a recorded torque per joint, and a damper in each joint. Forces at the end
-    effector are converted to joint torques elsewhere, by `put_torque_on_chain`.
+    Examples are a recorded torque per joint and a damper at each joint. Forces at the end
+    effector are mapped to joint torques by `put_torque_on_chain`.
 
     Args:
-        actor: Data of the operator or environment.
+        actor: Row of the operator or environment.
         t_s: Time since the start of the session, s.
         q: Joint positions, shape (n,), rad or m.
         qd: Joint velocities, shape (n,), rad/s or m/s.
         joints: Number n of joints.
         table: Tables of all operators and environments, for example of recorded torques.
-        torque: The torque is added to it, shape (n,), N m.
+        torque: The torque is added to this array, shape (n,), N m.
     """
     if actor.kind == _HAND or actor.kind == _LIVE_JOINT:
         # An operator, who pulls each joint to a target by a spring.
@@ -855,8 +853,8 @@ def _tip_motion(qd: Vector, tip: Vector, chain: RowArray) -> tuple[Three, Three]
     Args:
         qd: Joint velocities, shape (n,), rad/s or m/s.
         tip: Position of the end effector in the last link's frame, m.
-        chain: Data of the joints, one row per joint. `place_joints` must have been called
-            before. The Jacobian of the end effector is written into it.
+        chain: Joint data, one row per joint. `place_joints` must have been called before. The
+            Jacobian of the end effector is written into it.
     """
     position = place_end_effector(chain, tip)
     velocity = (0.0, 0.0, 0.0)

@@ -12,7 +12,7 @@ from .chain import Matrix, Three, multiply_matrices, multiply_vector
 from .elementary import sincos
 
 _plain_sincos = getattr(sincos, "py_func", sincos)
-"""The function `sincos` as plain Python. Compiling it takes longer than reading a file."""
+"""Uncompiled version of `sincos`, because compiling takes longer than reading an arm file."""
 
 
 class FramePose(NamedTuple):
@@ -44,10 +44,10 @@ class FramePose(NamedTuple):
         return cls(rotation, origin_m)
 
     def __matmul__(self, inner: "FramePose") -> "FramePose":
-        """Returns the product of two poses, which places one frame inside another.
+        """Returns the composition of two poses.
 
-        The pose `inner` is relative to the frame of this pose. The result is the pose of the
-        inner frame, relative to the frame to which this pose is relative.
+        `inner` is expressed in the frame of this pose. The result is the pose of the inner
+        frame, expressed in the outer frame of this pose.
         """
         x, y, z = self.turn(inner.origin_m)
         ox, oy, oz = self.origin_m

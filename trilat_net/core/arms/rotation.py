@@ -19,10 +19,10 @@ from .chain import Matrix, Three, add_vectors, cross_product, dot_product, scale
 from .elementary import sincos
 
 _SMALL = 1e-8
-"""Below this angle, rad, the sine equals the angle to the last bit."""
+"""Angle, rad, below which the sine equals the angle to the last bit."""
 _SHORT = 0.02
-"""Below this angle, rad, the first terms of a series are exact to the last bit, in contrast to
-closed forms.
+"""Angle, rad, below which the first terms of a series are exact to the last bit, whereas closed
+forms are not.
 """
 
 
@@ -86,17 +86,17 @@ def rotation_matrix(vector: Three) -> Matrix:
 def _choose_component(
     trace: float, xx: float, yy: float, zz: float, components: tuple[float, float, float, float]
 ) -> float:
-    """Returns one of four values, depending on which component of a quaternion is the largest.
+    """Returns one of four values, depending on which quaternion component is largest.
 
-    The components themselves are not known yet. The diagonal xx, yy, zz of the rotation matrix
-    and its trace tell which of them has the largest magnitude.
+    The components themselves are not yet known. The component with the largest magnitude is
+    determined from the trace and the diagonal of the rotation matrix.
 
     Args:
         trace: Trace of the rotation matrix.
-        xx: First number of its diagonal.
-        yy: Second number of its diagonal.
-        zz: Third number of its diagonal.
-        components: Values if w, x, y or z is the largest component.
+        xx: First diagonal element.
+        yy: Second diagonal element.
+        zz: Third diagonal element.
+        components: Values to return if w, x, y or z is the largest component.
     """
     by_w, by_x, by_y, by_z = components
     by_others = choose(yy >= zz, by_y, by_z)
@@ -108,7 +108,7 @@ def _choose_component(
 def _quaternion(R: Array | Matrix) -> tuple[float, Three]:
     """Converts a rotation matrix to a quaternion (w, v), with the scalar part w >= 0.
 
-    The method starts from the largest component (Shepperd, 1978), and so never divides by a
+    The method starts from the largest component (Shepperd, 1978), which avoids division by a
     small number.
     """
     xx, xy, xz = R[0]
@@ -183,8 +183,8 @@ def relative_rotation(R: Array | Matrix, other: Array | Matrix) -> Three:
 def _times_rows(row: Three, a: Three, b: Three, c: Three) -> Three:
     """Returns the scalar products of the vector `row` with the three vectors a, b and c.
 
-    These are one row of the product P Q' of two matrices, where `row` is a row of P, and a, b
-    and c are the rows of Q.
+    The result is one row of the matrix product P Q', where `row` is a row of P, and a, b and c
+    are the rows of Q.
     """
     x = row[0]
     y = row[1]

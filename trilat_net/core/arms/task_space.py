@@ -48,11 +48,11 @@ from .chain import (
 from .rotation import compose_rotations, relative_rotation, rotation_matrix
 
 POSITION = 3
-"""Number of a task's coordinates without an orientation."""
+"""Number of task-space coordinates if only positions are followed."""
 POSE = 6
-"""Number of a task's coordinates with an orientation."""
+"""Number of task-space coordinates if positions and orientations are followed."""
 TINY = 1e-12
-"""For a pivot of J J' below this value, the end effector cannot move along the axis at all."""
+"""Pivot of J J' below which the end effector cannot move along the axis at all."""
 
 
 @leaf
@@ -121,15 +121,14 @@ def update_pose(s: Row, chain: RowArray) -> None:
 
 @leaf
 def _update_jacobian_rate(s: Row, chain: RowArray, tip: Three) -> None:
-    """Computes the time derivative of the end effector's Jacobian J, for joint velocities qd.
+    """Computes the time derivative of the end effector's Jacobian J.
 
-    J has a column for each joint. It changes because the axes of the joints turn with their
-    links, and because their origins and the end effector move.
+    J has one column per joint. It changes because the joint axes turn with their links, and
+    because the joints and the end effector move.
 
     Args:
-        s: State of the site, with qd; the derivative is written into `Jd`.
-        chain: Data of the joints, one row per joint. `place_end_effector` must have been called
-            before.
+        s: State of the site, with the joint velocities qd; the derivative is written into `Jd`.
+        chain: Joint data, one row per joint. `place_end_effector` must have been called before.
         tip: Position of the end effector in base axes, m.
     """
     zeros = (0.0, 0.0, 0.0)
@@ -220,7 +219,7 @@ def _divide(number: float, pivot: float) -> float:
     """Returns a number divided by a pivot of a matrix factorisation, or 0 if the pivot is 0.
 
     A pivot of J J' is 0 for a direction in which the end effector cannot move. The result 0
-    then means no motion in this direction.
+    then means no motion in that direction.
     """
     has_pivot = pivot > TINY
     return choose(has_pivot, number / choose(has_pivot, pivot, 1.0), 0.0)
@@ -228,7 +227,7 @@ def _divide(number: float, pivot: float) -> float:
 
 @leaf
 def _factor(s: Row, damping: float) -> None:
-    """Factors the matrix J J' + damping I as L D L', so that `_solve` can divide by it.
+    """Factors the matrix J J' + damping I as L D L', for use by `_solve`.
 
     J is the Jacobian of the end effector. L is a lower triangular matrix with ones on its
     diagonal, and D a diagonal matrix. They are stored together in `s.A`: D on the diagonal, and
@@ -238,8 +237,8 @@ def _factor(s: Row, damping: float) -> None:
         D_j      = B_jj - sum_{p < j} L_jp^2 D_p
 
     J has a row of zeros for each axis that is not followed. For such an axis, 1 is added to the
-    diagonal of B, so that its pivot D_j is not zero. If another pivot vanishes, the arm cannot
-    move along the axis, and L is zero in its column.
+    diagonal of B, so that its pivot D_j is not zero. If any other pivot is zero, the arm cannot
+    move along that axis, and the column of L is set to zero.
 
     Args:
         s: State of the site. `axes` is 1 for each axis that is followed, otherwise 0.
@@ -265,10 +264,10 @@ def _factor(s: Row, damping: float) -> None:
 
 @leaf
 def _solve(s: Row, b: Array, y: Array) -> None:
-    """Solves the linear equations L D L' y = b by forward and backward substitution.
+    """Solves the linear system L D L' y = b by forward and backward substitution.
 
-    L is a lower triangular and D a diagonal matrix. `_factor` must have computed them before;
-    it stores both in `s.A`.
+    The lower triangular matrix L and the diagonal matrix D are stored in `s.A` by `_factor`,
+    which must have been called before.
 
     Args:
         s: State of the site. `A` has D on its diagonal, and the lower triangular matrix L below
@@ -291,17 +290,18 @@ def _solve(s: Row, b: Array, y: Array) -> None:
 
 @leaf
 def _factor_damped(s: Row) -> None:
-    """Factors J J', with a damping near singular poses, where the arm can hardly move.
+    """Factors J J', adding damping near singular poses.
 
-    J is the Jacobian of the end effector. The number 1 / trace((J J')^-1) is a lower bound of
-    the square of the least singular value of J. If this number is below the square of
-    `s.singular_value`, the damping is the difference, otherwise zero. The trace covers the axes
-    that are followed. It is computed from the factors without damping, by solving for each
-    column of the inverse.
+    J is the Jacobian of the end effector. 1 / trace((J J')^-1) is a lower bound of the square
+    of the smallest singular value of J. If this bound is below the square of
+    `s.singular_value`, the damping is the difference, otherwise zero. The trace covers the
+    followed axes. It is computed from the undamped factors by solving for each column of the
+    inverse.
 
     Args:
         s: State of the site. J and its derivative Jd get rows of zeros for axes that are not
-            followed. The factors are written into A, see `_factor`. `b` and `y` are work space.
+            followed. The factors are written into A (see `_factor`). `b` and `y` are work
+            space.
     """
     for j in range(s.shared):
         mask = s.axes[j]
@@ -336,9 +336,9 @@ def _update_axis_errors(s: Row) -> None:
     """Computes the error e of the end effector and its derivative ed, for each axis.
 
     For a position, e is the difference from the reference, m. For a pose, the last three
-    numbers of e are the rotation vector from the reference orientation to the present one, rad.
-    Both are zero along axes that the task does not follow, so that the control law does nothing
-    along them.
+    entries of e are the rotation vector from the reference orientation to the current
+    orientation, rad. Both are zero along axes that are not followed, so the control law does
+    not act along them.
     """
     for j in range(s.shared):
         s.e[j] = s.x[j] - s.q_des[j]

@@ -260,7 +260,7 @@ def update_external_torque(
 
 @leaf
 def _add_scaled(x: Vector, step_s: float, rate: Vector) -> Pair:
-    """Returns x + step_s * rate: two joint values after the time `step_s` at constant rates."""
+    """Returns x + step_s * rate: two joint values after `step_s` seconds at constant rates."""
     first = x[0] + step_s * rate[0]
     second = x[1] + step_s * rate[1]
     return first, second

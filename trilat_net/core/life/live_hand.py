@@ -40,18 +40,21 @@ from ..step.jit import leaf
 from ..step.vectors import Array, Vector
 
 SILENCE_NS = 200_000_000
-"""A longer silence of the holder releases the arm."""
+"""Silence of the holder after which the arm is released, ns."""
 GRIP_NS = 100_000_000
-"""Time in which a grip grows from 0 to 1, and in which it fades from 1 to 0."""
+"""Time in which the grip grows from 0 to 1, or fades from 1 to 0, ns."""
 GLIDE_NS = 50_000_000
-"""Longest time of a glide to the goal, unless a limit of the target prolongs it."""
+"""Longest time for the target to reach a new goal, ns, unless a limit on its motion prolongs
+it.
+"""
 
 ANOTHER_HOLDS = "hand: another one holds the arm"
 OUT_OF_ORDER = "hand: out of order"
 TAKEN = "takes hold"
 RELEASED = "lets go"
 SILENT = "is silent: let go"
-"""Outcomes of a message or a silence: reasons to ignore a message, and changes of the holder.
+"""Outcomes of a message or of a silence: reasons for ignoring a message, and changes of the
+holder.
 """
 
 
@@ -324,15 +327,15 @@ class HandStep(NamedTuple):
 
 
 def _move_target(rules: HandRules, memory: HandMemory) -> HandMemory:
-    """Returns the state one period later, with the target moved and the grip firmer or weaker.
+    """Returns the state one tick later, with the target moved and the grip updated.
 
-    The target moves with its velocity `rate`. The grip, a factor of the force from 0 to 1,
-    grows while a sender holds the arm, and fades after that. It needs GRIP_NS for the whole
-    range. When it has faded, nobody holds the arm, and no target is left.
+    The target moves at its velocity `rate`. The grip, a factor of the force from 0 to 1, grows
+    while a sender holds the arm and fades afterwards, taking GRIP_NS for the full range. Once
+    the grip has faded to 0, there is no holder and no target.
 
     Args:
         rules: Limits of the hand, and the rate of the control loop.
-        memory: State after the previous tick (period of the loop), with a target.
+        memory: State after the previous tick, with a target.
     """
     h_s = 1.0 / rules.rate_hz
     # The period, 1e9 / rate_hz in ns, as a fraction of GRIP_NS.
@@ -396,7 +399,7 @@ def find_glide_ns(between_messages_ns: int, rate_hz: int) -> int:
 
 _plain_glide_ns = getattr(find_glide_ns, "py_func", find_glide_ns)
 _plain_stopping_speed = getattr(find_stopping_speed, "py_func", find_stopping_speed)
-"""The same functions, uncompiled: a call from Python into compiled code takes longer than these
+"""The uncompiled functions. A call from Python into compiled code would take longer than these
 few operations.
 """
 
@@ -486,17 +489,16 @@ def _glide_tick(
 ) -> None:
     """Moves a target towards its goal in one control period, with limited acceleration.
 
-    A simulated spring pulls the arm to this target. The equations of the velocity are those of
-    `_find_limited_rate`, for compiled code.
+    Compiled equivalent of `_find_limited_rate`.
 
     Args:
-        left_s: Time that remains until the target arrives at the goal, s.
-        h_s: The period, s.
+        left_s: Time remaining until the target should reach the goal, s.
+        h_s: The control period, s.
         speed_limit: Largest speed of the target, m/s or rad/s.
         acceleration: Largest acceleration of the target, m/s^2 or rad/s^2.
         goal: The goal, shape (size,).
-        target: The target; changed, shape (size,).
-        rate: Its velocity; changed, shape (size,).
+        target: The target; modified, shape (size,).
+        rate: Velocity of the target; modified, shape (size,).
     """
     size = target.shape[0]
     square = 0.0
@@ -528,21 +530,21 @@ def _accept_command(
     command: HandCommand,
     locate: Callable[[], Sequence[float]],
 ) -> tuple[HandMemory, str]:
-    """Processes a message of a person or program that holds an arm, or wants to.
+    """Processes a message from a person or program that holds an arm, or tries to.
 
-    Only one sender holds an arm at a time. A message may take hold of a free arm, move the goal
-    to which the arm is pulled, or release the arm.
+    Only one sender can hold an arm at a time. A message may take hold of a free arm, move the
+    goal, or release the arm.
 
     Args:
         rules: Limits of the goals.
         memory: State before the message.
-        t_ns: Nominal time of the tick (control period), ns since the start of the session.
+        t_ns: Nominal time of the tick, ns since the start of the session.
         command: The message.
-        locate: Function that returns the arm's pose now.
+        locate: Function that returns the current pose of the arm.
 
     Returns:
-        The state after the message, and the outcome: a reason why the message has no effect, a
-        change of the holder, or "" for an ordinary message.
+        The state after the message, and the outcome: the reason why the message has no effect,
+            a change of the holder, or "" for an ordinary message.
     """
     is_held = memory.source != 0
     if is_held and memory.source != command.source:
@@ -583,24 +585,21 @@ def _take_hold(
     command: HandCommand,
     locate: Callable[[], Sequence[float]],
 ) -> HandMemory:
-    """Returns the state after a message by which a sender takes hold of a free arm.
+    """Returns the state after a sender has taken hold of a free arm.
 
-    A simulated spring pulls the arm to a target, which moves to the goal of the message. The
-    grip is the factor of the spring's force, 0 to 1. While the grip of an earlier hold fades,
-    its target still exists and moves. The new hold then continues with this grip, target and
-    velocity, so that the force does not jump. Otherwise it starts without force, at the pose of
-    the arm.
+    While the grip of an earlier hold fades, its target still exists and moves. A new hold then
+    continues with this grip, target and velocity, so that the force does not jump. Otherwise
+    the hold starts at the pose of the arm, with no force.
 
     Args:
         rules: Limits of the hand.
-        memory: State before the message. Nobody holds the arm.
-        t_ns: Nominal time of the tick (control period), ns since the epoch, the common start of
-            the session.
+        memory: State before the message, in which nobody holds the arm.
+        t_ns: Nominal time of the tick, ns since the start of the session.
         command: The message.
-        locate: Function that returns the arm's pose now.
+        locate: Function that returns the current pose of the arm.
 
     Returns:
-        The state. The target arrives at its goal after GLIDE_NS.
+        The new state. The target reaches its goal after GLIDE_NS.
     """
     zeros = (0.0,) * rules.size
     is_earlier_grip_fading = bool(memory.target)
@@ -626,15 +625,15 @@ def _take_hold(
 def _aim(
     rules: HandRules, memory: HandMemory, command: HandCommand, arrives_ns: int
 ) -> HandMemory:
-    """Returns the state of a pulled arm with the goal of a new message.
+    """Returns the state after the goal has been set from a new message.
 
-    A goal that the arm cannot reach is moved to the nearest point that it can reach.
+    A goal out of reach is replaced by the nearest reachable point.
 
     Args:
         rules: Limits of the hand.
         memory: State before the message.
         command: The message.
-        arrives_ns: Time at which the target arrives at the goal, ns since the start of the
+        arrives_ns: Time at which the target should reach the goal, ns since the start of the
             session.
     """
     goal = rules.reach.find_nearest(command.target)
@@ -646,30 +645,28 @@ def _aim(
 def _release(memory: HandMemory, number: int) -> HandMemory:
     """Returns the state after a person or program has let go of the arm.
 
-    Nobody holds the arm, but the grip, the target and its velocity continue, so that the force
-    fades without a jump.
+    The grip, the target and its velocity are kept, so that the force fades smoothly.
 
     Args:
         memory: State before the release.
-        number: Messages of the former holder up to this number are outdated. They do not take
-            hold of the arm again.
+        number: Messages of the former holder up to this sequence number are outdated, and
+            cannot take hold of the arm again.
     """
     before = (memory.source, number)
     return HandMemory(grip=memory.grip, target=memory.target, rate=memory.rate, before=before)
 
 
 def _find_fading_rate(rules: HandRules, memory: HandMemory) -> tuple[float, ...]:
-    """Returns the velocity of the target after the person has let go of the arm.
+    """Returns the velocity of the target while the grip fades after a release.
 
-    The force that pulls the arm to the target fades meanwhile. The speed of the target falls
-    with the largest deceleration that `rules` allow, until the target stands still.
+    The target decelerates as fast as `rules` allow until it stands still.
 
     Args:
         rules: Limits of the target's motion, and the rate of the control loop.
-        memory: State of the pull, with the present velocity of the target.
+        memory: State of the hand, with the current velocity of the target.
 
     Returns:
-        The velocity, one number per coordinate, in the unit of the target per second.
+        The velocity, one entry per coordinate, in the unit of the target per second.
     """
     speed = math.sqrt(sum(v * v for v in memory.rate))
     largest_change = rules.acceleration_limit / rules.rate_hz
@@ -684,22 +681,20 @@ def _find_limited_rate(
 ) -> tuple[float, ...]:
     """Returns the velocity with which a target moves towards its goal and stops there.
 
-    A simulated spring pulls an arm to this target. Speed and acceleration are limited.
+    Speed and acceleration are limited. The desired velocity points to the goal. Its magnitude
+    is the smallest of three speeds: the speed limit, the speed that reaches the goal in the
+    remaining time, and the largest speed from which the target can stop at the goal, Eq. (L1)
+    of the module docstring. The velocity changes linearly towards the desired velocity, by at
+    most the acceleration limit times the control period.
 
-    The desired velocity points to the goal. Its size is the smallest of three speeds: the speed
-    limit, the speed that reaches the goal in the time that is left, and the largest speed from
-    which the target can stop at the goal, Eq. (L1) at the top of this module. The velocity
-    changes from the last to the desired velocity in a straight line, by at most the
-    acceleration limit times the period.
-
-    The norms of velocities and accelerations are limited. The last and the desired velocity
-    lie within the speed limit, and so does any velocity between them.
+    The limits apply to the norms. The previous and the desired velocity are both within the
+    speed limit, and so is any velocity between them.
 
     Args:
-        rules: The limits of the hand.
-        memory: Its state, with the target already moved, the goal, and the last velocity
-            `rate`, m/s or rad/s.
-        left_s: Time that remains until the target arrives at the goal, s.
+        rules: Limits of the hand.
+        memory: State of the hand, with the target already moved, the goal, and the previous
+            velocity `rate`, m/s or rad/s.
+        left_s: Time remaining until the target should reach the goal, s.
 
     Returns:
         The velocity of the target, m/s or rad/s per coordinate.
@@ -730,17 +725,17 @@ def _find_limited_rate(
 def _find_rate(rules: HandRules, memory: HandMemory, t_ns: int) -> tuple[float, ...]:
     """Returns the velocity with which a target moves towards its goal.
 
-    A simulated spring pulls an arm to this target. It moves straight, and arrives when the next
-    message with a new goal is expected, unless this needs more than the largest speed. If the
-    acceleration is limited, it also slows down in time.
+    The target moves in a straight line, and arrives when the next message with a new goal is
+    expected, unless this would exceed the speed limit. If the acceleration is limited, the
+    target also decelerates in time.
 
     Args:
         rules: Limits of the target's motion, and the rate of the control loop.
-        memory: State, with the target already moved to this tick.
-        t_ns: Nominal time of the tick (control period), ns since the start of the session.
+        memory: State of the hand, with the target already moved to this tick.
+        t_ns: Nominal time of the tick, ns since the start of the session.
 
     Returns:
-        The velocity, one number per coordinate, in the unit of the target per second.
+        The velocity, one entry per coordinate, in the unit of the target per second.
     """
     # An overdue target arrives within one period.
     period_s = 1.0 / rules.rate_hz

@@ -35,7 +35,7 @@ from .live_hand import (
 )
 
 PROGRAM = 1
-"""The source that a record names for each action of a hand program."""
+"""Source recorded for each action of a hand program."""
 
 
 class HandContext(NamedTuple):
@@ -208,13 +208,12 @@ class OwnHand:
         )
 
     def _view_peers(self, k: int, links: Any, coordinates: int) -> tuple[PeerView, ...]:
-        """Returns what the user's program may know about the other arms.
+        """Returns the data about the other arms that the user's program may use.
 
-        The program sees the states of the other arms that this arm used in the previous control
-        period, after their network delay.
+        These are the delayed states of the other arms that this arm used in the previous tick.
 
         Args:
-            k: Number of the tick (control period) of the decision.
+            k: Number of the tick of the decision.
             links: State of each link, one row per peer.
             coordinates: Number of coordinates of a sample.
         """
@@ -289,13 +288,13 @@ class OwnHand:
         self._schedule(k, k, (), grip=False)
 
     def _schedule(self, k: int, due: int, target: tuple[float, ...], *, grip: bool) -> None:
-        """Stores a decision of the user's program until the tick (period) in which it acts.
+        """Stores a decision of the user's program until the tick in which it takes effect.
 
-        The wait imitates the reaction time of a person.
+        The delay imitates the reaction time of a person.
 
         Args:
-            k: Tick of the view on which the command is based.
-            due: Tick in which the command acts.
+            k: Tick of the view on which the decision is based.
+            due: Tick in which the decision takes effect.
             target: Target or force; empty if the arm is released.
             grip: True if the program holds the arm.
         """

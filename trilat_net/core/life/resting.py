@@ -48,7 +48,7 @@ from ..step.ticks import NS_PER_S, LifeReason, Mode
 from ..step.vectors import Array
 
 REST_RATE_1_S = 3.0
-"""Lambda for an arm at rest, if its control law has no such rate for the joints, 1/s."""
+"""Lambda for a resting arm if its control law has no such rate for the joints, 1/s."""
 
 _ROUNDING_S = 1e-9
 """Tolerance for rounding errors in the time at which a reference comes to rest, s."""
@@ -78,11 +78,11 @@ def rests(site: SiteRow) -> bool:
 
 @leaf
 def _find_brake_ratio(site: SiteRow) -> float:
-    """Returns how much of its largest torque an arm needs for braking by damping alone.
+    """Returns the fraction of the torque limit required for braking with damping alone.
 
-    This is the largest ratio of B |qd| to the torque limit over the joints, where B is the
-    damping with which the arm comes to rest, and qd the joint velocity. Above 1 the damping
-    alone needs more torque than a joint has.
+    This is the maximum of B |qd| / torque limit over all joints, where B is the damping with
+    which the arm comes to rest, and qd the joint velocity. If the ratio exceeds 1, damping
+    alone would require more torque than a joint can produce.
     """
     ratio = 0.0
     for i in range(site.joints):
@@ -93,10 +93,10 @@ def _find_brake_ratio(site: SiteRow) -> float:
 
 @leaf
 def _is_fast(site: SiteRow) -> bool:
-    """Returns True if an arm moves so fast that braking by damping exceeds a torque limit.
+    """Returns True if an arm moves so fast that damping would exceed a torque limit.
 
-    The damping of a joint needs the torque B |qd|, where B is the damping gain in N m s/rad and
-    qd the velocity of the joint. It suffices that one joint exceeds its limit.
+    Damping requires the torque B |qd|, where B is the damping gain in N m s/rad and qd the
+    joint velocity. A single joint that exceeds its limit is sufficient.
     """
     fast: bool = _find_brake_ratio(site) > 1.0
     return fast
@@ -152,7 +152,7 @@ def enter_rest(t_ns: int, mode: int, reason: int, site: SiteRow) -> None:
 def _read_rest_reference(site: SiteRow, i: int) -> tuple[float, float]:
     """Returns the reference position and velocity of joint i while the arm comes to rest.
 
-    `_write_rest_reference` says why joint space and task space keep them in different fields.
+    `_write_rest_reference` explains why joint space and task space use different fields.
 
     Returns:
         The position, rad or m, and the velocity, rad/s or m/s.
@@ -164,15 +164,15 @@ def _read_rest_reference(site: SiteRow, i: int) -> tuple[float, float]:
 
 @leaf
 def _write_rest_reference(site: SiteRow, i: int, q: float, qd: float) -> None:
-    """Stores the rest reference of a joint, the motion that brings the joint to rest.
+    """Stores the rest reference of a joint, which brings the joint to rest.
 
-    In joint space, the sites share joint angles. The fields `q_held` and `qd_held` have one
-    number per joint, and no other use while the arm rests. In task space, the sites share poses
-    of the end effector. Then these fields have one number per coordinate of the pose, and the
-    joints need `q_rest` and `qd_rest`. `_read_rest_reference` reads the same fields.
+    In joint space, the fields `q_held` and `qd_held` have one entry per joint, and are
+    otherwise unused while the arm rests. In task space, they have one entry per coordinate of
+    the end effector pose, so the joints use `q_rest` and `qd_rest` instead.
+    `_read_rest_reference` reads the same fields.
 
     Args:
-        site: State of the site; changed.
+        site: State of the site; modified.
         i: Index of the joint.
         q: Position of the reference, rad.
         qd: Velocity of the reference, rad/s.
@@ -187,10 +187,10 @@ def _write_rest_reference(site: SiteRow, i: int, q: float, qd: float) -> None:
 
 @leaf
 def _find_remaining_s(elapsed_s: float, site: SiteRow) -> float:
-    """Returns the time T_left that the arm still takes to come to rest, s.
+    """Returns the remaining time T_left until the arm comes to rest, s.
 
-    It is at least the part of LEAST_STOP_S that is left, and long enough for each joint to stop
-    with the deceleration that half of its torque limit gives.
+    T_left is at least the remainder of LEAST_STOP_S, and long enough for each joint to stop
+    with half of its torque limit.
 
     Args:
         elapsed_s: Time since the start of the rest, s.
@@ -253,14 +253,13 @@ def advance_rest_reference(t_ns: int, ticks: int, site: SiteRow) -> None:
 
 @leaf
 def _brakes(t_ns: int, site: SiteRow) -> bool:
-    """Returns True while the arm brakes, which is the first part of its rest.
+    """Returns True while the arm brakes, which is the first phase of coming to rest.
 
-    An arm at rest follows a reference, a position of each joint that slows down to zero
-    velocity. The arm brakes for at least LEAST_STOP_S, while the reference of a joint moves,
-    and while the arm is fast (its damping alone exceeds a torque limit).
+    The arm brakes for at least LEAST_STOP_S, and for as long as the rest reference of a joint
+    moves or the arm is fast (see `_is_fast`).
 
     Args:
-        t_ns: Time, ns since the epoch, the common start of the session.
+        t_ns: Time, ns since the start of the session.
         site: State of the site. While the arm is at rest, `return_from_ns` is the start of the
             rest.
     """
@@ -302,13 +301,12 @@ def put_rest_reference(site: SiteRow, q: Array, qd: Array) -> None:
 
 @leaf
 def _find_slip(site: SiteRow, i: int) -> float:
-    """Returns how far joint i deviates from its motion at rest, as a filtered error in rad/s.
+    """Returns the filtered deviation s of joint i from its rest reference, rad/s.
 
         s = qd - qd_ref + Lambda (q - q_ref)
 
-    The reference q_ref brings the joint to rest. The damping and the integral term of an arm at
-    rest act on s. Lambda is the rate of the adaptive law in joint space, and `REST_RATE_1_S`
-    with any other law, which has no such rate.
+    The damping and the integral term of a resting arm act on s. Lambda is the rate of the
+    adaptive law in joint space, or `REST_RATE_1_S` for other laws, which have no such rate.
 
     Returns:
         The deviation s, rad/s or m/s.
@@ -324,7 +322,7 @@ def _find_slip(site: SiteRow, i: int) -> float:
 
 @leaf
 def _shrink(torque: float, change: float) -> float:
-    """Returns a torque with a magnitude reduced by `change`, but at least zero.
+    """Returns a torque with its magnitude reduced by `change`, but not below zero.
 
     For example, 3 N m reduced by 2 gives 1 N m, and -1 N m reduced by 2 gives 0.
 

@@ -21,7 +21,7 @@ from ..step.jit import leaf
 from ..step.row_fields import SiteRow
 
 BLEND_S = 0.1
-"""Duration of the change from the torque at rest to that of the law, s."""
+"""Duration of the blend from the rest torque to the torque of the law, s."""
 
 
 @leaf
@@ -62,11 +62,9 @@ def limit_reference(k: int, site: SiteRow) -> None:
 def _limit_turn(site: SiteRow) -> None:
     """Limits how fast the orientation of the reference turns, about each axis of the base.
 
-    The reference is the pose that the arm follows. It may turn from its orientation in the
-    previous tick (period of the control loop) by at most the limit times the period, about each
-    axis. If it turns too far, the whole rotation vector of the turn is multiplied by the same
-    factor, so that the direction of its axis is kept. The reference then turns at the velocity
-    of the shortened turn.
+    In one tick, the reference may turn about each axis by at most the limit times the control
+    period. If the turn is too large, its rotation vector is scaled down, which preserves the
+    direction of the axis. The velocity of the reference is then that of the reduced turn.
 
     Args:
         site: State of the site. Its coordinates 0 to 2 are a position, and 3 to 5 a rotation
