@@ -44,15 +44,17 @@ from .conditions import LawSituation, StabilityCondition
 from .interface import ADAPTATION, CONVERGENCE, DAMPING, ERROR_DAMPING, ControlLaw, TuningSite
 
 LEAST_SINE = 0.1
-"""Smallest abs(sin q2) with which J_hat is inverted; a more stretched elbow uses this value."""
+"""Lower bound of abs(sin q2) used when inverting J_hat; replaces smaller values near a
+stretched elbow.
+"""
 
 
 @leaf
 def _solve_jacobian(lengths: Pair, q: Pair, b: Pair) -> Pair:
-    """Returns the joint rates that move the end effector of the planar arm at a given velocity.
+    """Returns the joint rates for a given velocity of the planar arm's end effector.
 
-    The rates solve J rates = b, where J is the Jacobian of the end effector. A stretched elbow
-    makes J singular. In this case, the sine of the elbow's angle is replaced by `LEAST_SINE`.
+    The rates solve J rates = b, where J is the Jacobian of the end effector. J is singular for
+    a stretched elbow; near this pose, the sine of the elbow angle is replaced by `LEAST_SINE`.
 
     Args:
         lengths: Lengths of the two links, m.
@@ -109,8 +111,8 @@ def _jacobian_rate_times(
 ) -> Pair:
     """Returns the product of the Jacobian's time derivative and the joint velocities v.
 
-    This is the part of the end effector's acceleration that remains if v is constant. The
-    Jacobian also changes because the estimates of the link lengths change.
+    This is the acceleration of the end effector for constant v. The Jacobian also changes
+    because the estimated link lengths change.
 
     Args:
         lengths: Estimated lengths of the links, m.

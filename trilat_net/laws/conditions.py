@@ -23,10 +23,10 @@ import numpy as np
 from ..core import Array, DominanceMatrix
 
 PASSIVE_OUTSIDE = "operators and environments are passive (*sufficient*)"
-"""The premise of each law that balances energy, as part of a sentence."""
+"""Premise of every law with an energy account, as part of a sentence."""
 COMMON_MOTION_SHARE = 0.21723362821
-"""-min sin x / x: the ratio d / (K T) of damping to stiffness times delay that the common
-motion of all sites needs at its most critical mass.
+"""-min sin x / x: the ratio d / (K T) of damping to stiffness times delay required for the
+common motion of all sites at the most critical mass.
 """
 
 
@@ -199,30 +199,30 @@ class StabilityCondition(NamedTuple):
 def _judge_two_sites(
     situation: LawSituation, K: Array, d: Array, scope: str
 ) -> StabilityCondition:
-    """Evaluates the stability condition of two arms that are coupled by springs with dampers.
+    """Evaluates the stability condition of two arms coupled by springs and dampers.
 
     The condition is due to Nuno, Basanez, Ortega and Spong, IJRR 28, 2009:
 
         4 d1 d2 >= (T1 + T2)^2 K1 K2
 
-    K1 and K2 are the stiffnesses of the two springs, d1 and d2 the dampings of the two arms.
-    T1 + T2 is the sum of the delays in both directions.
+    K1 and K2 are the stiffnesses of the two springs, d1 and d2 the dampings of the two arms,
+    and T1 + T2 the sum of the delays in both directions.
 
-    A torque that is held for the period h acts h / 2 later. Therefore each d is reduced by
-    K h / 2, and the sum of the delays is increased by h. Each stiffness is multiplied by the
-    weight with which its site follows the other. Both weights are 1 if a session has only two
-    sites; they can be less if the two sites are a part of a larger session.
+    Holding a torque for the period h delays it by h / 2 on average. Therefore each d is reduced
+    by K h / 2, and the sum of the delays is increased by h. Each stiffness is multiplied by the
+    weight that its site gives to the other site. Both weights are 1 in a session with two
+    sites, but may be smaller if the two sites are part of a larger session.
 
     Args:
         situation: The situation of the site, with the delays and the hold time h.
         K: Stiffness of each site per joint, N m/rad, shape (2, n), where n is the number of
             joints.
         d: Damping of each site per joint, N m s/rad, shape (2, n).
-        scope: Part of the text that says for which arms the condition is sufficient.
+        scope: Part of the text that states for which arms the condition is sufficient.
 
     Returns:
-        The condition with its numbers. It holds if it is met at every joint, and no damping is
-        negative after the reduction.
+        The condition with its numerical values. It holds if it is satisfied at every joint, and
+        no damping is negative after the reduction.
     """
     hold_s = situation.hold_s
     alpha = situation.alpha
@@ -253,24 +253,24 @@ def _judge_two_sites(
 def _judge_several_sites(
     situation: LawSituation, K: Array, d: Array, scope: str
 ) -> StabilityCondition:
-    """Evaluates the damping that more than two arms need if delayed springs couple them.
+    """Evaluates the damping condition of more than two arms coupled by delayed springs.
 
         d > c K T
 
-    d is the damping, K the stiffness of the springs and T the delay. The factor c is the larger
-    of two numbers: the negative of the least eigenvalue of the dominance matrix, for motions in
-    which the arms differ, and the factor for the common motion of all arms
+    d is the damping, K the stiffness of the springs and T the delay. The factor c is the
+    maximum of two values: the negative of the smallest eigenvalue of the dominance matrix, for
+    motions in which the arms differ, and the factor for the common motion of all arms
     (`_find_common_motion_share`).
 
     Args:
         situation: The laws, delays and weights of all sites.
         K: Stiffness of each site per joint, shape (N, n), N m/rad.
         d: Damping of each site per joint, shape (N, n), N m s/rad.
-        scope: Part of the text that says for which arms the condition is sufficient.
+        scope: Part of the text that states for which arms the condition is sufficient.
 
     Returns:
-        The condition. It is undecided if the sites have different gains or delays, and not met
-        if the dominance matrix is not reversible.
+        The condition. It is undecided if the sites have different gains or delays, and not
+        satisfied if the dominance matrix is not reversible.
     """
     T = situation.longest_s
     hold_s = situation.hold_s
@@ -306,25 +306,25 @@ def _judge_several_sites(
 
 
 def _find_common_motion_share(count: float) -> float:
-    """Returns how much damping all sites need so that their common motion dies away.
+    """Returns the damping ratio required for the common motion of all sites to decay.
 
-    In the common motion, all arms move alike. Each is pulled by a spring with the stiffness K
-    towards the position that the others had before the delay T, and is braked by a damper d. If
-    the motion oscillates with the angular frequency w, the delayed spring acts like a damper
-    K sin(w T) / w, which is negative for w T between pi and 2 pi. In continuous time, d must
+    In the common motion, all arms move alike. A spring with the stiffness K pulls each arm
+    towards the position that the others had a delay T ago, and a damper d brakes it. If the
+    motion oscillates with the angular frequency w, the delayed spring acts like a damper K
+    sin(w T) / w, which is negative for w T between pi and 2 pi. In continuous time, d must
     therefore exceed the maximum of -K sin(w T) / w, so that
 
         d / (K T) = -min sin(x) / x,    x = w T    (the constant `COMMON_MOTION_SHARE`).
 
-    If torques are held for the period h, the delay is T + h / 2 = n h / 2 with
-    n = 2 T / h + 1. With x = w h / 2, the condition becomes
+    If torques are held for the period h, the delay is T + h / 2 = n h / 2 with n = 2 T / h + 1.
+    With x = w h / 2, the condition becomes
 
         (d - K h / 2) / (K (T + h / 2)) = -min sin(n x) / (n sin x),    n x from pi to 2 pi.
 
     The minimum is found on a grid of 1001 points, which is fine enough for a smooth function.
 
     Args:
-        count: The number n: the delay in halves of the period h.
+        count: The number n, the delay in units of h / 2.
 
     Returns:
         The ratio of damping to stiffness times delay, dimensionless.
@@ -337,7 +337,7 @@ def _find_common_motion_share(count: float) -> float:
 
 
 BlockKey = str | tuple[str, int]
-"""A row or a column of a linear form.
+"""Key of a row or a column of a linear form.
 
 Rows: "tau"; the name of a state, for its derivative; ("to", j) for the vector sent to peer j.
 Columns: "q", "qd", "q_des", "qd_des", a state, ("from", j) for the vector received from peer j,

@@ -41,13 +41,13 @@ _NEUTRAL = (
 def _send_acceleration(law: Any, now: LawInput) -> None:
     """Computes the acceleration of the arm from its torques, and sends it to the other arms.
 
-    The acceleration is not measured. It is the solution qdd of M qdd = tau - tau_x - bias, with
-    tau within its limits, where M is the inertia matrix, tau_x the exogenous torque and bias
-    the torque of gravity and of Coriolis forces. The method is Gaussian elimination.
+    The acceleration is not measured. It is the solution qdd of M qdd = tau - tau_x - bias,
+    computed by Gaussian elimination. M is the inertia matrix, tau the limited torque, tau_x the
+    external torque, and bias the torque due to gravity and Coriolis forces.
 
     Args:
-        law: The law, whose `rows` are the work space.
-        now: Inputs and outputs of the law in this tick (period of the control loop).
+        law: The law, whose `rows` serve as work space.
+        now: Inputs and outputs of the law in this tick.
     """
     n = now.joints
     rows = law.rows

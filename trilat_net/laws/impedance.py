@@ -36,7 +36,7 @@ from .conditions import (
 from .interface import DAMPING, INERTIA, STIFFNESS, ControlLaw, TuningRun, TuningSite
 
 MOST_HANDS = 4
-"""Largest number of hands at the masters for which all combinations are tried."""
+"""Largest number of hands at the masters for which all combinations are evaluated."""
 
 
 @compiled
@@ -351,28 +351,27 @@ def _find_stiffest_wall(
 ) -> float:
     """Returns the largest wall stiffness with loop gain below 1 at all frequencies, N m/rad.
 
-    A loop whose gain is below 1 at every frequency is stable for constant delays of any length
-    (small-gain theorem). The loop from the slave's force to itself has at most the gain
+    A loop whose gain is below 1 at every frequency is stable for any constant delays
+    (small-gain theorem). The gain of the loop from the slave's force to itself is at most
 
         |K_e (K_s + B_s s) / (M_s s^2 + B_s s + K_s + K_e)|
             sum_i a_i^2 / |M_i s^2 + (B_i + b_i) s + K_i + k_i|
 
     where K_e is the stiffness of the wall, the index s denotes the slave, i runs over the
-    masters, k_i and b_i are stiffness and damping of the hand at master i, and s is the Laplace
-    variable. The absolute values are summed, because the delays of the masters may differ. The
-    gain is evaluated on a grid of frequencies and stiffnesses.
+    masters, k_i and b_i are the stiffness and damping of the hand at master i, and s is the
+    Laplace variable. Absolute values are summed because the delays of the masters may differ.
+    The gain is evaluated on a grid of frequencies and stiffnesses.
 
-    A spring at a master can raise the gain, and so can a mass, even though both are passive.
+    A spring or a mass at a master can increase the gain, although both are passive.
 
     Args:
         laws: Settings of the law of each arm.
         dominance_factors: Dominance factors a_i of the slave, shape (N,).
         slave: Index of the slave.
-        hands: Springs and dampers that act on the arm of each site. By default, none act.
+        hands: Springs and dampers that act on the arm of each site. Defaults to none.
 
     Returns:
-        The stiffness. It is inf if any stiffness is allowed, and 0 if not even free motion
-            decays.
+        The stiffness: inf if any stiffness is allowed, and 0 if not even free motion decays.
     """
     for law in laws:
         if any(damping <= 0.0 for damping in law.B):
@@ -410,9 +409,9 @@ def _compute_loop_gain(
 ) -> Array:
     """Returns the gain of the loop from the slave's force to itself, for many frequencies.
 
-    The slave sends the force of its environment to the masters, whose motion it follows.
-    `_find_stiffest_wall` gives the equation of this gain. The loop is stable for constant
-    delays of any length if the gain is below 1 at every frequency.
+    The slave sends the force of its environment to the masters, whose motion it follows. The
+    equation of this gain is given in `_find_stiffest_wall`. The loop is stable for any constant
+    delays if the gain is below 1 at every frequency.
 
     Args:
         laws: Settings of the law of each arm.
@@ -450,14 +449,14 @@ def _compute_loop_gain(
 def _select_master_hands(
     hands: Sequence[Sequence[ArmLoad] | None], slave: int
 ) -> list[tuple[tuple[ArmLoad, ...], ...]] | None:
-    """Returns all combinations of the persons who hold the masters, from nobody to everybody.
+    """Returns all combinations of hands at the masters, from none to all.
 
-    A person may let go of an arm at any time. Therefore stability is checked for each
-    combination.
+    Stability is checked for each combination, because a person may let go of an arm at any
+    time.
 
     Args:
         hands: Springs and dampers that act on the arm of each site.
-        slave: Index of the slave, whose hands are left out.
+        slave: Index of the slave, whose hands are omitted.
 
     Returns:
         For each combination, the hands of each site. None if a hand at a master is not a spring
@@ -482,10 +481,11 @@ def _select_master_hands(
 
 
 def _describe_stiffest_wall(situation: LawSituation, slave: int) -> str:
-    """Returns a phrase about the walls against which a slave in free motion is stable.
+    """Returns a phrase about the stiffest wall for which the loop is stable.
 
-    Example: "with a spring of up to 250 N m/rad at the slave, ...". The bound is the smallest
-    over all combinations of hands at the masters. Without a bound, the phrase gives the reason.
+    For example, "with a spring of up to 250 N m/rad at the slave, ...". The bound is the
+    minimum over all combinations of hands at the masters. If there is no bound, the phrase
+    states the reason.
 
     Args:
         situation: All sites, their laws and their hands.
@@ -546,10 +546,10 @@ def move_impedance(law: Any, force: Array, period_s: float) -> Array:
 
 
 def _exponentiate(matrix: Array) -> Array:
-    """Computes the exponential of a small matrix by scaling and squaring of its power series.
+    """Computes the exponential of a small matrix by scaling and squaring its power series.
 
     Source: Moler and Van Loan, "Nineteen dubious ways to compute the exponential of a matrix",
-    SIAM Review 45, 2003. SciPy is not used, because a session should not depend on SciPy.
+    SIAM Review 45, 2003. SciPy is not used because a session should not depend on it.
 
     Args:
         matrix: The matrix, shape (n, n).

@@ -34,8 +34,8 @@ from .conditions import LawSituation, LinearForm, LinearSituation, StabilityCond
 from .sent_vectors import SentVectorSpecs, convert_sends
 
 GainRange = tuple[float, float, str] | tuple[float, float, str, str]
-"""Range of a gain that is tuned: least value, largest value, unit and, optionally, the role of
-the sites that have the gain.
+"""Range of a tunable gain: lower bound, upper bound, unit and, optionally, the role of the
+sites that have the gain.
 """
 STIFFNESS = (1.0, 1000.0, "N m/rad")
 DAMPING = (0.5, 200.0, "N m s/rad")
@@ -97,21 +97,21 @@ class LawSettings(Frozen, frozen=True):
     """
 
     kind: ClassVar[Any] = None
-    """The class of the law; None for a law that is imported from a user's file."""
+    """Class of the law. None for a law that is imported from a user's file."""
     linear_note: ClassVar[str] = ""
-    """The effect that the law's linear form leaves out, as a sentence for the user."""
+    """Effect neglected by the law's linear form, as a sentence for the user."""
     fixed_shares: ClassVar[bool] = False
-    """True if the law uses only the dominance factors at the start of the session."""
+    """True if the law uses only the initial dominance factors of the session."""
     has_functional: ClassVar[bool] = False
     """True if the energy function V of the paper's stability proof applies to the law."""
     planar: ClassVar[bool] = False
-    """True if the law uses the planar arm's regressor and cannot control a chain."""
+    """True if the law uses the planar arm's regressor and therefore cannot control a chain."""
     needs_joint_space: ClassVar[bool] = False
-    """True if the law combines numbers per joint with numbers per shared coordinate. It then
-    cannot control arms that share positions of their end effectors.
+    """True if the law combines values per joint with values per shared coordinate. Such a law
+    cannot control arms that share end effector positions.
     """
     compares_positions: ClassVar[bool] = False
-    """True if the law itself compares positions of end effectors, not angles of joints."""
+    """True if the law itself compares end effector positions rather than joint angles."""
 
     @property
     def plugged(self) -> bool:
@@ -363,9 +363,9 @@ class LawSettings(Frozen, frozen=True):
 
 
 def _format_class_name(tag: str) -> str:
-    """Returns the name that the class of a law must have: "FourChannel" for "four_channel".
+    """Returns the required class name of a law, for example "FourChannel" for "four_channel".
 
-    Laws are found by their files. The rule links the file, the class and the name in a
+    Laws are found by file name. This rule links the file, the class and the name used in a
     scenario.
     """
     return "".join(word.capitalize() for word in tag.split("_"))
@@ -410,7 +410,7 @@ class ControlLaw:
 
         Args:
             facts: Facts about the arm and the other arms that are known before the run.
-            gains: Gains by name. Gains that are left out keep their default.
+            gains: Mapping from gain name to value. Omitted gains keep their defaults.
 
         Raises:
             TypeError: The law has no gain of that name.
@@ -485,14 +485,14 @@ def _derive_settings(kind: type[ControlLaw], tag: str) -> type[LawSettings]:
     """Creates the class that stores the gains of a law in a scenario.
 
     A law is written as one class, whose instances compute torques while an arm is controlled. A
-    scenario, the description of an experiment, needs only the gains of the law: it reads and
-    checks them without creating an instance. Therefore a second class is derived, a frozen
-    record (`msgspec.Struct`), so that no author of a law has to write the gains twice.
+    scenario needs only the gains of the law, which are read and validated without creating an
+    instance. A second class, a frozen record (`msgspec.Struct`), is therefore derived, so that
+    authors of laws need not declare the gains twice.
 
-    Annotations of the law and its base classes become the fields of the record; each has a
-    default, which is the value of the class attribute. Methods and class variables that need
-    nothing but the gains are copied (see `_depends_on_gains`), so that for example the
-    stability condition can be evaluated from the record.
+    Annotations of the law and its base classes become the fields of the record, with the values
+    of the class attributes as defaults. Methods and class variables that depend only on the
+    gains are copied (see `_depends_on_gains`), so that the stability condition, for example,
+    can be evaluated from the record.
 
     Args:
         kind: The class of the law.
@@ -540,16 +540,16 @@ def _is_class_variable(hint: Any) -> bool:
 
 
 def _depends_on_gains(name: str, value: Any) -> bool:
-    """Returns True if an attribute of a law's class is copied to the record of its gains.
+    """Returns True if an attribute of a law's class should be copied to its `Settings`.
 
     The record of gains, the class `Settings`, is derived from the class of a law (see
-    `_derive_settings`). It has the gains, but not the state that an instance of the law has
-    while it controls an arm.
+    `_derive_settings`). It contains the gains, but not the state of an instance that controls
+    an arm.
 
-    - Functions and properties are copied if they use the gains alone. `begin`, `torque` and
-      `energies` need the state, and Python's special methods belong to the class itself.
+    - Functions and properties are copied if they use only the gains. `begin`, `torque` and
+      `energies` need the state, and special methods belong to the class itself.
     - Other attributes are copied if they are declared by `LawSettings`, the base class of all
-      records, for example `planar`. The rest are details of the law.
+      records, for example `planar`. All others are internal to the law.
 
     Args:
         name: Name of the attribute.
@@ -565,16 +565,16 @@ def _depends_on_gains(name: str, value: Any) -> bool:
 
 
 def _check_methods(kind: Any, code: str, path: str) -> None:
-    """Rejects a class without a method `torque`, or with a memory that it does not declare.
+    """Raises ScenarioError if a class has no method `torque`, or has undeclared memory.
 
-    The memory of a law is everything that it must know in the next control period. It is
-    logged, so that a run can be verified from any period. A class declares it by `remembers`,
-    or by the methods `memory` and `recall`.
+    The memory of a law is all state that it needs in the next tick. It is logged, so that a run
+    can be verified from any tick. A class declares its memory with `remembers`, or with the
+    methods `memory` and `recall`.
 
     Args:
         kind: The class.
-        code: Name of the law for errors.
-        path: Path of the key for errors.
+        code: Name of the law for error messages.
+        path: Path of the key for error messages.
 
     Raises:
         ScenarioError: The class has no such method, or does not declare its memory.
@@ -602,15 +602,15 @@ def _check_methods(kind: Any, code: str, path: str) -> None:
 
 
 def _check_site_count(kind: Any, code: str, path: str, sites: int) -> None:
-    """Rejects a law that does not support the number of arms in the scenario.
+    """Raises ScenarioError if a law does not support the number of arms in the scenario.
 
-    The class of a law may state a number or a range in its attribute `sites`, for example
-    `sites = 2` or `sites = (2, 4)`. A site is the process that controls one arm.
+    The class of a law may specify a number or a range in its attribute `sites`, for example
+    `sites = 2` or `sites = (2, 4)`.
 
     Args:
         kind: The class.
-        code: Name of the law for errors.
-        path: Path of the key for errors.
+        code: Name of the law for error messages.
+        path: Path of the key for error messages.
         sites: Number of sites in the scenario.
 
     Raises:
@@ -641,11 +641,11 @@ def _check_site_count(kind: Any, code: str, path: str, sites: int) -> None:
 
 
 def _find_written_attributes(kind: Any) -> list[str]:
-    """Returns the names of the attributes of `self` that a class assigns outside `__init__`.
+    """Returns the names of attributes of `self` that a class assigns outside `__init__`.
 
-    An attribute that changes during a run is a memory, which a control law must declare so that
+    An attribute that changes during a run is memory, which a control law must declare so that
     runs can be repeated from the log. The source of each method is searched for assignments to
-    `self`. Changes by method calls, such as the `append` of a list, are not found.
+    `self`. Changes made by method calls, such as `append` on a list, are not detected.
 
     Args:
         kind: The class of a law.

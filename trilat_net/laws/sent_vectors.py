@@ -22,14 +22,15 @@ from ..records import MAX_JOINTS
 
 
 class _SentVectorSpec(Frozen, frozen=True):
-    """Declaration of a vector that a control law sends in every control period.
+    """Declaration of a vector that a control law sends in every tick.
 
-    The length may depend on the arm, which the class of the law does not know.
+    The length may depend on the arm, which is not known to the class of the law.
 
     Attributes:
-        unit: Unit of its values, as in "J", or "" for dimensionless values.
-        length: Number of its values: "joints", "coordinates" (that sites share), or a number.
-        per_peer: True if each peer gets its own vector, False if all peers get the same vector.
+        unit: Unit of its entries, for example "J", or "" if they are dimensionless.
+        length: Number of entries: "joints", "coordinates" (shared by the sites), or a number.
+        per_peer: True if each peer gets a different vector, False if all peers get the same
+            vector.
     """
 
     unit: Annotated[str, Meta(max_length=24, pattern=r"^[ -~]*$")] = ""

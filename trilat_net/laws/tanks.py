@@ -67,7 +67,7 @@ class Tanks(EnergyLaw):
     remembers: ClassVar = ("E_seen", "carried")
     tune: ClassVar = {"K": STIFFNESS, "Kd": ERROR_DAMPING}
     guarded = True
-    """False leaves the transparency layer without a tank, for comparison."""
+    """False disables the tank of the transparency layer, for comparison."""
 
     def begin(self, facts: LawContext) -> None:
         """Prepares the law before a run by creating its state and constants.

@@ -61,17 +61,17 @@ from .conditions import (
 from .interface import DAMPING, STIFFNESS, EnergyLaw, TuningSite
 
 RECEPTIONS = ("replay", "zero", "scaled", "hold")
-"""Ways to choose the wave that acts on the arm, see `Wave`.
+"""Ways to choose the wave that acts on the arm. See `Wave`.
 
-`hold` repeats the last wave. It is not passive, and serves only for comparison.
+`hold` repeats the last wave. It is not passive, and exists only for comparison.
 """
 _REPLAY = 0
 _SCALED = 2
 _HOLD = 3
 CONCEALED_S = 0.005
-"""A repeated wave is limited so that the known energy lasts for this time, s."""
+"""Time for which the known energy must last while a wave is repeated, s."""
 STAMP_FILTER_TICKS = 20.0
-"""Time constant of the filtered rate at which stamps advance, ticks."""
+"""Time constant of the filter for the rate at which stamps advance, ticks."""
 
 
 @compiled
@@ -82,21 +82,21 @@ def _replay_wave(
     energy: float,
     h: float,
 ) -> float:
-    """Returns the wave to play so that lost waves are made up for, within the known energy.
+    """Returns the wave to play, which makes up for lost waves within the known energy.
 
-    A wave acts on the arm (is played) like a force that also carries energy. If messages are
-    lost, the arm would end at a wrong position. Later messages contain the integral of all
-    waves, so that the integral of the lost waves is known. The line owes this integral to the
-    arm. The owed integral is played in addition to the wave of this control period, at the mean
-    rate of the lost waves or slower. The known energy is divided evenly over the owed integral:
-    each unit of the integral may cost only its part of the energy.
+    A wave acts on the arm (is played) like a force that also carries energy. If lost messages
+    were ignored, the arm would end at a wrong position. Later messages contain the integral of
+    all waves, from which the integral of the lost waves (the owed integral) is known. It is
+    played in addition to the wave of this tick, at the mean rate of the lost waves or slower.
+    The known energy is distributed evenly over the owed integral: each unit of the integral may
+    use only its share of the energy.
 
     Args:
-        law: The law, whose owed integral and owed time are reduced by the part that is played.
+        law: The law; its owed integral and owed time are reduced by the part that is played.
         index: Index of the line and joint in the law's lists.
-        fresh: The wave that is played anyway, sqrt(W).
-        energy: The known energy that has not been played, J.
-        h: The period, s.
+        fresh: The wave that is played in any case, sqrt(W).
+        energy: The known energy that has not yet been played, J.
+        h: The control period, s.
 
     Returns:
         The sum of `fresh` and the additional wave, sqrt(W).
@@ -129,25 +129,25 @@ def _replay_wave(
 
 @compiled
 def _conceal_wave(law: Any, index: int, energy: float, h: float) -> float:
-    """Returns the wave that acts on the arm in a period in which no message has arrived.
+    """Returns the wave that acts on the arm in a tick in which no message has arrived.
 
-    A wave w in sqrt(W) carries the power w^2 / 2. The previous wave is repeated, but it is
-    limited so that the energy E that has arrived and not been used would last for the time
-    T = `CONCEALED_S`, which means w^2 T / 2 <= E.
+    A wave w in sqrt(W) carries the power w^2 / 2. The previous wave is repeated, but limited
+    such that the unused energy E that has arrived would last for the time T = `CONCEALED_S`,
+    that is, w^2 T / 2 <= E.
 
-    Two accounts of the law concern the missing waves. `owed_U` is the time integral of the
-    waves that were lost and that the arm has yet to receive, sqrt(W) s. The repeated wave
-    replaces a missing one. Therefore its integral w h is subtracted from `owed_U`, so that the
-    arm does not receive it again after a later message has stated the integral of the missing
-    waves. `held_s` is the time for which waves have been repeated since the last message.
+    Two accounts of the law track the missing waves. `owed_U` is the time integral of the lost
+    waves that the arm has yet to receive, sqrt(W) s. Because the repeated wave replaces a
+    missing one, its integral w h is subtracted from `owed_U`. Otherwise, the arm would receive
+    it again after a later message has reported the integral of the missing waves. `held_s` is
+    the time for which waves have been repeated since the last message.
 
-    If lost waves of the same sign are owed from earlier, a part of them is added to the
+    If earlier lost waves of the same sign are still owed, a part of them is added to the
     repeated wave (`_replay_wave`).
 
     Args:
         law: The law, with its accounts.
         index: Index of the line and joint in the law's lists.
-        energy: Energy E that has arrived and not been used, J.
+        energy: Unused energy E that has arrived, J.
         h: Control period, s.
 
     Returns:
@@ -185,17 +185,17 @@ def _receive_wave(
     i: int,
     missed: float,
 ) -> float:
-    """Chooses the wave that acts on the arm in a control period, and accounts for its energy.
+    """Chooses the wave that acts on the arm in one tick, and accounts for its energy.
 
-    The wave comes from one peer (another arm), over a virtual line. The energy of a new sample
-    (message) is added to the line's account W of energy that has arrived. The energy of the
-    wave that acts (is played) moves from W to the account H, the energy that this arm may send.
-    The setting `reception` decides which wave is played if a sample is late or lost.
+    The energy of a new sample is added to the account W of the line, which holds the energy
+    that has arrived. The energy of the wave that acts (is played) is transferred from W to the
+    account H, the energy that this arm may send. The setting `reception` determines which wave
+    is played if a sample is late or lost.
 
     Args:
         law: The law, with its energy accounts.
         now: Inputs and outputs of the law in this tick.
-        j: Index of the peer, the site at the other end of the line.
+        j: Index of the peer at the other end of the line.
         i: Index of the joint.
         missed: Number of samples between the sample in use and the previously used sample. -1
             if there is no new sample.
@@ -275,16 +275,16 @@ def _follow_wave(
     i: int,
     v: float,
 ) -> float:
-    """Computes the torque by which a received wave moves the arm through a spring.
+    """Computes the torque with which a received wave moves the arm through a spring.
 
     The wave moves one end of a spring and damper, and the other end pulls the arm. Part of the
-    wave is reflected; the reflected wave is stored in `now` and will be sent to the peer. The
-    module docstring gives the equations.
+    wave is reflected; the reflected wave is stored in `now` and will be sent to the peer. See
+    the module docstring for the equations.
 
     Args:
-        law: The law; the position of the spring is changed.
-        now: Inputs and outputs of the law in this control period.
-        j: Index of the peer (the other arm) from which the wave came.
+        law: The law; the position of the spring is updated.
+        now: Inputs and outputs of the law in this tick.
+        j: Index of the peer that sent the wave.
         i: Index of the joint.
         v: The wave, sqrt(W).
 
@@ -316,17 +316,17 @@ def _follow_wave(
 
 @compiled
 def _close_wave_period(law: Any, now: LawInput, i: int) -> None:
-    """Updates the energy of this end of the lines after a control period.
+    """Updates the energy account of this end of the lines after a control period.
 
-    The energy H is what this site, the process of one arm, may send to its peers in waves,
-    together with the energy in its springs. The function subtracts the work of the torque on
-    the arm in the previous period. If H then exceeds the energy of the springs and the initial
-    reserve, the dampers have dissipated the excess, and it is removed. In the first period, the
-    function initialises the springs and H.
+    H is the energy that this site may send to its peers in waves, plus the energy in its
+    springs. The work of the torque on the arm in the previous control period is subtracted. If
+    H then exceeds the energy of the springs plus the initial reserve, the excess has been
+    dissipated by the dampers and is removed. In the first tick, the springs and H are
+    initialised.
 
     Args:
         law: The law, with its accounts.
-        now: Inputs and outputs of the law in this period.
+        now: Inputs and outputs of the law in this tick.
         i: Index of the joint.
     """
     H = now.to_all.H
@@ -360,24 +360,24 @@ def _close_wave_period(law: Any, now: LawInput, i: int) -> None:
 
 @compiled
 def _send_waves(law: Any, now: LawInput, i: int, committed: float) -> None:
-    """Scales down the waves of a joint if the site does not have the energy to send them.
+    """Scales down the waves of a joint if the site lacks the energy to send them.
 
-    A wave u in sqrt(W) that lasts for a control period h carries the energy u^2 h / 2. The
-    site, the process of one arm, keeps an account H of the energy that it may send, J. A part
-    of H is not available: the energy stored in the springs, the energy that the coming period
-    needs (`committed`), and half of the initial reserve. This half is kept because the motion
-    in the coming period is only predicted and may cost more.
+    A wave u in sqrt(W) that lasts for a control period h carries the energy u^2 h / 2. The site
+    keeps an account H of the energy that it may send, J. Part of H is not available: the energy
+    stored in the springs, the energy needed in the next period (`committed`), and half of the
+    initial reserve, which is kept because the predicted motion in the next period may cost more
+    than expected.
 
-    Each message to a peer (another arm) contains the wave u and two sums since the start, from
-    which the peer can learn what lost messages contained: U, the sum of u h in sqrt(W) s, and
-    E, the sum of the energies in J.
+    Each message to a peer contains the wave u and two cumulative sums, from which the peer can
+    recover the contents of lost messages: U, the sum of u h in sqrt(W) s, and E, the sum of the
+    energies in J.
 
     Args:
         law: The law, with its accounts.
-        now: Inputs and outputs of the law in this control period. It contains the waves, which
-            are scaled, and the sums and H, which are updated.
+        now: Inputs and outputs of the law in this tick. The waves are scaled, and the sums and
+            H are updated.
         i: Index of the joint.
-        committed: Energy that the coming period needs for other purposes, J.
+        committed: Energy needed for other purposes in the next period, J.
     """
     h = now.h_s
     H = now.to_all.H
@@ -406,18 +406,17 @@ def _send_waves(law: Any, now: LawInput, i: int, committed: float) -> None:
 
 
 def _find_line_impedance(lines: Mapping[str, Any], site: str, peer: str) -> Any:
-    """Returns the impedance that a user stated for the line between two arms.
+    """Returns the impedance that a user has specified for the line between two sites.
 
-    A line is the virtual connection over which two arms exchange waves. The order of the two
-    names does not matter.
+    The order of the two names does not matter.
 
     Args:
-        lines: Impedances by name of the line, for example {"m1-s": 18.0}, N m s/rad.
+        lines: Mapping from line name to impedance, for example {"m1-s": 18.0}, N m s/rad.
         site: Name of the site at one end of the line.
         peer: Name of the site at the other end.
 
     Returns:
-        A number for all joints, or one number per joint. None if no impedance is stated.
+        A scalar for all joints, or one value per joint. None if no impedance is specified.
     """
     name = f"{site}-{peer}"
     reversed_name = f"{peer}-{site}"
@@ -860,14 +859,12 @@ class Wave(EnergyLaw):
         return form
 
     def _add_spring_end(self, form: LinearForm, j: int, state: str, b: Array) -> None:
-        """Adds the equations of a line that pulls the arm by a spring to the linear form.
+        """Adds the equations of a line that pulls the arm through a spring to the linear form.
 
-        A line is the virtual connection over which two sites, the processes of one arm each,
-        exchange waves. The received wave v moves one end of a spring K with a damper B in
-        parallel; q_sd is the position of this end. The other end is the arm with the position q
-        and the velocity qd. With the impedance b of the line and c = sqrt(2 b), the rate of
-        q_sd, the force F of spring and damper, the torque tau on the arm and the sent wave u
-        are
+        The received wave v moves one end of a spring K with a parallel damper B; q_sd is the
+        position of this end. The other end is the arm, with the position q and the velocity qd.
+        With the impedance b of the line and c = sqrt(2 b), the rate of q_sd, the force F of the
+        spring and damper, the torque tau on the arm and the sent wave u are
 
             rate = (c v - K q_sd + K q + B qd) / (b + B)
             F    = K (q_sd - q) + B (rate - qd)
@@ -875,11 +872,11 @@ class Wave(EnergyLaw):
             u    = v - (c / b) F
 
         Each is linear in the four columns v, q_sd, q and qd. A block `form.add(row, column,
-        gain)` says that the row contains gain times the column. The row of a state is its rate;
-        ("from", j) is the wave received from peer j, and ("to", j) the wave sent to it.
+        gain)` adds gain times the column to the row. The row of a state is its rate; ("from",
+        j) is the wave received from peer j, and ("to", j) the wave sent to it.
 
         Args:
-            form: The law's linear form, which is extended.
+            form: The law's linear form; modified.
             j: Index of the peer at the other end of the line.
             state: Name of the state q_sd.
             b: Impedance of the line at each joint, N m s/rad.

@@ -45,7 +45,7 @@ from .user_law import (
 )
 
 CHECKED: Any = {"_nrt": False, "boundscheck": True}
-"""Options with which laws are compiled: wrong indices and divisions by zero raise."""
+"""Compiler options for laws: invalid indices and divisions by zero raise exceptions."""
 T = TypeVar("T")
 
 
@@ -85,7 +85,7 @@ def is_compiled(law: Any) -> bool:
 
 @leaf
 def _all_finite(values: Array) -> bool:
-    """Returns True if all numbers of an array are finite."""
+    """Returns True if all elements of an array are finite."""
     are_finite = True
     for i in range(values.shape[0]):
         are_finite = are_finite and np.isfinite(values[i])
@@ -181,13 +181,13 @@ class LawForm(NamedTuple):
 
 
 def _vectors_dtype(vectors: Sequence[SentVector], width: int = 0) -> np.dtype[np.void] | None:
-    """Returns the NumPy data type that gives the numbers of an array the names of vectors.
+    """Returns a NumPy dtype whose fields are named vectors, or None if there are no vectors.
 
-    A compiled law thus reads vectors that other laws sent as fields, such as `received.F`. The
-    result is None if there are no vectors.
+    A compiled law uses it to access the vectors sent by other laws as fields, such as
+    `received.F`.
 
     Args:
-        vectors: The vectors, one after another in the row.
+        vectors: The vectors, in the order in which the row contains them.
         width: Number of floats in the row, if it is longer than the vectors.
     """
     if not vectors:
@@ -249,11 +249,11 @@ def collect_law_input(s: Row, links: Any, received: Any, sent: Any, to_all: Any)
 
 @cache
 def _compile_law(torque: Callable[..., Any], form: LawForm) -> Any:
-    """Compiles the method `torque` of a control law to machine code that the simulation calls.
+    """Compiles the method `torque` of a control law to machine code.
 
-    The arguments of the compiled function are arrays: the numbers of the law, the state of the
-    site and of its links, and the vectors that the law receives and sends. Machine code of laws
-    of this package is stored on disk. Laws of users are compiled in each process.
+    The arguments of the compiled function are arrays: the gains and memory of the law, the
+    state of the site and of its links, and the vectors that the law receives and sends. Machine
+    code for the laws of this package is cached on disk. User laws are compiled in each process.
 
     Args:
         torque: The method of the law's class.
@@ -317,24 +317,24 @@ def _compile_law(torque: Callable[..., Any], form: LawForm) -> Any:
 
 
 def _read_numbers(law: Any, remembered: Sequence[str]) -> dict[str, np.ndarray[Any, Any]]:
-    """Collects the gains and the memory of a law, which its compiled form keeps in an array.
+    """Collects the gains and the memory of a law, which its compiled form stores in an array.
 
-    These are the attributes of the instance, and the attributes of its class whose names occur
-    in the method `torque`. Each of them needs a fixed type:
+    These are the attributes of the instance, and those attributes of its class whose names
+    occur in the method `torque`. Each of them needs a fixed type:
 
-    - Integers that do not change, such as counts and indices, remain integers. Booleans that
-      do not change become integers.
-    - All other numbers become floats. They include integers that may change: numbers that the
-      law remembers from tick to tick, attributes that `torque` assigns, and elements of lists.
-      A tick is a period of the control loop.
+    - Integers that do not change, such as counts and indices, remain integers. Booleans that do
+      not change become integers.
+    - All other numbers become floats. They include integers that may change: the memory of the
+      law, attributes assigned by `torque`, and elements of lists.
 
     Args:
         law: An instance of the law's class.
         remembered: Names of the attributes that the law keeps from tick to tick.
 
     Returns:
-        Arrays by attribute name: first the numbers that the law remembers, in their order, then
-        the other numbers in alphabetical order. Attributes that are not numbers are left out.
+        A mapping from attribute name to array: first the memory, in the order of `remembered`,
+            then the other attributes in alphabetical order. Attributes that are not numeric are
+            omitted.
     """
     # The byte code of `torque` names the attributes that it reads and assigns. It does not tell
     # whether they belong to the law, so names of attributes of other objects are included.
@@ -367,17 +367,17 @@ _INPUTS = {
     "LawInput": ("now", LawInput._fields),
     "Record(alpha": ("an entry of now.peers", PeerView._fields),
 }
-"""Names and fields of the inputs of a law, by the first words of their types in Numba."""
+"""Names and fields of the inputs of a law, keyed by the first words of their Numba types."""
 
 
 def _explain(error: Exception, law: Any) -> str:
     """Explains to a user in one sentence why Numba cannot compile a control law.
 
-    The messages of Numba are long and name types of Numba. Frequent causes are recognised and
-    explained in the terms of a law; otherwise the first sentence of the message is returned.
+    Numba's messages are long and refer to Numba types. Frequent causes are recognised and
+    explained in terms of the law; otherwise the first sentence of the message is returned.
 
     Args:
-        error: The error of Numba.
+        error: The error raised by Numba.
         law: An instance of the law's class.
     """
     text = re.sub(r"\x1b\[[0-9;]*m", "", str(error))
@@ -421,8 +421,8 @@ def _reads_own_attribute(law: Any, name: str) -> bool:
     """Returns True if the method `torque` of a law reads an attribute of the law itself.
 
     Numba's error names an unknown attribute, but not its object. The explanation for the user
-    depends on whether it is `self.NAME` or an attribute of the law's input. The byte code of
-    the method shows this.
+    depends on whether the attribute belongs to `self` or to the law's input, which can be seen
+    in the bytecode of the method.
 
     Args:
         law: An instance of the law's class.
@@ -438,14 +438,14 @@ def _reads_own_attribute(law: Any, name: str) -> bool:
 
 
 def _explain_field(name: str, kind: str, location: str) -> str:
-    """Explains to a user that the input of a control law has no field with a certain name.
+    """Explains to a user that the input of a control law has no field of a given name.
 
     The sentence suggests the field that was probably meant.
 
     Args:
         name: Name of the field.
         kind: The input, a key of `_INPUTS`.
-        location: Line of the law, as in " (line 12)"; empty if unknown.
+        location: Line in the law's source, for example " (line 12)"; empty if unknown.
     """
     subject, names = _INPUTS[kind]
     nearest = suggest_nearest(name, names) or f"; it has {', '.join(names)}"
@@ -455,13 +455,13 @@ def _explain_field(name: str, kind: str, location: str) -> str:
 def _explain_attribute(name: str, law: Any, location: str) -> str:
     """Explains to a user why a compiled control law cannot use an attribute of `self`.
 
-    Only numbers and lists of numbers can be compiled. The attribute is of another type, does
-    not exist, or is a method. For a method, the sentence says what to write instead.
+    Only numbers and lists of numbers can be compiled. The attribute has another type, does not
+    exist, or is a method. For a method, the sentence suggests what to write instead.
 
     Args:
         name: Name of the attribute.
         law: An instance of the law's class.
-        location: Line of the law, as in " (line 12)"; empty if unknown.
+        location: Line in the law's source, for example " (line 12)"; empty if unknown.
     """
     if not hasattr(law, name):
         problem = "does not exist"

@@ -20,7 +20,9 @@ from ...errors import count_nouns
 MAX_SENT = 16
 """Largest number of values per joint that a law sends to a peer."""
 MAX_RECORD_SENT = 1024
-"""Largest number of values that a law sends to all its peers together, as in each record."""
+"""Largest number of values that a law sends to all its peers in one tick, as stored in a
+record.
+"""
 
 
 class SentVector(NamedTuple):
@@ -47,8 +49,8 @@ class _SentEntry(NamedTuple):
 
     Attributes:
         vector: Vector that contains the value.
-        peer: The only peer that gets the vector, or "" if all peers get it.
-        position: Position of the value in the vector, from 0.
+        peer: The only receiver of the vector, or "" if it is sent to all peers.
+        position: Index of the value in the vector.
     """
 
     vector: SentVector

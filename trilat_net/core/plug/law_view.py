@@ -36,12 +36,12 @@ from .user_law import (
 def _update_model(s: Row, chain: RowArray | None) -> None:
     """Computes the gravity torque, inertia matrix and bias torque of an arm for a user's law.
 
-    The bias torque is the torque of Coriolis forces, gravity and friction, which an arm needs
-    even without acceleration.
+    The bias torque is the torque due to Coriolis forces, gravity and friction, which is
+    required even without acceleration.
 
     Args:
         s: State of the site.
-        chain: Data of the joints, one row per joint. None for the planar two-link arm.
+        chain: Joint data, one row per joint. None for the planar two-link arm.
     """
     if chain is None:
         two_link_stages.update_model(s)
@@ -86,17 +86,17 @@ _PER_COORDINATE = ("q_des", "qd_des", "felt")
 _IN_ROW = {"gravity": "G"}
 """Fields of the site's row whose names differ from those of a law's input."""
 _FIRST_PEER_VECTOR = PeerView._fields.index("q")
-"""Index of the first vector in `PeerView`: q, qd and tau_x come last, after single numbers."""
+"""Index of the first vector in `PeerView`: q, qd and tau_x follow the scalar fields."""
 
 
 def _name_vectors(vectors: Sequence[SentVector], numbers: list[float]) -> SimpleNamespace:
-    """Divides a list of numbers into named vectors, which a control law reads as attributes.
+    """Splits a list of numbers into named vectors, which a control law reads as attributes.
 
-    For example, a law that receives the vector F reads it as `received.F`.
+    For example, a received vector F is read as `received.F`.
 
     Args:
         vectors: Names and lengths of the vectors.
-        numbers: Values of the vectors, one vector after another. Further values are ignored.
+        numbers: Concatenated values of the vectors. Any further values are ignored.
     """
     named = SimpleNamespace()
     first = 0
@@ -217,21 +217,18 @@ class PlainLaw:
         self._law.restore(memory)
 
     def _read(self, k: int) -> LawInput:
-        """Collects the input of the control law for one tick, a period of the control loop.
+        """Collects the input of the control law for one tick.
 
-        `update_law_view` must have written the arrays before. All numbers are copied from them
-        to lists, which plain Python reads faster than arrays.
+        `update_law_view` must have been called before. All values are copied from the arrays to
+        lists, which plain Python reads faster.
 
-        The input also contains the vectors that the law sends to the laws of its peers (other
-        arms), with the numbers of the previous tick. The law overwrites them, and
-        `_collect_sent` reads the new numbers. The array has the order of a record: first the
-        vectors that go to all peers, then for each peer the vectors that go to this peer alone.
+        The input also contains the vectors that the law sends to its peers, with their values
+        from the previous tick. The law overwrites them, and `_collect_sent` reads the new
+        values. The array is ordered like a record: first the vectors sent to all peers, then
+        the vectors sent to each single peer.
 
         Args:
-            k: Number of the tick (control period).
-
-        Returns:
-            The input.
+            k: Number of the tick.
         """
         setup = self._setup
         # One column per field of `PeerView`, in their order, with one entry per peer.
@@ -267,13 +264,13 @@ class PlainLaw:
         )
 
     def _collect_sent(self, now: LawInput) -> list[float]:
-        """Returns all numbers that the law sends to other arms, in the order of the log.
+        """Returns all values that the law sends to other arms, in log order.
 
         Args:
-            now: Input of the tick, which contains the vectors that the law wrote.
+            now: Input of the tick, which contains the vectors written by the law.
 
         Raises:
-            ValueError: A vector has another length than the law declares.
+            ValueError: The length of a vector differs from its declaration.
         """
         sent = _collect_vectors(self._sends_to_all, now.to_all, "to_all")
         for j, to_peer in enumerate(now.sent):
@@ -282,17 +279,17 @@ class PlainLaw:
 
 
 def _collect_vectors(declared: Sequence[SentVector], vectors: Any, name: str) -> list[float]:
-    """Returns the numbers of the vectors that a control law sends, as one flat list.
+    """Returns the vectors that a control law sends as one flat list.
 
-    The order and the lengths are those that the law has declared.
+    The order and the lengths follow the law's declaration.
 
     Args:
         declared: Vectors that the law declares.
         vectors: Values of the vectors, as attributes.
-        name: Name of `vectors` in the law's input, for errors.
+        name: Name of `vectors` in the law's input, for error messages.
 
     Raises:
-        ValueError: A vector has another length than the law declares.
+        ValueError: The length of a vector differs from its declaration.
     """
     numbers: list[float] = []
     for vector in declared:

@@ -30,14 +30,14 @@ from ..step.vectors import Array
 _OPTIONS: Any = {"_nrt": False, "error_model": "numpy"}
 _config: Any = numba.config
 _PLAIN: dict[int, Callable[..., None]] = {}
-"""Python functions, by the numbers that replace their addresses if Numba is disabled."""
+"""Python functions, keyed by the numbers that replace their addresses if Numba is disabled."""
 
 
 @intrinsic
 def _call_compiled(_context: Any, address: Any, arguments: Any) -> Any:
-    """Generates the call of a compiled function, which returns nothing, by its address.
+    """Generates the call of a compiled function by its address. The function returns nothing.
 
-    Numba calls this function when it compiles a caller of `call_address`. An exception of the
+    Numba calls this while compiling a caller of `call_address`. An exception raised by the
     called function propagates to its caller.
 
     Args:
@@ -46,8 +46,8 @@ def _call_compiled(_context: Any, address: Any, arguments: Any) -> Any:
         arguments: Numba's type of the tuple of arguments.
 
     Returns:
-        The signature, as Numba expects it of an intrinsic, and the function that generates the
-        LLVM code of the call.
+        The signature and the function that generates the LLVM code of the call, as Numba
+        requires from an intrinsic.
     """
 
     def generate(context: Any, builder: Any, signature: Any, values: Any) -> Any:
@@ -91,11 +91,10 @@ def _call_compiled(_context: Any, address: Any, arguments: Any) -> Any:
 
 
 def _call_plain(address: int, arguments: tuple[Any, ...]) -> None:
-    """Calls a Python function by its number in `_PLAIN`, when Numba is disabled.
+    """Calls a Python function by its number in `_PLAIN`. Used when Numba is disabled.
 
-    Without Numba there is no machine code and so no address. `UserModel` then registers
-    the Python function under a number and returns this number in place of the
-    address.
+    Without Numba, there is no machine code and hence no address. `UserModel` then registers the
+    Python function under a number and returns this number instead of an address.
 
     Args:
         address: The number.
@@ -106,7 +105,7 @@ def _call_plain(address: int, arguments: tuple[Any, ...]) -> None:
 
 
 call_address: Any = _call_plain if _config.DISABLE_JIT else _call_compiled
-"""Calls the function at an address with a tuple of arguments; its exceptions propagate."""
+"""Calls the function at an address with a tuple of arguments. Exceptions propagate."""
 
 
 def digest_sibling_sources(function: Callable[..., Any]) -> str:
@@ -146,19 +145,18 @@ def _compile(
 ) -> Any:
     """Compiles a function of a user's model, so that machine code can call it.
 
-    The function takes the parameters of its model as a record. The simulation has the
-    parameters as an array of floats. Therefore the result takes this array, and gives the
-    function a view of it as a record.
+    The function expects the parameters of its model as a record, whereas the simulation stores
+    them as an array of floats. The result therefore takes this array, and passes the function a
+    view of it as a record.
 
     Args:
         function: The function of the model, called with the parameters and with a row.
-        form: Layout of the parameters: name and shape of each parameter. All are floats.
-        row: Layout of the row, from which the function reads its input and into which it
-            writes its result.
+        form: Layout of the parameters: the name and shape of each parameter, all floats.
+        row: Layout of the row that contains the input of the function and receives its result.
 
     Returns:
-        The compiled function, called with the array of the parameters and with the row. If
-        Numba is disabled, a Python function.
+        The compiled function, whose arguments are the parameter array and the row. A Python
+        function if Numba is disabled.
     """
     count = form.itemsize // 8  # floats of 8 bytes
     compute = numba.njit(**_OPTIONS)(function)
@@ -241,10 +239,10 @@ class UserModel:
         return find_address(call)
 
     def _find_parameters(self) -> dict[str, Array]:
-        """Returns the numerical fields of the model as arrays, by name.
+        """Returns the numerical fields of the model, a mapping from name to array.
 
         The compiled function of the model receives them as a row with these field names. Fields
-        of other types, such as texts, are left out. Example: a field `stiffness_n_m = 200`
+        of other types, such as strings, are omitted. For example, a field `stiffness_n_m = 200`
         becomes {"stiffness_n_m": array(200.0)}.
         """
         parameters = {}

@@ -58,7 +58,7 @@ class LawContext(NamedTuple):
 def _make_operator(operate: Callable[[Any, Any], Any]) -> Any:
     """Creates an arithmetic method of `LawVector`, such as `__add__`, from an operation.
 
-    The method works number by number. Its arguments are the vector and the other operand.
+    The method works elementwise. Its arguments are the vector and the other operand.
 
     Args:
         operate: The operation on two numbers, for example `operator.add`.
@@ -398,8 +398,8 @@ class SiteLaw:
         """Returns the error for a problem with the law, which names the arm and the class.
 
         Args:
-            tick: Number of the tick (control period). None outside a tick.
-            problem: The problem, a sentence for the user.
+            tick: Number of the tick. None outside a tick.
+            problem: The problem, as a sentence for the user.
         """
         return LawFailed(problem, site=self._site, code=self.name, tick=tick)
 
@@ -418,10 +418,9 @@ class LawResults(NamedTuple):
 
 
 def _flatten(value: Any) -> Iterator[float]:
-    """Yields the numbers of an attribute of a control law as floats, to store them in the log.
+    """Yields the numbers in an attribute of a control law as floats, for storage in the log.
 
-    A single number gives itself. Nested lists give their numbers in order: [[1, 2], [3]] gives
-    1, 2 and 3.
+    A single number yields itself. Nested lists are flattened: [[1, 2], [3]] yields 1, 2 and 3.
     """
     if isinstance(value, Real):
         yield float(value)
@@ -433,12 +432,12 @@ def _flatten(value: Any) -> Iterator[float]:
 def _fill(value: Any, numbers: Iterator[float]) -> Any:
     """Restores an attribute of a law from a list of numbers; the inverse of `_flatten`.
 
-    Example: the value [[1, 2], [3]] and the numbers 4, 5, 6 give [[4, 5], [6]]. Types are kept:
-    an integer stays an integer as long as its new number is integral.
+    For example, the value [[1, 2], [3]] and the numbers 4, 5, 6 result in [[4, 5], [6]]. Types
+    are preserved: an integer remains an integer if its new value is integral.
 
     Args:
-        value: Present value: a number, an array, or nested lists of numbers.
-        numbers: The new numbers. As many of them are consumed as `value` contains.
+        value: Current value: a number, an array, or nested lists of numbers.
+        numbers: The new numbers, of which as many are consumed as `value` contains.
     """
     if isinstance(value, bool):
         return bool(next(numbers))
