@@ -48,9 +48,8 @@ def main() -> None:
 def _run() -> None:
     """Runs the command given on the command line.
 
-    Two commands are handled before the others are loaded: `stop`, so that arms stop without
-    delay, and the hidden command `start-processes`, which starts the processes of a session by
-    forking.
+    Two commands are handled before the others are loaded: `stop`, to stop arms without delay,
+    and the hidden command `start-processes`, which forks the processes of a session.
     """
     if sys.argv[1:2] == ["stop"]:
         if sys.platform == "linux":
@@ -83,12 +82,14 @@ def _run() -> None:
 
 
 def _exit_before_zenoh(code: int | None) -> None:
-    """Ends the process at once if the network library Zenoh is loaded.
+    """Ends the process immediately if the network library Zenoh is loaded.
 
-    Otherwise Python would shut down before the threads of Zenoh, which then abort the process.
+    Otherwise, Python would shut down before Zenoh's threads, which would then abort the
+    process.
 
     Args:
-        code: The exit code. None if an exception ends the process; Python then reports it.
+        code: The exit code. None if the process ends with an exception, which Python then
+            reports.
     """
     if code is not None and "zenoh" in sys.modules:
         with suppress(OSError):  # Python reports this error itself

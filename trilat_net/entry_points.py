@@ -21,13 +21,15 @@ from .errors import UsageError
 from .package_names import PACKAGE_COMMANDS, PACKAGE_FUNCTIONS, PACKAGE_HOOKS
 
 COMMANDS = "trilat_net.commands"
-"""Group of the commands. Each name is a command with a hyphen in place of each space."""
+"""Entry point group of commands. Each name is a command with hyphens in place of spaces."""
 FUNCTIONS = "trilat_net.api"
-"""Group of the functions and classes of the Python interface."""
+"""Entry point group of functions and classes of the Python interface."""
 VIEWS = "trilat_net.views"
-"""Group of the viewers in which `trilat log view --in` can open a log."""
+"""Entry point group of the viewers in which `trilat log view --in` can open a log."""
 HOOKS = "trilat_net.hooks"
-"""Group of the functions that `hooks` looks up in the optional packages of this program."""
+"""Entry point group of the functions that `hooks` looks up in the optional packages of this
+program.
+"""
 
 _PACKAGE_OF = {
     COMMANDS: {name: package for package, names in PACKAGE_COMMANDS.items() for name in names},

@@ -27,7 +27,7 @@ _OTHER_CODE = (
     _PROGRAM / "packages",
     Path(os.__file__).parent,
 )
-"""Folders of this program and of Python's standard library."""
+"""Folders that contain this program and Python's standard library."""
 _OPTION = re.compile(
     r"(trilat [a-z][^;:,)]*)|(?<![\w-])(--[a-z][a-z-]*|-o\b)( [\d*'\[{]\S*| [A-Z]{2,}\b)?"
 )
@@ -44,14 +44,14 @@ _ARGUMENTS = {
     "--gravity": "gravity_percent",
     "--at": "at_s",
 }
-"""Python arguments whose names cannot be derived from the names of their options."""
+"""Python arguments whose names cannot be derived from the option names."""
 
 
 def _name_argument(match: re.Match[str]) -> str:
     """Returns the Python argument that corresponds to an option in a message.
 
     For example, "--min-coverage 0.9" becomes "min_coverage=0.9", and "--force" becomes
-    "force=True". A whole command such as "trilat log recover run.mcap" is not changed.
+    "force=True". A complete command such as "trilat log recover run.mcap" is left unchanged.
 
     Args:
         match: A match of `_OPTION`.
@@ -74,7 +74,9 @@ class TrilatError(Exception):
 
     exit_code = 1
     in_command: ClassVar[bool] = False
-    """True in a process that runs a command, so that messages name options, not arguments."""
+    """True in a process that runs a command, where messages refer to options rather than
+    arguments.
+    """
 
     def __str__(self) -> str:
         # KeyError.__str__ would quote the text.
@@ -229,7 +231,7 @@ class CodeFailed(RunFailed):
         self.tick = tick
 
     def __reduce__(self) -> tuple[object, ...]:
-        """Returns what pickle needs to rebuild the error with all its facts.
+        """Returns the data from which pickle rebuilds the error with all its attributes.
 
         Worker processes use pickle to report errors to the process that started them.
         """
@@ -296,10 +298,10 @@ def format_wall_time(seconds: float) -> str:
 
 
 def _pluralise(singular: str) -> str:
-    """Returns the plural of an English noun, as in "samples" for "sample" or "axes" for "axis".
+    """Returns the plural of an English noun, for example "axes" for "axis".
 
     Args:
-        singular: The noun, possibly with words before it, as in "late sample".
+        singular: The noun, possibly preceded by other words, for example "late sample".
 
     Returns:
         The same words, with the last word in the plural.
@@ -321,7 +323,7 @@ MOST_LETTERS = 80
 MOST_COMPARED = 500
 """Largest number of words that `suggest_nearest` compares.
 
-The computing time grows faster than the product of the number of words and their length.
+The computing time grows faster than the number of words times their length.
 """
 
 
@@ -385,13 +387,13 @@ def find_nearest(word: str, valid: Sequence[str], elsewhere: Sequence[str] = ())
 
 
 def _prepare_choices(suggestions: Mapping[str, str]) -> dict[str, str]:
-    """Returns the words to compare with a misspelt word, each with the text to suggest.
+    """Returns a mapping from the words to compare with a misspelt word to the suggestions.
 
-    Upper and lower case count as equal. Users also forget the unit at the end of a key: "delay"
-    and "dely" mean "delay_ms". Therefore each key is listed with and without its unit.
+    The comparison ignores case. Users also tend to forget the unit at the end of a key ("delay"
+    or "dely" for "delay_ms"), so each key is listed with and without its unit.
 
     Args:
-        suggestions: The text to suggest for each valid word.
+        suggestions: Mapping from valid word to the string to suggest.
     """
     choices: dict[str, str] = {}
     for word, suggestion in suggestions.items():
@@ -463,12 +465,12 @@ def describe_exception(error: BaseException) -> str:
 
 
 def _is_users_file(name: str) -> bool:
-    """Returns True if a source file belongs to a user, not to this program or a library.
+    """Returns True if a source file belongs to a user rather than to this program or a library.
 
-    The place of an error is reported in the user's file, where it can be corrected.
+    Errors are reported at a location in the user's file, where they can be corrected.
 
     Args:
-        name: Name of the file in a traceback. Code without a file has the name "<string>".
+        name: File name from a traceback, which is "<string>" for code without a file.
     """
     file = Path(name)
     if name.startswith("<") or "site-packages" in file.parts:

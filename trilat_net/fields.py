@@ -58,7 +58,7 @@ class Frozen(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tr
 
 
 MAX_QUANTITY = 1e9
-"""Largest absolute value of the quantities of a scenario."""
+"""Largest absolute value of any quantity in a scenario."""
 
 Positive = Annotated[float, Meta(gt=0.0, le=MAX_QUANTITY)]
 NotNegative = Annotated[float, Meta(ge=0.0, le=MAX_QUANTITY)]
@@ -120,7 +120,7 @@ _TYPE_NAMES = {
     "array": "a list",
     "object": "a table",
 }
-"""The TOML name of each type, by the name that msgspec uses."""
+"""Mapping from the type names of msgspec to those of TOML."""
 WITHOUT_QUOTES = ": write it without quotes and unit, which the key's name states"
 
 
@@ -145,12 +145,12 @@ def reword_problem(problem: str) -> str:
 
 
 def _reword_types(quoted: re.Match[str]) -> str:
-    """Replaces the names of types in an error of msgspec by those that authors of TOML know.
+    """Replaces type names in an msgspec error with those known to authors of TOML.
 
-    Example: "`float | null`" becomes "a number". Null is left out, because TOML has no null.
+    For example, "`float | null`" becomes "a number". Null is omitted because TOML has no null.
 
     Args:
-        quoted: Match of the quoted types. Group 1 is the text between the backquotes.
+        quoted: Match of the quoted types, with the text between the backquotes in group 1.
     """
     types = quoted[1].split(" | ")
     return " or ".join(_TYPE_NAMES.get(name, name) for name in types if name != "null")
@@ -174,7 +174,7 @@ UNITS = {
     "nm_rad": "N m/rad",
     "nm_s_rad": "N m s/rad",
 }
-"""The unit for each ending of a name, such as "ms" for delay_ms."""
+"""Mapping from the ending of a name to its unit, for example "ms" for delay_ms."""
 
 
 def split_unit(name: str) -> tuple[str, str]:

@@ -34,9 +34,12 @@ from .errors import LogError, LogRefused, TrilatError, UsageError
 from .package_names import PACKAGE_COMMANDS
 
 DISK_ERRNOS = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO})
-"""Numbers of the system errors of a disk that accepts no more data, for example a full disk."""
+"""Error numbers that indicate that a disk accepts no more data, for example because it is full.
+"""
 STUDY_LIBRARIES = ("loky", "matplotlib", "scipy")
-"""Libraries that `trilat-net` installs and `trilat-net-core` does not (pyproject.toml)."""
+"""Libraries that are installed with `trilat-net` but not with `trilat-net-core`
+(pyproject.toml).
+"""
 
 EXTRAS = {
     "dask": "cluster",
@@ -49,7 +52,8 @@ EXTRAS = {
     "rerun": "view",
     "statsmodels": "stats",
 }
-"""For each optional library, the extra of trilat-net that installs it (pyproject.toml)."""
+"""Mapping from optional library to the extra of trilat-net that installs it (pyproject.toml).
+"""
 
 
 def require_libraries(*names: str) -> None:
@@ -298,7 +302,7 @@ def make_folder(folder: Path, *, may_be_link: bool = True) -> Path:
 
 
 SYSTEM_FOLDERS = ("/dev", "/dev/fd", "/proc/self/fd")
-"""Folders in which the system itself makes symbolic links, for example /dev/stdout."""
+"""Folders in which the system itself creates symbolic links, for example /dev/stdout."""
 
 
 def refuse_link(path: Path) -> None:
@@ -353,7 +357,7 @@ def make_results_folder(folder: Path | None, name: str, *, force: bool | None) -
 def _make_next_folder(name: str) -> Path:
     """Creates the next free folder `runs/NAME-N`, and returns its path.
 
-    No other process gets the same folder, because creating an existing folder fails.
+    No two processes get the same folder, because creating an existing folder fails.
     """
     for n in itertools.count(1):
         folder = Path("runs") / f"{name}-{n:03d}"
@@ -491,7 +495,7 @@ def write_whole(
 
 
 def _write_parts(stream: BinaryIO, parts: Iterable[bytes | str]) -> None:
-    """Writes the parts of a file one after the other, and encodes text as UTF-8."""
+    """Writes the parts of a file in sequence, encoding text as UTF-8."""
     for part in parts:
         stream.write(part.encode() if isinstance(part, str) else part)
 

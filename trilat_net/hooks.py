@@ -22,7 +22,7 @@ from importlib import import_module
 from typing import Any
 
 _loaders: dict[str, Callable[[], Any]] = {}
-"""For each hook, a function that imports the registered function and returns it."""
+"""Mapping from hook name to a function that imports and returns the registered function."""
 
 
 def register_hooks(package: str, functions: Mapping[str, str]) -> None:
@@ -91,8 +91,8 @@ def import_on_use(package: str, modules: Mapping[str, str]) -> Callable[[str], A
 
 
 def _import_function(module: str, name: str) -> Any:
-    """Imports a function that an upper package has registered as a hook.
+    """Imports a function that a higher-level package has registered as a hook.
 
-    The import happens when a lower package uses the hook for the first time.
+    The import takes place when a lower-level package first uses the hook.
     """
     return getattr(import_module(module), name)

@@ -19,7 +19,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 
 FIFO_PRIORITY = 50
-"""Priority of the thread of a control loop with real-time scheduling (SCHED_FIFO)."""
+"""Real-time priority (SCHED_FIFO) of the thread that runs a control loop."""
 LOOP_NICE = -10
 """Nice value of a control loop if real-time scheduling is not permitted."""
 
@@ -98,10 +98,10 @@ def request_real_time_scheduling() -> str:
 def _change_threads(change: Callable[[int], None]) -> None:
     """Applies a change, such as a higher priority, to all threads of this process.
 
-    The calling thread comes first.
+    The calling thread is changed first.
 
     Args:
-        change: Function that changes the thread with a given number. 0 is the calling thread.
+        change: Function that changes the thread with a given ID. 0 denotes the calling thread.
     """
     change(0)
     threads_folder = Path("/proc/self/task")  # Linux lists the threads of a process here
@@ -146,13 +146,13 @@ def raise_priority(nice: int) -> bool:
 
 
 def _raise_session_priority(nice: int) -> None:
-    """Raises the priority of the operating system's session that this process leads, if any.
+    """Raises the priority of the operating system session that this process leads, if any.
 
-    A session is a group of processes (`setsid`). Linux may share the processors among sessions
-    first, and only then among the threads of a session (`man 7 sched`, "The autogroup
-    feature"). The nice value of a thread then has no effect outside its session. If another
-    process leads the session, for example a shell, nothing changes, because its other processes
-    would be raised too.
+    A session is a group of processes (`setsid`). Linux may distribute processor time first
+    among sessions, and only then among the threads of each session (`man 7 sched`, "The
+    autogroup feature"). In this case, the nice value of a thread has no effect outside its
+    session. If another process, for example a shell, leads the session, nothing is changed,
+    because this would also affect its other processes.
     """
     if os.getsid(0) == os.getpid():
         with suppress(OSError):  # not permitted, or the system has no such groups

@@ -24,9 +24,9 @@ SiteOrder = Literal[
     "released",
     "held",
 ]
-"""Commands that change the mode of a site. The empty text means that there is no command.
+"""Commands that change the mode of a site. An empty string means that there is no command.
 
-Users send "stop", "enable" and "reset". The site itself causes the others, for example
+Users send "stop", "enable" and "reset". The others are issued by the site itself, for example
 "arm_lost" if no measurement has arrived from its robot.
 """
 

@@ -20,7 +20,7 @@ PARAMETERS = 5
 MAX_JOINTS = 12
 """Largest number of joints of an arm."""
 MAX_LAW_MEMORY = 1024
-"""Largest number of values in a law's memory, which each record contains."""
+"""Largest number of values in a law's memory, which is part of each record."""
 
 
 class Mode(IntEnum):

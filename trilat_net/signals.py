@@ -21,9 +21,9 @@ from typing import Any
 _HANG_UP = getattr(signal, "SIGHUP", getattr(signal, "SIGBREAK", None))
 _SIGNALS = (signal.SIGINT, signal.SIGTERM, _HANG_UP)
 ENDING_SIGNALS = tuple(number for number in _SIGNALS if number is not None)
-"""Signals that request the end of the program, such as the signal of Ctrl-C."""
+"""Signals that request the end of the program, such as SIGINT (Ctrl-C)."""
 _SAME_REQUEST_S = 0.2
-"""Signals within this time, in s, count as one request.
+"""Time, in s, within which signals count as one request.
 
 A terminal and a parent process may both deliver the same signal.
 """
@@ -76,17 +76,17 @@ class Interrupt:
             outer.number = outer.number or self.number
 
     def _handle(self, number: int, _frame: FrameType | None) -> None:
-        """Records a signal that requests the end of the program, such as the signal of Ctrl-C.
+        """Records a signal that requests the end of the program, such as SIGINT (Ctrl-C).
 
-        The first signal requests an orderly end. A second Ctrl-C requests the end at once, for
-        a user who does not want to wait. Two signals in quick succession count as one request,
+        The first signal requests a clean shutdown. A second Ctrl-C requests an immediate end,
+        for users who do not want to wait. Two signals in quick succession count as one request,
         because a terminal and a parent process may both deliver the same signal.
 
         Args:
             number: Number of the signal.
 
         Raises:
-            KeyboardInterrupt: The signal has arrived in a `with` block of `raising`.
+            KeyboardInterrupt: The signal arrived in a `with` block of `raising`.
         """
         self.number = self.number or number
         # When a terminal closes, the terminal and its shell each send SIGHUP. The second one
@@ -173,19 +173,19 @@ def end_process_at_signals() -> Callable[[], None]:
 
 
 def _exit_by_signal(number: int, _frame: FrameType | None) -> None:
-    """Ends the process at once with the exit code that shells give to a signal, 128 + number.
+    """Ends the process immediately with the exit code 128 + number, as shells do.
 
-    This is the signal handler during a compilation in the first process of a container.
+    Signal handler during a compilation in the first process of a container.
     """
     os._exit(128 + number)
 
 
 def _watch_signals() -> Callable[[], None]:
-    """Starts a thread that ends the process as soon as an ending signal arrives.
+    """Starts a thread that ends the process as soon as a termination signal arrives.
 
     Python's signal handler in C writes the number of each signal into a pipe
-    (`signal.set_wakeup_fd`). The thread reads the pipe, and therefore works even while the main
-    thread is inside the compiler.
+    (`signal.set_wakeup_fd`). Since the thread reads from this pipe, it works even while the
+    main thread is inside the compiler.
 
     Returns:
         A function that stops the thread.
@@ -219,9 +219,9 @@ def _watch_signals() -> Callable[[], None]:
 
 
 def _may_interrupt(owner: object) -> bool:
-    """Returns True if a signal may interrupt the present work of the process.
+    """Returns True if a signal may interrupt the current work of the process.
 
-    The object that handles the signal decides this.
+    This is decided by the object that handles the signal.
 
     Args:
         owner: Object whose method handles the signal. None if the handler is a plain function.

@@ -12,7 +12,8 @@ from typing import Any
 from .errors import ScenarioError
 
 _MAX_KEY_PARTS = 32
-"""Largest number of parts of a dotted key. Scenarios need four, as in sites.m1.arm.l1_m."""
+"""Largest number of parts of a dotted key. Scenarios need four, for example sites.m1.arm.l1_m.
+"""
 
 _KEY_PART = re.compile(
     r"""(?P<word>[\w-]+|"[^"]*"|'[^']*')|(?P<dot>\s{0,9}\.\s{0,9})|(?P<other>.)"""
@@ -36,13 +37,13 @@ def parse_toml(text: str) -> dict[str, Any]:
 
 
 def _refuse_long_keys(text: str) -> None:
-    """Refuses a text with a dotted key that has very many parts.
+    """Raises ScenarioError if a dotted key in the text has too many parts.
 
-    The time that a TOML parser needs grows faster than the square of the number of parts, so a
+    The running time of a TOML parser grows faster than the square of the number of parts, so a
     short text from an untrusted source could block the program.
 
     Raises:
-        ScenarioError: There is such a key. The error contains the number of its line.
+        ScenarioError: A key has too many parts. The error contains its line number.
     """
     for number, line in enumerate(text.split("\n"), 1):
         if line.count(".") < _MAX_KEY_PARTS:

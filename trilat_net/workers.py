@@ -22,7 +22,7 @@ from .errors import TrilatError
 from .signals import hold_sigint
 
 _PARENT_POLL_S = 0.5
-"""Period in which a worker process checks that its parent process still exists, in s."""
+"""Interval, in s, at which a worker process checks that its parent process still exists."""
 
 
 def count_cores() -> int:
@@ -67,13 +67,13 @@ def worker_pool(count: int) -> Iterator[Executor]:
 
 
 def _prepare_worker(parent: int, in_command: bool) -> None:
-    """Prepares a new worker process, so that only its parent process decides when it ends.
+    """Prepares a new worker process, so that its lifetime is controlled only by its parent.
 
     The worker ignores Ctrl-C, and ends as soon as its parent has ended.
 
     Args:
-        parent: Process number of the parent.
-        in_command: True if the parent runs a command of `trilat`, which changes the wording of
+        parent: Process ID of the parent.
+        in_command: True if the parent runs a command of `trilat`, which affects the wording of
             errors (`TrilatError.in_command`).
     """
     TrilatError.in_command = in_command
@@ -82,13 +82,13 @@ def _prepare_worker(parent: int, in_command: bool) -> None:
 
 
 def _exit_after(parent: int) -> None:
-    """Ends this worker process as soon as its parent process has ended, however it ended.
+    """Ends this worker process as soon as its parent process has ended for any reason.
 
-    The function waits in a thread. Without this thread, workers would continue computing after
-    their parent was killed.
+    Runs in a thread. Without this thread, workers would continue computing after their parent
+    was killed.
 
     Args:
-        parent: Process number of the parent.
+        parent: Process ID of the parent.
     """
     from multiprocessing import connection, parent_process
 
