@@ -162,10 +162,7 @@ class SessionError(TrilatError):
 
 
 class LogError(TrilatError):
-    """A log that is missing, incomplete, or not written by this program.
-
-    A log is the MCAP file with the recorded data of a run.
-    """
+    """A log (MCAP file of a run) that is missing, incomplete, or not written by this program."""
 
     exit_code = 2
 
@@ -240,19 +237,13 @@ class CodeFailed(RunFailed):
 
 
 class LawFailed(CodeFailed):
-    """A user's control law that raised an exception, was too slow, or returned bad results.
-
-    A control law is the class that computes the torques of an arm.
-    """
+    """A user's control law that raised an exception, was too slow, or returned bad results."""
 
     kind = "law"
 
 
 class PlantFailed(CodeFailed):
-    """A user's arm model that raised an exception, was too slow, or returned bad results.
-
-    The model is called a plant: a class that computes the motion of an arm from its torques.
-    """
+    """A user's arm model that raised an exception, was too slow, or returned bad results."""
 
     kind = "plant"
 
@@ -328,7 +319,7 @@ The computing time grows faster than the number of words times their length.
 
 
 _UNIT_ENDINGS = ("deg", "hz", "kg", "m", "ms", "n", "nm", "ns", "rad", "s", "us")
-"""Units that may end a key, in lower case."""
+"""Units with which a key may end, in lower case."""
 
 
 def suggest_nearest(word: str, valid: Sequence[str], elsewhere: Sequence[str] = ()) -> str:

@@ -1,8 +1,8 @@
 """Format in which a log stores changes during a run, for example of a link delay.
 
-Each site stores one record per tick, which contains the JSON text of every change applied in
-that tick. With the types of this module, programs that only forward or store records can read
-these texts without the scenario.
+Each site stores one record per tick, which contains every change applied in that tick as a JSON
+string. The types of this module allow programs that only forward or store records to parse
+these strings without the scenario.
 """
 
 from collections.abc import Sequence
@@ -69,7 +69,7 @@ def count_skipped_ticks(texts: Sequence[str]) -> int:
     its tick, including those that report missed ticks.
 
     Args:
-        texts: JSON texts of the changes in the record. Invalid texts are ignored.
+        texts: Changes in the record, as JSON strings. Invalid strings are ignored.
     """
     skipped = 0
     for text in texts:

@@ -94,7 +94,7 @@ class TickRecord(NamedTuple):
             in the log is detected by a mismatch of this checksum in the tick of the input. Each
             arrival is encoded in little-endian order (peer i64, tick i64, q f64s, qd f64s),
             followed by its tau_x if the law reflects force.
-        cmd: JSON texts of the changes applied in this tick.
+        cmd: Changes applied in this tick, as JSON strings.
         mem: State of the site that no other field contains. Empty in RUN and DIVERGED. In other
             modes, the held pose, rad, and the time at which the return began, ns since the
             start of the session, or 0 before the return. For a site with a user's law, these

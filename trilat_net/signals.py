@@ -175,7 +175,7 @@ def end_process_at_signals() -> Callable[[], None]:
 def _exit_by_signal(number: int, _frame: FrameType | None) -> None:
     """Ends the process immediately with the exit code 128 + number, as shells do.
 
-    Signal handler during a compilation in the first process of a container.
+    Used as the signal handler during compilation in the first process of a container.
     """
     os._exit(128 + number)
 

@@ -18,7 +18,7 @@ _MAX_KEY_PARTS = 32
 _KEY_PART = re.compile(
     r"""(?P<word>[\w-]+|"[^"]*"|'[^']*')|(?P<dot>\s{0,9}\.\s{0,9})|(?P<other>.)"""
 )
-"""Matches the next piece of a line: a part of a key, a dot, or another character."""
+"""Matches the next token of a line: a part of a key, a dot, or another character."""
 
 
 def parse_toml(text: str) -> dict[str, Any]:

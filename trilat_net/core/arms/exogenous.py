@@ -226,7 +226,7 @@ def torque_source_rows(
 
 @leaf
 def minimum_jerk(t_s: float, start_s: float, end_s: float) -> Pair:
-    """Returns the progress of a minimum-jerk motion, which is as smooth as a human reach.
+    """Returns the progress of a minimum-jerk motion, which resembles human reaching.
 
         10 x^3 - 15 x^4 + 6 x^5,    x = (t - start) / (end - start)
 

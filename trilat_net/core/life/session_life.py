@@ -315,7 +315,7 @@ def _apply_order(t_ns: int, site: SiteRow) -> None:
     modes.
 
     Args:
-        t_ns: Time, ns since the epoch, the common start of the session.
+        t_ns: Time, ns since the start of the session.
         site: State of the site, with the command and the number of missed ticks.
     """
     order = site.order

@@ -7,8 +7,7 @@ programs in one array. No Python code runs per simulation.
 
 Invariant:
     - The results are bit-identical to those of `OwnHand.advance_span`, provided that each
-      program decides in time. `SeveralHands.explain` tells which programs this module does not
-      support.
+      program decides in time. `SeveralHands.explain` states why a program is not supported.
 """
 
 import math

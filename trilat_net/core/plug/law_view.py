@@ -84,7 +84,7 @@ def update_law_view(
 _PER_JOINT = ("q", "qd", "tau_x", "tau_before", "q_before", "tau", "gravity", "bias")
 _PER_COORDINATE = ("q_des", "qd_des", "felt")
 _IN_ROW = {"gravity": "G"}
-"""Fields of the site's row whose names differ from those of a law's input."""
+"""Mapping from field names of a law's input to those of the site's row, where they differ."""
 _FIRST_PEER_VECTOR = PeerView._fields.index("q")
 """Index of the first vector in `PeerView`: q, qd and tau_x follow the scalar fields."""
 

@@ -191,7 +191,7 @@ def _compile(
 
 
 class UserModel:
-    """A user's model in the form that the compiled simulation needs: numbers and machine code.
+    """A user's model in the form required by the simulation: parameters and machine code.
 
     Args:
         model: A model of an operator, an environment or network delays.

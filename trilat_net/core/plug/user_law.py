@@ -430,7 +430,7 @@ def _flatten(value: Any) -> Iterator[float]:
 
 
 def _fill(value: Any, numbers: Iterator[float]) -> Any:
-    """Restores an attribute of a law from a list of numbers; the inverse of `_flatten`.
+    """Restores an attribute of a law from its numbers. Inverse of `_flatten`.
 
     For example, the value [[1, 2], [3]] and the numbers 4, 5, 6 result in [[4, 5], [6]]. Types
     are preserved: an integer remains an integer if its new value is integral.
