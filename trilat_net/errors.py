@@ -162,7 +162,7 @@ class SessionError(TrilatError):
 
 
 class LogError(TrilatError):
-    """A log (MCAP file of a run) that is missing, incomplete, or not written by this program."""
+    """A log (the MCAP file of a run) that is missing, incomplete, or not from this program."""
 
     exit_code = 2
 

@@ -24,9 +24,9 @@ Without a spring, waves carry b h qd^2 / 4 more energy than the work of the arm,
 describe the previous period. H lends this energy until the arm slows down.
 
 Invariant:
-    - An end never extracts more energy from a line than the other end has put in, whichever
-      messages are late or lost. The only exception is the reception mode "hold", which exists
-      for comparisons.
+    - An end never extracts more energy from a line than the other end has put in, no matter
+      which messages are late or lost. The only exception is the reception mode "hold", which
+      exists for comparisons.
     - An end never puts more energy into its lines than its account H contains.
 """
 
