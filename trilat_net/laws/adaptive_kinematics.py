@@ -186,7 +186,7 @@ class AdaptiveKinematics(ControlLaw):
     known_facts: ClassVar = "gravity, as its first estimate, and no length"
 
     def begin(self, facts: LawContext) -> None:
-        """Prepares the law of a site before a run, initializing its estimates and their rates.
+        """Prepares the law of a site before a run, initialising its estimates and their rates.
 
         The link lengths and the dynamic parameters of the arm are estimated. Their initial
         values are taken from the settings.

@@ -34,7 +34,7 @@ from .interface import DAMPING, INERTIA, STIFFNESS, ControlLaw, TuningSite
 
 @compiled
 class Smith(ControlLaw):
-    """Couples a master and a slave with springs, and predicts the slave to remove the delay.
+    """Couples a master and a slave with springs and a predictor that removes the delay.
 
     A spring pulls each arm towards the other, and a damper brakes it. Instead of waiting for
     the delayed position of the slave, the master uses a model of the slave and corrects it with

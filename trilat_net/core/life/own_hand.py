@@ -166,7 +166,7 @@ class OwnHand:
         return k % self.period_ticks == 0
 
     def find_next_event(self, k: int) -> int:
-        """Returns the next tick after `k` with a decision, or in which a decision takes effect.
+        """Returns the next tick after `k` in which a decision is made or takes effect.
 
         All ticks before that can be computed by one compiled call of `advance_span`.
         """
