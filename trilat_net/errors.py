@@ -440,7 +440,7 @@ def describe_exception(error: BaseException) -> str:
     kind = type(error).__name__
     lines = str(error).strip().splitlines()
     text = f"{kind}: {lines[0]}" if lines else kind
-    # The message of a syntax error already names the place.
+    # The message of a syntax error already states the location.
     if isinstance(error, SyntaxError):
         return text
     # Imported here, because `trilat stop` imports this module and describes no exception.

@@ -128,7 +128,7 @@ class Sync(ControlLaw):
         )
         for p in range(len(self.Yr)):
             Yr = first[p] * r[0] + second[p] * r[1]  # entry p of Y' r
-            # The trapezoid rule needs the entry of the previous tick, so it starts at tick 1.
+            # The trapezoidal rule needs the entry of the previous tick, so it starts at tick 1.
             if now.k > 0:
                 gain_s = half_h * self.Gamma[p]
                 Yr_sum = self.Yr[p] + Yr

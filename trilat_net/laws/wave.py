@@ -517,7 +517,7 @@ class Wave(EnergyLaw):
             else:
                 impedances = np.zeros(n) + line
                 self.impedance += impedances.tolist()
-        # A number in place of the text, because `torque` is compiled.
+        # A number instead of the string, because `torque` is compiled.
         self.playing = RECEPTIONS.index(self.reception)
 
         # Per line and joint.

@@ -213,7 +213,7 @@ def torque_source_rows(
         if content is None:
             continue
 
-        # All tables have the same number of columns, filled up with zeros.
+        # All tables have the same number of columns, padded with zeros.
         columns = np.shape(content)[1]
         table = np.zeros((len(content), width))
         table[:, :columns] = content
@@ -299,7 +299,7 @@ def _target_progress(actor: Row, t_s: float) -> Pair:
     """
     is_live_hand = actor.kind >= _LIVE_TIP  # the live kinds have the largest numbers
     if is_live_hand:
-        # `a` is the present target, and `b` the target one second later.
+        # `a` is the current target, and `b` the target one second later.
         return 0.0, 1.0
     return minimum_jerk(t_s, actor.move_start_s, actor.move_end_s)
 
@@ -805,7 +805,7 @@ def _add_joint_torque(
         torque: The torque is added to this array, shape (n,), N m.
     """
     if actor.kind == _HAND or actor.kind == _LIVE_JOINT:
-        # An operator, who pulls each joint to a target by a spring.
+        # An operator who pulls each joint towards a target with a spring.
         progress, rate = _target_progress(actor, t_s)
         factor = 1.0
         square = 0.0

@@ -385,7 +385,7 @@ def _explain(error: Exception, law: Any) -> str:
     line_numbers = re.findall(rf'{file}"?,? (?:line |\()(\d+)', text)
     location = f" (line {line_numbers[-1]})" if line_numbers else ""
 
-    # Numba's words for code that allocates memory.
+    # Numba's message for code that allocates memory.
     if "NRT required" in text or "returning of array" in text:
         return (
             f"the law creates an array or a list{location}: compute number by number, as in "
@@ -553,7 +553,7 @@ class CompiledLaw:
         """
         arrays = self._arrays
         assert arrays.channel is not None
-        # Only the types of the arguments count: any integers serve as tick and time.
+        # Only the types of the arguments matter, so tick and time may be any integers.
         example_tick = 0
         example_t_ns = 0
         self._stage = bind_leaf(

@@ -131,7 +131,7 @@ class PlainLaw:
         self._sent = sent
         self._update = update_law_view
 
-        # Views of the arrays: reading them gives the present state of the site, and writing
+        # Views of the arrays: reading them yields the current state of the site, and writing
         # into them changes it.
         site = arrays.site[0]
         self._views: dict[str, Array] = {}

@@ -182,7 +182,7 @@ def _compile(
     sources = digest_sibling_sources(function)
     is_part_of_this_package = bool(sources)
     if is_part_of_this_package:
-        # The machine code is stored on disk, under a hash of everything that it depends on.
+        # The machine code is cached on disk, under a hash of everything that it depends on.
         text = f"{sources} {function.__module__} {function.__qualname__} {form} {row}"
         digest = hashlib.sha256(text.encode()).hexdigest()
         return compile_named(call, f"own_{digest[:32]}", signature, **_OPTIONS)
@@ -208,7 +208,7 @@ class UserModel:
         empty if the model has no parameters.
         """
         fields = [value.ravel() for value in self._find_parameters().values()]
-        # A model without numbers gives an empty array.
+        # A model without parameters yields an empty array.
         return np.concatenate([np.zeros(0), *fields])
 
     def compile_to_address(self, name: str, row: np.dtype[np.void]) -> int:
