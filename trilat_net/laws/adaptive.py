@@ -100,8 +100,8 @@ class Adaptive(ControlLaw):
 
         Args:
             theta_hat: Estimate before the step, shape (P,).
-            Yr: Product Y' r, shape (P,). For the trapezoidal rule, the sum over two ticks.
-            gain_s: Duration of the step, s. For the trapezoidal rule, half of the control
+            Yr: Product Y' r, shape (P,). For the trapezoid rule, the sum over two ticks.
+            gain_s: Duration of the step, s. For the trapezoid rule, half of the control
                 period.
         """
         return theta_hat - gain_s * np.array(self.Gamma) * Yr

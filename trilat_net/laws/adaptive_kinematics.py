@@ -28,7 +28,7 @@ effector with finite reach cannot move at a constant velocity forever. Source of
 Jacobian: Cheah, Liu and Slotine, Int. J. Robotics Research 25 (2006).
 
 Invariant:
-    - Both estimates are integrated with the trapezoidal rule, like the estimate of `adaptive`.
+    - Both estimates are integrated with the trapezoid rule, like the estimate of `adaptive`.
     - The estimated lengths are clipped to their bounds, which does not affect the stability
       proof.
 """

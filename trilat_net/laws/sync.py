@@ -12,7 +12,7 @@ it anywhere else. Laws that compare positions, such as `adaptive`, do not have t
 because their r contains the position error instead of q.
 
 Invariant:
-    - The parameter estimate is integrated with the trapezoidal rule, as in the law `adaptive`.
+    - The parameter estimate is integrated with the trapezoid rule, as in the law `adaptive`.
 """
 
 from collections.abc import Mapping
@@ -72,7 +72,7 @@ class Sync(ControlLaw):
         """Prepares the law before a run by creating the parameter estimate.
 
         The initial estimate of the arm's dynamic parameters is the setting `theta_hat0`. Its
-        rate in the previous tick is also stored, as required by the trapezoidal rule.
+        rate in the previous tick is also stored, as required by the trapezoid rule.
 
         Args:
             facts: Facts about the arm and the other arms that are known before the run.
@@ -97,7 +97,7 @@ class Sync(ControlLaw):
         -Lambda q and acceleration a = -Lambda qd. Y' is its transpose. Note that r = qd - v.
 
         The regressor is evaluated once for both the torque and the estimate. The estimate is
-        integrated with the trapezoidal rule, which multiplies the mean of the old and the new
+        integrated with the trapezoid rule, which multiplies the mean of the old and the new
         rate by the control period.
 
         Args:
@@ -128,7 +128,7 @@ class Sync(ControlLaw):
         )
         for p in range(len(self.Yr)):
             Yr = first[p] * r[0] + second[p] * r[1]  # entry p of Y' r
-            # The trapezoidal rule needs the entry of the previous tick, so it starts at tick 1.
+            # The trapezoid rule needs the entry of the previous tick, so it starts at tick 1.
             if now.k > 0:
                 gain_s = half_h * self.Gamma[p]
                 Yr_sum = self.Yr[p] + Yr
