@@ -67,7 +67,7 @@ def has_orientation(s: Row) -> bool:
 
 @leaf
 def count_linear_coordinates(s: Row) -> int:
-    """Returns the number of shared coordinates whose difference is plain subtraction.
+    """Returns the number of shared coordinates whose difference is a plain subtraction.
 
     These are the positions (m) or joint angles (rad), which come first. In a pose, the last
     three coordinates are an orientation, and the difference of two orientations is a rotation.
