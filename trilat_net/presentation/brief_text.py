@@ -1,15 +1,15 @@
-"""Composes the short texts of `trilat certify` and `trilat metrics`, of about ten lines each.
+"""Composes the short output of `trilat certify` and `trilat metrics`, about ten lines each.
 
-A reader should see within seconds whether a run was stable and how well the arms followed each
-other. With the option --all, these commands print everything, see `certificate_text` and
-`summary_text`.
+The short output lets a reader see within seconds whether a run was stable and how well the arms
+followed each other. With the option --all, the commands print everything; see
+`certificate_text` and `summary_text`.
 
 Invariant:
-    - A short text has at most `MOST_LINES` lines, and one more line that mentions --all. The
-      meaning of a judgement and remarks about the run are not counted.
-    - Each line is also printed with --all, or contains the largest of the values that --all
-      prints.
-    - The judgement comes first, and a line that contradicts stability is never left out.
+    - A short text has at most `MOST_LINES` lines, plus one line that mentions --all. The
+      explanation of a verdict and remarks about the run are not counted.
+    - Each line is also printed with --all, or contains the largest of the values printed with
+      --all.
+    - The verdict comes first, and a line that contradicts stability is never omitted.
 """
 
 from collections.abc import Iterator
@@ -57,12 +57,12 @@ _MARK_RANKS = {"FAIL": 0, "open": 1, "ok": 2, "note": 3}
 
 
 def compose_key_reasons(certificate: Certificate) -> Iterator[Block]:
-    """Yields the judgement whether a run was stable, and its most important reasons.
+    """Yields the stability verdict on a run and the most important reasons for it.
 
     `trilat certify` prints these lines by default, and all reasons with the option --all.
 
     Args:
-        certificate: Judgement whether a run was stable, with its reasons.
+        certificate: Stability certificate of the run.
     """
     lines = describe_certificate(certificate)
     judgement, *reasons = _choose_lines(lines)
@@ -97,10 +97,10 @@ def _choose_lines(lines: list[CertificateLine]) -> list[CertificateLine]:
 
 
 def compose_key_metrics(metrics: LogMetrics) -> Iterator[Block]:
-    """Yields a table with the ten most important metrics of a run, each with its subject.
+    """Yields a table of the ten most important metrics of a run, each with its subject.
 
-    The subject is, for example, the site with the largest value, or "every site" if all sites
-    have the same value.
+    The subject is, for example, the site with the largest value, or "every site" if the value
+    is the same at all sites.
 
     Args:
         metrics: All metrics of the run.

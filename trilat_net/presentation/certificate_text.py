@@ -1,15 +1,15 @@
-"""Composes the text that explains whether a run was stable, for the terminal and for a report.
+"""Composes the explanation of whether a run was stable, for the terminal and for reports.
 
-`analysis.certificate` judges the run from its log. `describe_certificate` returns the
-sentences, which the terminal and the report share. The terminal adds tables of the conditions
-of the stability theorem, and of the energies that changed V, the energy function of the
-stability proof.
+`analysis.certificate` judges the run from its log, and `describe_certificate` turns the result
+into the sentences shown in the terminal and in the report. The terminal output also includes
+tables of the premises of the stability theorem, and of the energies that changed V, the energy
+function in the stability proof.
 
 Invariant:
-    - The terminal and the report have the same sentences.
+    - The terminal and the report contain the same sentences.
     - The verdict comes first.
-    - The listed energies add up: V at the end is V at the start plus all other entries, up to
-      entries that are too small to be listed.
+    - The listed energies add up: V at the end is V at the start plus all other entries, except
+      for entries too small to be listed.
 """
 
 import math
@@ -67,12 +67,12 @@ _HOLDS = {True: "holds", False: "fails", None: "undecided"}
 
 
 def compose_certificate(certificate: Certificate) -> Iterator[Block]:
-    """Yields the text of a stability certificate: judgement, reasons, and tables.
+    """Yields the text of a stability certificate: verdict, reasons, and tables.
 
-    The tables contain the premises (conditions of the stability theorem) and the energies.
+    The tables list the premises of the stability theorem and the energies.
 
     Args:
-        certificate: Judgement whether a run was stable, with its reasons.
+        certificate: Stability certificate of the run.
     """
     judgement, *reasons = describe_certificate(certificate)
     for line in (judgement, *describe_in_words(certificate), *reasons):
@@ -101,14 +101,14 @@ def compose_certificate(certificate: Certificate) -> Iterator[Block]:
 
 
 def select_premises(certificate: Certificate) -> list[premise_quantities.Premise]:
-    """Returns the conditions (premises) of stability that apply to the control laws of a run.
+    """Returns the stability premises that apply to the control laws of a run.
 
-    Most of them belong to the stability theorem of the paper, which is about an energy function
-    V. For control laws without such a function, only the condition about walls applies, and the
-    conditions that the law itself declares.
+    Most premises belong to the stability theorem of the paper, which is based on an energy
+    function V. For control laws without such a function, only the premise about walls and the
+    premises declared by the law itself apply.
 
     Args:
-        certificate: Judgement whether a run was stable, with its reasons.
+        certificate: Stability certificate of the run.
     """
     premises = list(certificate.premises)
     if not certificate.has_functional:
@@ -126,11 +126,10 @@ def _tabulate_premises(premises: Sequence[premise_quantities.Premise]) -> TextTa
 
 
 def compose_twins(twins: PushedTwins) -> Iterator[Block]:
-    """Yields the text about the repetitions of a run with small pushes.
+    """Yields a description of the twins of a run: its repetitions with small pushes.
 
-    A repetition with a push is called a twin, and shows whether small disturbances grow. The
-    text states the size up to which the effect of a push is proportional to the push, and
-    contains a line about each push.
+    Twins show whether small disturbances grow. The text states the size up to which the effect
+    of a push is proportional to the push, followed by one line per push.
 
     Args:
         twins: The run and its twins.
@@ -144,12 +143,11 @@ def compose_twins(twins: PushedTwins) -> Iterator[Block]:
 
 
 class CertificateLine(NamedTuple):
-    """One line of a stability certificate: a sentence with a mark such as "ok" or "FAIL".
+    """One line of a stability certificate: a sentence marked with, for example, "ok" or "FAIL".
 
     Attributes:
-        mark: "ok" if the sentence is evidence that the run was stable, "FAIL" if it is
-            evidence against it, "open" if it leaves the question open, and "note" for other
-            sentences.
+        mark: "ok" for evidence that the run was stable, "FAIL" for evidence that it was not,
+            "open" for evidence that leaves the question open, and "note" for anything else.
         text: The sentence.
     """
 
@@ -158,24 +156,24 @@ class CertificateLine(NamedTuple):
 
     @property
     def print_form(self) -> MarkedText:
-        """The sentence with its coloured mark, as the terminal and the page show it.
+        """The sentence with its coloured mark, as shown in the terminal and on the page.
 
-        For example, the mark is "ok". If the sentence begins with the same word and a colon,
-        the word is left out of the sentence, so that it does not appear twice.
+        If the sentence itself starts with the mark and a colon, as in "note: ...", that prefix
+        is removed so that the mark does not appear twice.
         """
         return MarkedText(MARKS[self.mark], self.text.removeprefix(f"{self.mark}: "))
 
 
 def describe_certificate(certificate: Certificate) -> list[CertificateLine]:
-    """Returns the judgement of a certificate, and then its reasons, each as a marked sentence.
+    """Returns the verdict of a certificate followed by its reasons, each as a marked sentence.
 
-    The reasons are: the energy function V of the stability proof; the end of the run; the
-    energy balance; the energies that control laws declare; the characteristic roots; the twins,
-    which are repeated runs with a small push; and the log itself. Reasons that do not exist for
-    a run are left out.
+    The possible reasons are the energy function V of the stability proof, the end of the run,
+    the energy balance, energies declared by control laws, the characteristic roots, the twins
+    (repeated runs with a small push), and the log itself. Reasons that are not available for
+    the run are omitted.
 
     Args:
-        certificate: Judgement whether a run was stable, with its reasons.
+        certificate: Stability certificate of the run.
     """
     lines = _describe_verdict(certificate)
     if certificate.balance is not None:
@@ -213,10 +211,10 @@ def describe_certificate(certificate: Certificate) -> list[CertificateLine]:
 
 
 def describe_in_words(certificate: Certificate) -> list[CertificateLine]:
-    """Explains in sentences what the judgement of a run means, with remarks about the run.
+    """Explains in full sentences what the verdict on a run means, with remarks about the run.
 
     Args:
-        certificate: Judgement whether a run was stable, with its reasons.
+        certificate: Stability certificate of the run.
     """
     sentences = [_explain_judgement(certificate), *certificate.remarks]
     return [CertificateLine("note", sentence) for sentence in sentences if sentence]
@@ -255,12 +253,12 @@ def _explain_judgement(certificate: Certificate) -> str:
 
 
 def describe_settling(certificate: Certificate) -> str:
-    """Returns a clause on the observed motion of a run that settled without a stability proof.
+    """Returns a clause on the motion of a run that settled without a stability proof.
 
-    A settled run has become slow, or its motion decays. Its arms need not be at rest.
+    In a settled run, the motion is slow or decaying, but the arms are not necessarily at rest.
 
     Args:
-        certificate: Judgement of a run that settled, with its reasons.
+        certificate: Stability certificate of a run that settled.
     """
     speed = f"{certificate.end.end_speed_rad_s:.2g} rad/s"
     return (
@@ -270,17 +268,17 @@ def describe_settling(certificate: Certificate) -> str:
 
 
 def describe_pace(certificate: Certificate) -> str:
-    """Returns how fast a small disturbance of the final pose dies away or grows, as a sentence.
+    """Returns a sentence on how fast a small disturbance of the final pose decays or grows.
 
-    For example: "a small disturbance halves every 0.83 s". The rate is that of the
-    characteristic root of the linearised control loop that decays most slowly or, if a root
-    grows, of the root that grows fastest.
+    For example: "a small disturbance halves every 0.83 s". The rate is that of the slowest
+    characteristic root of the linearised control loop or, if any root is unstable, of the
+    fastest growing one.
 
     Args:
-        certificate: Judgement whether a run was stable, with its reasons.
+        certificate: Stability certificate of the run.
 
     Returns:
-        The sentence. Empty if the roots prove nothing, or if their rate is unknown.
+        The sentence, or an empty string if the roots are inconclusive or their rate is unknown.
     """
     roots = certificate.roots
     if roots is None or not roots.rate_per_s:
@@ -323,15 +321,14 @@ def _describe_verdict(certificate: Certificate) -> list[CertificateLine]:
 def describe_theorem(certificate: Certificate) -> list[str]:
     """Returns a line that says whether the paper's stability theorem applies to a run.
 
-    A theorem in the paper guarantees stability if the controller and the network fulfil its
-    conditions. The line states whether these conditions were fulfilled.
+    The theorem guarantees stability if the controller and the network satisfy its premises. The
+    line states whether they were satisfied in this run.
 
     Args:
-        certificate: Judgement whether a run was stable, with its reasons.
+        certificate: Stability certificate of the run.
 
     Returns:
-        The line. Empty if the theorem is about a different control law and therefore does not
-        apply.
+        A list with the line. Empty if the theorem does not cover the control law of the run.
     """
     if not certificate.has_functional:
         return []
@@ -408,13 +405,13 @@ def _describe_paper_weights(certificate: Certificate) -> str:
 
 
 def compose_headline(certificate: Certificate) -> str:
-    """Returns the judgement of a run and its basis in one line.
+    """Returns the verdict on a run and the basis for it, on one line.
 
-    For example "stable: converged; rests on: exact roots, slowest -0.832 /s". If the arms
-    exceeded their limits, the line says which joint did so, and when.
+    For example: "stable: converged; rests on: exact roots, slowest -0.832 /s". If an arm
+    exceeded its limits, the line says which joint did so, and when.
 
     Args:
-        certificate: Judgement whether a run was stable, with its reasons.
+        certificate: Stability certificate of the run.
     """
     end = certificate.end
     if end.behaviour is EndBehaviour.DIVERGED:
@@ -457,13 +454,13 @@ def _describe_end(certificate: Certificate) -> str:
 
 
 def describe_judgement(certificate: Certificate) -> str:
-    """Returns the judgement whether a run was stable, in one line.
+    """Returns the stability verdict on a run, on one line.
 
-    If the judgement is open, the line states the reasons. A reason that repeats the end of the
-    run is left out, because another line of the certificate is about the end.
+    If the verdict is open, the line states why. Reasons that concern the end of the run are
+    omitted because another line of the certificate covers them.
 
     Args:
-        certificate: Judgement whether a run was stable, with its reasons.
+        certificate: Stability certificate of the run.
     """
     if certificate.decision.is_too_short:
         return f"{certificate.stability}: {'; '.join(certificate.reasons)}"
@@ -541,17 +538,17 @@ def _describe_balance(balance: EnergyBalance) -> str:
 
 
 def list_energies(balance: EnergyBalance) -> list[tuple[str, float]]:
-    """Lists the energies of the balance of V, the energy function of the stability proof.
+    """Lists the entries of the energy balance of V, the energy function in the stability proof.
 
     The entries are V at the start, the energies that changed V, and V at the end, in J.
-    Energies below `MIN_ENERGY_SHARE` of the largest energy are left out. If there are more than
-    `MAX_LISTED_LINKS` links, their energies are summed.
+    Energies below `MIN_ENERGY_SHARE` of the largest one are omitted. If there are more than
+    `MAX_LISTED_LINKS` links, their energies are combined into one entry.
 
     Args:
         balance: The energy balance.
 
     Returns:
-        Name and energy of each entry.
+        One (name, energy in J) pair per entry.
     """
     link_energies: dict[str, Array] = {}
     source_energies: dict[str, Array] = {}

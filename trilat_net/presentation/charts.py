@@ -1,18 +1,19 @@
-"""Computes the data of the interactive charts in the report of a run, a web page.
+"""Computes the data for the interactive charts in the report of a run, a web page.
 
-Scripts in the page draw the charts. The charts need signals of the run, such as joint angles
-and torques. A log typically contains a value per millisecond, which is far too much for a page.
-`ChartBuilder` therefore divides the time into intervals, and keeps the least and the largest
-value of each interval (decimation). The result consists of tables of columns, and of charts
-whose lines refer to these columns by index. `page_data` defines the types of the data.
+Scripts in the page draw the charts from signals of the run, such as joint angles and torques. A
+log typically contains one value per millisecond, which is far too much for a page, so
+`ChartBuilder` decimates the signals: it divides the time axis into intervals and keeps the
+minimum and maximum of each interval. The result consists of tables of columns, and of charts
+whose lines refer to these columns by index. The data types are defined in `page_data`.
 
 Invariant:
-    - Every spike of the log is on the page, because decimation keeps the least and the largest
-      value of an interval.
-    - Every line of a chart has a value to draw. A chart without any line is left out, and
-      `_PageCharts.missing` names the chart, so that the page can mention it.
-    - Numbers are stored as base64 text of little-endian int32 and float32, which is a third of
-      the length of decimal text.
+    - Every spike in the log is visible on the page, because decimation keeps the minimum and
+      maximum of each interval.
+    - Every line of a chart has at least one value to draw. Charts without any lines are
+      omitted, and their titles are listed in `_PageCharts.missing` so that the page can mention
+      them.
+    - Numbers are stored as base64-encoded little-endian int32 and float32, which takes a third
+      of the space of decimal text.
 """
 
 import base64
@@ -80,21 +81,21 @@ class _PageCharts(NamedTuple):
 
 
 class ChartBuilder:
-    """Computes from a log the charts of the web page that reports the run.
+    """Computes the charts of a run's report page from its log.
 
-    The values of the signals become tables, from which the scripts of the page draw the charts
-    in the browser.
+    The signals are stored in tables, from which scripts draw the charts in the browser.
 
     Args:
         log: Log of the run.
-        twin: Log of the same run without operators, the people or programs that move the arms.
-            If `None`, the chart of the motion due to operators is left out.
+        twin: Log of the same run without operators. If `None`, the chart of the motion caused
+            by operators is omitted.
 
     Attributes:
-        bounds_m: Left, right, bottom and top of a box around the motion of all arms, in m.
-        units_per_m: Scale of the pictures of the arms, in units of the picture per m. Pictures
-            with a chain, and of planar arms that move in less than half of `PICTURE_SIDE`, are
-            scaled to that size, because the widths of lines are fixed. Other pictures have the
+        bounds_m: Left, right, bottom and top of the bounding box of the motion of all arms, in
+            m.
+        units_per_m: Scale of the pictures of the arms, in picture units per m. Pictures that
+            contain a chain, or planar arms that move within less than half of `PICTURE_SIDE`,
+            are scaled up to that size because line widths are fixed. All other pictures have
             scale 1.
         leads: Weights with which each slave follows the other arms over time.
     """
@@ -137,11 +138,11 @@ class ChartBuilder:
     def build(self) -> _PageCharts:
         """Computes all charts of the page: overview, motion of the arms, and timing.
 
-        A chart without any curve is left out, for example the estimates of a law that has none.
-        The page lists the titles of such charts by section.
+        A chart without any curves is omitted, for example the estimates of a law that estimates
+        nothing. The page lists the titles of omitted charts by section.
 
         Returns:
-            The data of the page, and the titles of the charts that are left out.
+            The page data, including the titles of omitted charts.
         """
         log = self._log
         charts: list[Chart] = []

@@ -1,12 +1,12 @@
-"""Composes a paragraph for a paper about the stability of a run, with its references.
+"""Composes a paragraph about the stability of a run for use in a paper, with references.
 
-The paragraph names the scenario, the program, the verdict with its basis, and the values behind
-it, so that a reader of the paper can reproduce and judge the statement. References follow as
-BibTeX entries.
+The paragraph names the scenario, the program, the verdict and its basis, and the underlying
+values, so that a reader of the paper can reproduce and assess the statement. References follow
+as BibTeX entries.
 
 Invariant:
-    - The paragraph states only facts that the certificate states.
-    - A source is listed only if the statement rests on it.
+    - The paragraph states only facts that are in the certificate.
+    - A source is listed only if the statement relies on it.
 """
 
 from collections.abc import Iterator, Mapping
@@ -67,13 +67,13 @@ _STATEMENTS = {
 
 
 def compose_citation(log: Log, certificate: Certificate) -> Iterator[str]:
-    """Yields a paragraph for a paper about a run, and then its references as BibTeX.
+    """Yields a paragraph about a run for use in a paper, followed by its references as BibTeX.
 
-    The paragraph states the scenario, the judgement and its basis, and the program.
+    The paragraph states the scenario, the verdict and its basis, and the program.
 
     Args:
         log: The log of the run.
-        certificate: Judgement whether the run was stable, with its reasons.
+        certificate: Stability certificate of the run.
     """
     yield " ".join(_compose_sentences(log, certificate))
     yield ""

@@ -1,18 +1,17 @@
-"""Draws columns of a log over time, as the method `Log.plot` does.
+"""Plots columns of a log over time; this is the implementation of `Log.plot`.
 
 A column is one recorded quantity of an arm, such as the angle of its first joint. For example,
-`log.plot("q1", "tau1")` draws the angle and the torque of the first joint of all arms. A name
-selects one of
+`log.plot("q1", "tau1")` plots the angle and the torque of the first joint of every arm. A name
+can refer to
 
-- a quantity, such as "q", which stands for all columns of the quantity,
+- a quantity, such as "q", which selects all columns of the quantity,
 - a column without its unit, such as "q1",
 - a column, such as "q1_rad".
 
 Invariant:
-    - Names are those of the tables of the log (`Log.table`), and "e", the error.
-    - Each column has a panel. The panel contains a line for each selected arm that has the
-      column.
-    - An unknown name raises an error that lists the existing names.
+    - Names are those of the tables of the log (`Log.table`), and "e" for the error.
+    - There is one panel per column, with one line for each selected arm that has the column.
+    - An unknown name raises an error that lists the valid names.
 """
 
 import re
@@ -82,22 +81,22 @@ def plot_log(
     from_s: float | None = None,
     until_s: float | None = None,
 ) -> Figure:
-    """Draws columns of a log over time, with a panel per column and a line per arm.
+    """Plots columns of a log over time, with one panel per column and one line per arm.
 
-    For example, `plot_log(log, ["q1", "tau1"])` draws the angle and the torque of the first
-    joint of all arms. If nothing is selected, the figure is the overview of the run.
+    For example, `plot_log(log, ["q1", "tau1"])` plots the angle and the torque of the first
+    joint of every arm. If nothing is selected, the figure is the overview of the run.
 
     Args:
         log: The log.
         names: Names of quantities or columns. Each name gets its own rows of panels.
-        sites: Names of the arms. `None` for all arms.
-        joints: Joints to draw, for quantities with a column per joint.
-        from_s: First time that is drawn, in s. `None` for the start of the run.
-        until_s: Last time that is drawn, in s. `None` for the end of the run.
+        sites: Names of the arms to plot. `None` for all arms.
+        joints: Joints to plot, for quantities with one column per joint.
+        from_s: Start of the plotted interval, in s. `None` for the start of the run.
+        until_s: End of the plotted interval, in s. `None` for the end of the run.
 
     Raises:
         UnknownName: There is no such column, arm or joint.
-        UsageError: The interval of time contains no records.
+        UsageError: The interval contains no records.
         LogError: The records cannot be read.
     """
     is_restricted = not (

@@ -1,11 +1,11 @@
-"""Writes the sentences on the basis of a stability decision, and on the obstacles to it.
+"""Turns the basis of a stability decision, and the obstacles to it, into sentences.
 
-`analysis.stability_decision` decides and returns names, and the evidence with its numbers. For
-example, this module states the basis "roots" as "exact roots, slowest -0.832 /s".
+`analysis.stability_decision` makes the decision and returns names with numerical evidence. This
+module describes, for example, the basis "roots" as "exact roots, slowest -0.832 /s".
 
 Invariant:
-    - Each name of a basis has exactly one function in `BASES`, and each name of an obstacle
-      exactly one function in `OBSTACLES`.
+    - Each basis has exactly one function in `BASES`, and each obstacle exactly one function in
+      `OBSTACLES`.
 """
 
 from collections.abc import Callable, Iterable
@@ -60,16 +60,16 @@ def _describe_span(roots: decision_facts.LoopRoots) -> str:
 def describe_tick_span(
     span_s: float | None, deviation_per_s: float | None, *, repeats: bool
 ) -> str:
-    """Returns a clause on the time for which the roots of a sampled loop were computed.
+    """Returns a clause on the time span for which the roots of a sampled loop were computed.
 
-    If the controllers compute in ticks (periods of the control loop) that are not all alike,
-    the roots belong to a span of several ticks.
+    If the ticks of the controllers are not all alike, the roots describe a span of several
+    ticks.
 
     Args:
-        span_s: The time, in s. None if all ticks are alike.
-        deviation_per_s: Uncertainty of the rate due to delays that do not repeat, in 1/s. None
-            if they nearly repeat.
-        repeats: True if the delays repeat after this time.
+        span_s: The time span, in s. None if all ticks are alike.
+        deviation_per_s: Uncertainty of the rate caused by delays that do not repeat exactly, in
+            1/s. None if they nearly repeat.
+        repeats: True if the delays repeat after this span.
 
     Returns:
         The clause, with a leading comma. Empty if all ticks are alike.
@@ -84,10 +84,10 @@ def describe_tick_span(
 
 
 def describe_left_out(roots: decision_facts.LoopRoots) -> str:
-    """Returns a phrase about the programs whose reaction the linear analysis leaves out.
+    """Returns a phrase about programs whose reaction the linear analysis ignores.
 
-    A program that moves an arm can be any code, which cannot be linearised. The phrase is empty
-    if there is no such program.
+    A program that moves an arm can run arbitrary code, which cannot be linearised. The phrase
+    is empty if there is no such program.
 
     Args:
         roots: The roots of the loop.

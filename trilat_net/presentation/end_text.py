@@ -1,11 +1,11 @@
-"""Writes the sentences for users on the motion at the end of a run.
+"""Describes the motion at the end of a run in sentences for users.
 
-`analysis.run_end` judges the motion and returns names and numbers. This module writes them as
+`analysis.run_end` judges the motion and returns names and numbers. This module turns them into
 sentences, for example "converged: largest |e| 0.001 rad and |qd| 0.0002 rad/s in the last
 second".
 
 Invariant:
-    - Each name of a doubt has exactly one template in `END_DOUBTS`.
+    - Each kind of doubt has exactly one template in `END_DOUBTS`.
 """
 
 from collections.abc import Callable, Iterable
@@ -60,13 +60,13 @@ def _list_doubts(end: RunEnd) -> list[str]:
 
 
 def name_behaviour(end: RunEnd) -> str:
-    """Returns a phrase for the behaviour at the end, such as "converged" or "growing".
+    """Returns a phrase for the behaviour at the end of a run, such as "converged" or "growing".
 
-    If the arms rest, but with synchronisation errors above the limit of settled sites, the
+    If the arms are at rest but synchronisation errors exceed the limit for settled sites, the
     phrase says that errors remain.
 
     Args:
-        end: How the motion ends.
+        end: The motion at the end of the run.
     """
     has_converged = end.behaviour is EndBehaviour.CONVERGED
     if has_converged and end.end_error_rad > SETTLED_ERROR_RAD:

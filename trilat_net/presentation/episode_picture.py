@@ -1,12 +1,13 @@
-"""Draws the arms at one time of an episode, as an array of pixels for a video.
+"""Draws the arms at one moment of an episode as a pixel array, for use in a video.
 
-An episode is one attempt of a learned program at a task, see `trilat_studies`. A picture has
-one panel per arm. One of the panels also shows the goal of the task.
+An episode is one attempt of a learned program at a task, see `trilat_studies`. The picture has
+one panel per arm, and one of the panels also shows the goal of the task.
 
 Invariant:
-    - A picture depends only on the poses of the arms, the goal of the task and the title.
-    - All pictures of an episode have the same size and the same axis limits, so that only arms
-      and bodies move in the video.
+    - A picture depends only on the poses of the arms and bodies, the goal of the task, and the
+      title.
+    - All pictures of an episode have the same size and axis limits, so that only arms and
+      bodies move in the video.
 """
 
 from collections.abc import Mapping
@@ -45,9 +46,7 @@ _BASE: dict[str, Any] = {
 
 
 class EpisodePicture:
-    """Draws pictures of the arms in a learning episode, one after another, into one figure.
-
-    An episode is one attempt of a learning program at a task.
+    """Draws successive pictures of the arms in a learning episode, reusing one figure.
 
     Args:
         scenario: Scenario of the task, with the arms.
@@ -74,19 +73,17 @@ class EpisodePicture:
         goal_m: Array | None,
         title: str,
     ) -> NDArray[np.uint8]:
-        """Draws the arms, the bodies and the goal of the task at one time of an episode.
-
-        An episode is one attempt at a task. Its pictures can be combined to a video.
+        """Draws the arms, the bodies and the goal of the task at one moment of an episode.
 
         Args:
-            q_rad: Joint angles by site, in rad, shape (n,) each.
-            bodies: Poses of the bodies that the arms can touch, by site and name, shape (7,)
-                each.
-            goal_m: Position that the task requires, in m. `None` if the goal is not a position.
+            q_rad: Joint angles of each site, in rad, shape (n,) each.
+            bodies: For each site, the poses of the bodies that its arm can touch, keyed by body
+                name, shape (7,) each.
+            goal_m: Position required by the task, in m. `None` if the goal is not a position.
             title: Text in the lower left corner of the first panel.
 
         Returns:
-            Colours of the pixels (red, green, blue), shape (height, width, 3).
+            RGB pixels, shape (height, width, 3).
         """
         for number, (site, axes) in enumerate(self._panels.items()):
             arm = self._arms[site]

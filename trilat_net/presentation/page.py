@@ -72,7 +72,7 @@ def write_report(
     Args:
         log: Log of the run.
         folder: Folder of both files. It is created if it does not exist.
-        certificate: Judgement whether the run was stable, with its reasons.
+        certificate: Stability certificate of the run.
         twin: Log of the same run, simulated without the people or programs that move the arms.
             The page shows the difference, which is the motion due to these operators. If
             `None`, this section is left out.

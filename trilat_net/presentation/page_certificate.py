@@ -73,7 +73,7 @@ def render_certificate(log: Log, certificate: Certificate) -> Markup:
 
     Args:
         log: Log of the run.
-        certificate: Judgement whether the run was stable, with its reasons.
+        certificate: Stability certificate of the run.
     """
     _, *grounds = describe_certificate(certificate)
     lines = [

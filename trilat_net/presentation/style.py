@@ -434,7 +434,7 @@ def empty_figure(text: str, form: FigureSize = REPORT_SIZE) -> Figure:
 
     Args:
         text: The reason.
-        form: Width, type sizes and resolution of the figure.
+        form: Width, font sizes and resolution of the figure.
     """
     characters = round(_EMPTY_FIGURE_CHARACTERS_PER_IN * form.width_in)
     lines = textwrap.wrap(text, characters)

@@ -1,9 +1,9 @@
-"""Exports a log as a folder of CSV files, with one file per table.
+"""Exports a log as a folder of CSV files, one file per table.
 
-A table contains, for instance, the records of one arm, with a row per period of its control
-loop. A file has a line of column names and then a line per row. Numbers are written with as
-many digits as Python needs to read them back unchanged. A missing value is an empty field. Two
-more files describe the columns and contain the scenario.
+A table contains, for instance, the records of one arm, with one row per tick. Each file starts
+with a line of column names. Numbers are written with as many digits as Python needs to read
+them back unchanged, and a missing value is an empty field. Two more files contain the
+descriptions of the columns and the scenario.
 """
 
 import csv

@@ -1,27 +1,26 @@
-"""Exports logs as a dataset of LeRobot, version 3.0, for learning from demonstrations.
+"""Exports logs as a LeRobot dataset, version 3.0, for learning from demonstrations.
 
-LeRobot trains programs to move robots as people did. A dataset is a sequence of frames at a
-fixed rate, divided into episodes. A frame contains the state of the slave arm, the pose of
-every user's arm, the dominance factors of the users (the weights with which the slave follows
-them), the ages of the samples with which the sites follow each other, and, in a run with a
-program, whether a person intervened instead of the program.
+LeRobot trains programs to control robots by imitating people. A dataset is a sequence of frames
+at a fixed rate, divided into episodes. Each frame contains the state of the slave arm, the pose
+of every user's arm, the dominance factors of the users, the ages of the samples that the sites
+use to follow each other, and, in a run with a program, whether a person intervened.
 
 Invariant:
-    - A frame has the newest record of every site at or before its time. A record is the stored
-      result of one period of the control loop of the arm. Nothing is interpolated.
-    - A frame is left out if such a record is older than the period of the site's control loop
-      and also older than the period of the frames. In that case the episode ends, and the next
-      episode begins after the gap.
-    - Observations and actions are states of a site at the time of the frame, from the site's
-      own records. Link delays therefore affect only the samples of peers. The features `age_s`
-      are the ages of these samples.
-    - Numbers are float32. An orientation consists of six numbers, which never jump (see
+    - A frame contains, for every site, the most recent record at or before the time of the
+      frame. Nothing is interpolated.
+    - A frame is dropped if such a record is older than both the control period of the site and
+      the frame period. In that case the episode ends, and the next one begins after the gap.
+    - Observations and actions are states of a site at the time of the frame, taken from the
+      site's own records. Link delays therefore affect only the samples of peers. The features
+      `age_s` are the ages of these samples.
+    - Numbers are float32. An orientation is stored as six numbers, which never jump (see
       `trilat_net.log.orientations`).
     - With the setting `actions`, actions have the names and units of `action_features` of the
       plugin `lerobot_robot_trilat`, so that a trained program can command the plugin. With
-      `observations=plugin`, the observations also have the names and units of the plugin. A
+      `observations=plugin`, observations also have the names and units used by the plugin. A
       test compares them.
-    - There is a column `intervention` only if a program moves the arm of a user in some log.
+    - The column `intervention` exists only if a program moves the arm of a user in at least one
+      of the logs.
 """
 
 import json

@@ -1,10 +1,9 @@
-"""Exports a log as a MATLAB file (.mat) with a struct per arm and an array per column.
+"""Exports a log as a MATLAB file (.mat) with one struct per arm and one array per column.
 
-For example, `m1.q1_rad` contains the angle of the first joint of the arm m1 in each period of
-its control loop, and `m1.link.age_s_us` is a column of the statistics of its network
-connections. The struct `events` contains the events of the session. The text `about_json`
-describes all columns, and the text `scenario_toml` is the scenario, the description of the
-experiment.
+For example, `m1.q1_rad` contains the angle of the first joint of arm m1 at every tick, and
+`m1.link.age_s_us` is a column of its link statistics. The struct `events` contains the session
+events. The string `about_json` describes all columns, and the string `scenario_toml` is the
+scenario.
 """
 
 from pathlib import Path
@@ -42,12 +41,12 @@ def _write(log: Log, path: Path, written: Written) -> None:
     variables: dict[str, Any] = {}
 
     def store(table: Table, table_name: str) -> None:
-        """Adds a table as a struct to the variables that the MATLAB file will contain.
+        """Adds a table as a struct to the variables of the MATLAB file.
 
         Args:
             table: Table of the log, such as the records of a site.
-            table_name: Name of the table: "m1" for the records of the site m1, and "m1.link"
-                for another table of this site, which becomes a field of its struct.
+            table_name: Name of the table: "m1" for the records of site m1, and "m1.link" for
+                another table of this site, which becomes a field of its struct.
         """
         struct = _build_struct(table)
         site, _, kind = table_name.partition(".")

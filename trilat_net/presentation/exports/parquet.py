@@ -1,8 +1,8 @@
-"""Exports a log as a folder of Parquet files, with one file per table.
+"""Exports a log as a folder of Parquet files, one file per table.
 
-A table contains, for instance, the records of one arm, with a row per period of its control
-loop. Parquet is a compressed column format that pandas, polars and DuckDB read. Two more files
-in the folder describe the columns and contain the scenario.
+A table contains, for instance, the records of one arm, with one row per tick. Parquet is a
+compressed columnar format that pandas, polars and DuckDB can read. Two more files in the folder
+contain the descriptions of the columns and the scenario.
 """
 
 import io

@@ -1,14 +1,14 @@
-"""Draws the poses of the arms at a few times of a run, for a figure and for a page.
+"""Draws the poses of the arms at a few moments of a run, for a figure and for a page.
 
-A planar arm is drawn in its plane. An arm in space, called a chain, is drawn as seen from one
-fixed direction, in parallel projection. Up in the picture is opposite to gravity.
+A planar arm is drawn in its plane. An arm in space, called a chain, is drawn in parallel
+projection from a fixed direction, with gravity pointing down.
 
-The figure "arms" is one of Matplotlib, and `render_arms_svg` returns SVG for the page. Both
-draw the same poses, which `find_pose` computes.
+The figure "arms" is drawn with Matplotlib, and `render_arms_svg` returns SVG for the page. Both
+draw the same poses, which are computed by `find_pose`.
 
 Invariant:
-    - The positions of the joints are those of the simulation kernel's forward kinematics.
-    - The reference pose of each arm, which its control law tries to reach, is drawn with dashed
+    - Joint positions come from the simulation kernel's forward kinematics.
+    - The reference pose that the control law of each arm tries to reach is drawn with dashed
       lines.
 """
 
@@ -87,12 +87,12 @@ class _ArmPose(NamedTuple):
     bodies: Sequence[Array] = ()
 
     def scale(self, factor: float) -> "_ArmPose":
-        """Returns the pose with all points multiplied by a factor, for another unit.
+        """Returns the pose with all points multiplied by a factor.
 
-        This converts a pose in m to the units of a picture.
+        This converts a pose from m to picture units.
 
         Args:
-            factor: The factor.
+            factor: Picture units per m.
         """
         return _ArmPose(
             actual=factor * self.actual,
@@ -103,11 +103,11 @@ class _ArmPose(NamedTuple):
         )
 
     def list_points(self) -> Array:
-        """Returns all points that are drawn for this pose, from which the picture is scaled.
+        """Returns all points drawn for this pose, from which the picture limits are computed.
 
         Returns:
-            The points of the arms, of their paths and of the touched bodies, shape (K, 2), in
-            m.
+            The points of the arms, of their paths and of the touched bodies, in m, shape (K,
+            2).
         """
         parts = [self.actual, self.desired, self.path, self.shadow, *self.bodies]
         return np.concatenate(parts)
@@ -116,18 +116,18 @@ class _ArmPose(NamedTuple):
 def trace_bodies_m(
     upright_axes: Array | None, sizes_m: Iterable[Sequence[float]], poses: Array
 ) -> list[Array]:
-    """Returns the edges of box-shaped bodies as paths in the plane of a picture.
+    """Returns the edges of box-shaped bodies as paths in the picture plane.
 
-    A path visits all edges of a box, so that one line draws the box.
+    A path visits all edges of a box, so that the box can be drawn as a single line.
 
     Args:
         upright_axes: See `project_arm_m`.
         sizes_m: Size of each of the b bodies along its own axes, in m.
         poses: Poses of the bodies in K records, shape (K, 7 b): for each body the position in
-            m, and the unit quaternion of its orientation with w first.
+            m, followed by the orientation as a unit quaternion with w first.
 
     Returns:
-        A path per body, shape (K, 16, 2), in m.
+        One path per body, in m, shape (K, 16, 2).
     """
     paths = []
     body_count = poses.shape[1] // 7
@@ -152,20 +152,20 @@ def trace_bodies_m(
 def project_arm_m(
     upright_axes: Array | None, points: Array, *, onto_floor: bool = False
 ) -> Array:
-    """Projects points of an arm to the plane of a picture, in m.
+    """Projects points of an arm onto the picture plane, in m.
 
-    A planar arm lies in the plane already. An arm in space is seen from one fixed direction,
-    with "up" opposite to gravity.
+    A planar arm already lies in this plane. An arm in space is viewed from a fixed direction,
+    with gravity pointing down.
 
     Args:
-        upright_axes: Axes forward, sideways and up of an upright frame, in the frame of the
-            base, shape (3, 3). `None` for a planar arm.
-        points: Points in the frame of the base, in m, shape (..., 3). Points of a planar arm
-            have the shape (..., 2), and are returned unchanged.
+        upright_axes: Forward, sideways and up axes of an upright frame, expressed in the base
+            frame, shape (3, 3). `None` for a planar arm.
+        points: Points in the base frame, in m, shape (..., 3). Points of a planar arm have
+            shape (..., 2) and are returned unchanged.
         onto_floor: True to return the shadows of the points on a floor at the base.
 
     Returns:
-        Points in the picture, shape (..., 2), in m.
+        Points in the picture, in m, shape (..., 2).
     """
     if upright_axes is None:
         return points
@@ -183,15 +183,15 @@ def project_arm_m(
 def _choose_instants_s(log: Log, count: int = INSTANTS) -> list[float]:
     """Chooses the times at which to draw the arms, including the first and the last time.
 
-    Equal steps of time would mostly show arms at rest. Therefore the times are equally spaced
-    in a measure of progress to which time and motion contribute one half each.
+    Equally spaced times would mostly show arms at rest. The times are instead equally spaced in
+    a measure of progress that gives equal weight to elapsed time and to motion.
 
     Args:
         log: Log of the run.
-        count: Largest number of times. There may be fewer, because the times are rounded.
+        count: Maximum number of times. Fewer are returned if times coincide after rounding.
 
     Returns:
-        The times in increasing order, in s.
+        The times in ascending order, in s.
     """
     end_s = Timeline(log).end_s
     grid_s = np.linspace(0.0, end_s, 1001)
@@ -225,7 +225,7 @@ def _choose_instants_s(log: Log, count: int = INSTANTS) -> list[float]:
 def find_pose(log: Log, site: str, t_s: float) -> _ArmPose | None:
     """Returns the pose of an arm at a given time, with the path of its end effector (tip).
 
-    The pose is that of the newest record at or before the time.
+    The pose is taken from the most recent record at or before that time.
 
     Args:
         log: Log of the run.
@@ -266,11 +266,10 @@ def find_pose(log: Log, site: str, t_s: float) -> _ArmPose | None:
 
 
 def compute_pose_box_m(poses: Sequence[_ArmPose | None]) -> PictureBox:
-    """Returns a box around poses of arms and their base: the limits of the axes of a picture.
+    """Returns a box around arm poses and their base, for use as the axis limits of a picture.
 
-    The box has a margin. Before the margin is added, the box is made at least 70 % as wide as
-    it is high, and at least 70 % as high as it is wide, so that pictures are never narrow
-    strips.
+    Neither side of the box is shorter than 70 % of the other, so pictures are never narrow
+    strips. A margin is added last.
 
     Args:
         poses: The poses. Entries that are `None` are ignored.
@@ -302,7 +301,7 @@ def _draw_arms(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
 
     Args:
         log: Log of the run.
-        form: Width, type sizes and resolution of the figure.
+        form: Width, font sizes and resolution of the figure.
     """
     instants = _NARROW_INSTANTS if form.narrow else INSTANTS
     times_s = _choose_instants_s(log, instants)
@@ -371,14 +370,14 @@ def _draw_pose(axes: Axes, pose: _ArmPose | None, colour: str) -> None:
 
 
 def render_arms_svg(log: Log, bounds_m: PictureBox, factor: float) -> Markup:
-    """Draws the poses of all arms at a few times, as SVG pictures for the report's web page.
+    """Draws the poses of all arms at a few moments as SVG pictures for the report's web page.
 
-    There is a row per arm and a column per time. Arms without records are left out.
+    There is one row per arm and one column per moment. Arms without records are omitted.
 
     Args:
         log: Log of the run.
         bounds_m: Left, right, bottom and top of every picture, in m.
-        factor: Scale of the pictures, in units of the picture per m.
+        factor: Scale of the pictures, in picture units per m.
 
     Returns:
         HTML with the pictures.

@@ -2,16 +2,16 @@
 
 There are two figures:
 
-- `draw_functional` draws V, the energy function with which the stability of the coupled arms is
-  proved, and which must not rise by itself (docs/theory/certificate-energy.md). It also draws
-  the parts of V, the contribution of each arm, the energy that was dissipated, the work that
-  was done on the arms, and the residual: the change of V that dissipation and work do not
-  explain.
-- `draw_observed_energy` is for control laws that prove their passivity by energy accounts: they
-  record how much energy they have received and supplied. The figure draws these energies.
+- `draw_functional` draws V, the energy function used to prove the stability of the coupled
+  arms, which must not rise on its own (docs/theory/certificate-energy.md). It also draws the
+  components of V, the contribution of each arm, the dissipated energy, the work done on the
+  arms, and the residual, which is the change of V not explained by dissipation and work.
+- `draw_observed_energy` is for control laws that prove their passivity through energy
+  accounting, by recording how much energy they have received and supplied. The figure draws
+  these energies.
 
 Invariant:
-    - Times for which V is unknown, because records are missing, are shaded.
+    - Times at which V is unknown because of missing records are shaded.
     - The largest rise of V is marked, because V must not rise in a stable run.
 """
 
@@ -74,15 +74,15 @@ def draw_functional(
 ) -> Figure:
     """Draws the energy function V of the stability proof and its balance, in J over time.
 
-    V decreases if the controllers dissipate more energy than the operators supply. The panels
-    are, from the top: V and the contribution of each site; the parts of V; dissipation and
-    work; and the residual of the balance, the part of V that these energies do not explain.
-    Without a balance the figure shows the reason.
+    V decreases if the controllers dissipate more energy than the operators supply. From top to
+    bottom, the panels show V and the contribution of each site; the components of V;
+    dissipation and work; and the residual of the balance, which these energies do not explain.
+    If there is no balance, the figure shows the reason.
 
     Args:
         log: Log of the run.
-        certificate: Judgement whether the run was stable, which contains the balance.
-        form: Width, type sizes and resolution of the figure.
+        certificate: Stability certificate of the run, which contains the balance.
+        form: Width, font sizes and resolution of the figure.
     """
     balance = certificate.balance
     if balance is None:
@@ -133,17 +133,17 @@ def _draw_certificate(log: Log, form: FigureSize) -> Figure:
 def draw_observed_energy(
     log: Log, observed: ObservedEnergy, form: FigureSize = REPORT_SIZE
 ) -> Figure:
-    """Draws the energies for which the control laws keep accounts, in J over time.
+    """Draws the energies that the control laws account for, in J over time.
 
     Some control laws ensure stability by never returning more energy than they received, and
-    record this account. The figure has a panel for each kind of energy: in transit between
-    sites, known to the receivers, stored, and exchanged with the arms. A curve of energy in
-    transit has the colour of the receiving site.
+    record this account. There is one panel per kind of energy: in transit between sites, known
+    to the receivers, stored, and exchanged with the arms. Curves of energy in transit use the
+    colour of the receiving site.
 
     Args:
         log: Log of the run.
         observed: The declared energies, at least one.
-        form: Width, type sizes and resolution of the figure.
+        form: Width, font sizes and resolution of the figure.
     """
     kinds = {curve.kind for curve in observed.curves}
     panel_kinds = [kind for kind in _OBSERVED_PANELS if kind in kinds]
@@ -291,7 +291,7 @@ def _draw_residual(axes: Axes, balance: EnergyBalance, form: FigureSize) -> None
     Args:
         axes: Panel of the figure, as Matplotlib axes.
         balance: V and all energies that change it, in J over time.
-        form: Width, type sizes and resolution of the figure.
+        form: Width, font sizes and resolution of the figure.
     """
     largest_energy = balance.scale or 1.0
     floor = 1e-9 * largest_energy  # smaller magnitudes are drawn at this height

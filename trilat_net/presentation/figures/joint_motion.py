@@ -1,17 +1,16 @@
 """Draws the signals of the arms, such as torques, angles, errors and contact forces.
 
-Each function with the decorator `draws` is one figure. Most signals are read from the log of
-the run. Some are computed:
+Each function decorated with `draws` is one figure. Most signals are read from the log of the
+run. Some are computed:
 
-- Weights with which an arm follows the other arms (dominance factors) are computed from the
-  scenario, the description of the experiment, and its recorded changes.
+- Dominance factors are computed from the scenario and its recorded changes.
 - Contact forces are computed from the walls of the scenario and the recorded motion, by
   `analysis.torque_sources`.
 - The settling time, after which an error stays small, is computed by `analysis.site_signals`.
 
 Invariant:
-    - Torques of operators (the people or programs that move arms) are drawn as they act on the
-      arm. The log contains the opposite sign, the torque that the arm exerts on the operator.
+    - Operator torques are drawn as they act on the arm. The log contains the opposite sign, the
+      torque exerted by the arm on the operator.
 """
 
 import textwrap
@@ -71,7 +70,7 @@ def _draw_operator_torques(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
 
     Args:
         log: Log of the run.
-        form: Width, type sizes and resolution of the figure.
+        form: Width, font sizes and resolution of the figure.
     """
     return _draw_joints(
         log=log,
@@ -109,14 +108,14 @@ def _explain_absent_displacement(log: Log) -> str:
 def draw_operator_displacement(
     log: Log, form: FigureSize = REPORT_SIZE, *, twin: Log | None = None
 ) -> Figure:
-    """Draws how far the operators, people or programs that move the arms, displaced every arm.
+    """Draws how far the operators displaced every arm, in rad over time.
 
-    The displacement, in rad, is the difference between the recorded run and a simulation of the
-    same run without operators.
+    The displacement is the difference between the recorded run and a simulation of the same run
+    without operators.
 
     Args:
         log: Log of the run.
-        form: Width, type sizes and resolution of the figure.
+        form: Width, font sizes and resolution of the figure.
         twin: The run without operators. `None` to simulate it.
     """
     run_without_operators = SimulatedLog.without_operators(log) if twin is None else twin
@@ -138,7 +137,7 @@ def _draw_control_torques(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
 
     Args:
         log: Log of the run.
-        form: Width, type sizes and resolution of the figure.
+        form: Width, font sizes and resolution of the figure.
     """
     reached_limits = list[Array]()
     for site in log.sites:
@@ -172,7 +171,7 @@ def _draw_joints(
 
     Args:
         log: Log of the run.
-        form: Width, type sizes and resolution of the figure.
+        form: Width, font sizes and resolution of the figure.
         sites: Names of the sites that have the signal.
         signal: Function that returns the signal of a site.
         label: Label of the value axis.
@@ -213,22 +212,23 @@ def add_joint_rows(
     sharey: str,
     titles: Sequence[str] = (),
 ) -> tuple[list[list[Axes]], list[Axes]]:
-    """Adds a grid of panels to a figure: one panel per quantity and joint.
+    """Adds a grid of panels to a figure, with one panel per quantity and joint.
 
-    Arms with two joints have a column per joint and a row per quantity. Arms with more joints
-    have a row per joint and a column per quantity, because a row of many joints would not fit.
+    Arms with two joints have one column per joint and one row per quantity. Arms with more
+    joints have one row per joint and one column per quantity, because a row with many joints
+    would not fit.
 
     Args:
         figure: The figure.
         log: Log with the joints.
-        form: Width, type sizes and resolution of the figure.
-        heads: Title of each quantity, used above a column.
-        labels: Label of each quantity, used beside a row.
+        form: Width, font sizes and resolution of the figure.
+        heads: Titles of the quantities, used above columns.
+        labels: Labels of the quantities, used beside rows.
         sharey: "col" if the quantities of a joint share their value axis, otherwise "none".
-        titles: Titles of the joints. Empty for their names.
+        titles: Titles of the joints. Empty to use the joint names.
 
     Returns:
-        The panels, by quantity and then by joint, and the lowest panel of each column.
+        The panels, indexed by quantity and then by joint, and the bottom panel of each column.
     """
     titles = titles or style.name_joints(log)
     if len(titles) == 2:
@@ -258,7 +258,7 @@ def _draw_operation(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
 
     Args:
         log: Log of the run.
-        form: Width, type sizes and resolution of the figure.
+        form: Width, font sizes and resolution of the figure.
     """
     heads = ("torque on the arm (N m)", "joint angle (rad)")
     if form.narrow:
@@ -284,11 +284,11 @@ def _draw_operation(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
 def choose_height_in(log: Log, two_joints_in: float) -> float:
     """Returns the height of a figure with panels per joint, in inches.
 
-    If arms have more than two joints, each joint has a row of panels, see `add_joint_rows`.
+    Arms with more than two joints have one row of panels per joint, see `add_joint_rows`.
 
     Args:
         log: Log of the run.
-        two_joints_in: Height of the figure of arms with two joints, in inches.
+        two_joints_in: Height of the figure for arms with two joints, in inches.
     """
     joint_count = len(style.name_joints(log))
     if joint_count == 2:
@@ -307,7 +307,7 @@ def _draw_positions(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
 
     Args:
         log: Log of the run.
-        form: Width, type sizes and resolution of the figure.
+        form: Width, font sizes and resolution of the figure.
     """
     heads = [f"{site}: q (rad)" for site in log.sites]
     labels = heads if form.narrow else [f"angle of {site} (rad)" for site in log.sites]
@@ -352,7 +352,7 @@ def _draw_tracking_errors(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
 
     Args:
         log: Log of the run.
-        form: Width, type sizes and resolution of the figure.
+        form: Width, font sizes and resolution of the figure.
     """
     titles = style.name_shared(log)
     unit = plot_signals.shared_unit(log)
@@ -397,7 +397,7 @@ def _draw_settling(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
 
     Args:
         log: Log of the run.
-        form: Width, type sizes and resolution of the figure.
+        form: Width, font sizes and resolution of the figure.
     """
     unit = plot_signals.shared_unit(log)
     entries = []
@@ -469,7 +469,7 @@ def _draw_parameter_estimates(log: Log, form: FigureSize = REPORT_SIZE) -> Figur
 
     Args:
         log: Log of the run.
-        form: Width, type sizes and resolution of the figure.
+        form: Width, font sizes and resolution of the figure.
     """
     arm = log.scenario.arms[log.sites[0]]
     if arm.chain is not None:
@@ -498,7 +498,7 @@ def _draw_link_estimates(log: Log, form: FigureSize) -> Figure:
 
     Args:
         log: Log of the run.
-        form: Width, type sizes and resolution of the figure.
+        form: Width, font sizes and resolution of the figure.
     """
     arms = log.scenario.arms
     longest_arm = max((arms[site] for site in log.sites), key=lambda arm: arm.counts.joints)
@@ -586,7 +586,7 @@ def _draw_phase_portrait(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
 
     Args:
         log: Log of the run.
-        form: Width, type sizes and resolution of the figure.
+        form: Width, font sizes and resolution of the figure.
     """
     titles = style.name_shared(log)
     unit = plot_signals.shared_unit(log)
@@ -643,7 +643,7 @@ def _draw_end_effector_paths(log: Log, form: FigureSize = REPORT_SIZE) -> Figure
 
     Args:
         log: Log of the run.
-        form: Width, type sizes and resolution of the figure.
+        form: Width, font sizes and resolution of the figure.
     """
     mosaic = style.arrange_joints(len(_PLANES), form.narrow)
     row_in = 0.9 * form.width_in / len(mosaic[0])
@@ -688,16 +688,16 @@ def _draw_path(axes: Axes, path: Array, line: dict[str, Any]) -> None:
 
 
 def thin_path(path: Array) -> Array:
-    """Returns points of a path at about equal distances along it, including both ends.
+    """Returns points at approximately equal distances along a path, including both ends.
 
-    Figures need far fewer points than a log has records. The path is thinned by its length and
-    not by time, so that its fast parts keep as many points as its slow ones.
+    Figures need far fewer points than a log has records. Thinning by path length rather than by
+    time keeps as many points in the fast parts of the path as in the slow ones.
 
     Args:
         path: Points of the path, shape (K, 2), K > 0. Each axis is scaled to its own extent.
 
     Returns:
-        Some of the points, shape (P, 2).
+        A subset of the points, shape (P, 2).
     """
     extent = np.ptp(path, axis=0)
     scaled_path = path / np.where(extent > 0.0, extent, 1.0)
@@ -713,9 +713,7 @@ def thin_path(path: Array) -> Array:
 
 
 def _list_sites_with_changing_dominance(log: Log) -> list[str]:
-    """Lists the arms whose dominance factors change during the run, in scenario order.
-
-    A dominance factor is the weight with which an arm follows another arm.
+    """Lists the sites whose dominance factors change during the run, in scenario order.
 
     Args:
         log: Log of the run.
@@ -739,7 +737,7 @@ def _draw_authority(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
 
     Args:
         log: Log of the run.
-        form: Width, type sizes and resolution of the figure.
+        form: Width, font sizes and resolution of the figure.
     """
     changing_sites = _list_sites_with_changing_dominance(log)
     titles = style.name_joints(log)
@@ -795,7 +793,7 @@ def _draw_contact(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
 
     Args:
         log: Log of the run.
-        form: Width, type sizes and resolution of the figure.
+        form: Width, font sizes and resolution of the figure.
     """
     sites = _list_sites_with_walls(log)
     with style.time_figure(log, form, 2.9) as plot:

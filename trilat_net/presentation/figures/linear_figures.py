@@ -1,19 +1,18 @@
-"""Draws the results of linear analyses and of network measurements, which need no recorded run.
+"""Draws the results of linear analyses and network measurements, which need no recorded run.
 
-A linear model describes small motions of the coupled arms around a pose of rest.
+A linear model describes small motions of the coupled arms around a rest pose.
 
-- `draw_port_impedance` draws the impedance that operators feel at the joints that they move,
-  and `draw_port_passivity` shows whether the arms could supply energy to operators.
-- `draw_root_map` draws the characteristic roots of the linear model, in continuous time and as
-  executed in ticks (periods of the control loop). A root with a positive real part means that
-  the arms are unstable.
+- `draw_port_impedance` draws the impedance that operators feel at the joints they move, and
+  `draw_port_passivity` shows whether the arms could supply energy to the operators.
+- `draw_root_map` draws the characteristic roots of the linear model, both in continuous time
+  and as executed in ticks. A root with a positive real part means that the arms are unstable.
 - `draw_network_delays` draws the measured one-way delays of a network.
-- `draw_arm_gains` draws the largest stable stiffness of an arm for different delays.
+- `draw_arm_gains` draws the largest stable stiffness of an arm as a function of the delay.
 
 Invariant:
-    - Each line of an impedance has the colour of the arm that the operator holds. It is solid
-      if the other arm can move freely, and dashed if the other arm is clamped.
-    - Frequencies at which a criterion of passivity or stability fails are shaded.
+    - Each impedance curve has the colour of the arm held by the operator. It is solid if the
+      other arm can move freely, and dashed if the other arm is clamped.
+    - Frequencies at which a passivity or stability criterion fails are shaded.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
@@ -48,14 +47,14 @@ _CROWDED_TICKS_HZ = (0.1, 1.0, 10.0)
 
 
 def draw_port_impedance(ports: PortAnalysis, size: FigureSize = REPORT_SIZE) -> Figure:
-    """Draws the impedance that operators feel along every joint over frequency.
+    """Draws the impedance that operators feel at every joint, over frequency.
 
-    The impedance is the ratio of force to velocity. For each joint, a panel of the magnitude is
-    above a panel of the phase. The panels of many joints are arranged in several rows.
+    The impedance is the ratio of force to velocity. Each joint has a magnitude panel above a
+    phase panel. If there are many joints, the panels wrap into several rows.
 
     Args:
-        ports: Analysis of the ports, the places at which operators hold the arms.
-        size: Width, type sizes and resolution of the figure.
+        ports: Analysis of the ports at which operators hold the arms.
+        size: Width, font sizes and resolution of the figure.
     """
     if "unstable" in (ports.verdict, ports.clamped_verdict):
         return style.empty_figure("The loop is unstable: it has no impedance.", size)
@@ -171,20 +170,20 @@ def _convert_to_hz(w_rad_s: Array) -> Array:
 
 
 def draw_port_passivity(ports: PortAnalysis, size: FigureSize = REPORT_SIZE) -> Figure:
-    """Draws over frequency whether the loop is passive, and stable with any passive operators.
+    """Draws whether the loop is passive, and stable with any passive operators, over frequency.
 
-    The upper panel shows the smallest eigenvalue of Y + Y^H, divided by its bound 2 norm(Y),
-    where Y is the admittance matrix of the ports: velocities over forces. A negative value
-    means that the loop can generate energy. With the value -1 it returns all energy that an
-    operator supplies.
+    The upper panel shows the smallest eigenvalue of Y + Y^H divided by its bound 2 norm(Y),
+    where Y is the admittance matrix of the ports (velocity per force). A negative value means
+    that the loop can generate energy. At -1, it returns all the energy that an operator
+    supplies.
 
-    The lower panel shows the criterion for stability with any passive operators: for two sites
-    Llewellyn's parameter of each joint, which must be at least 1; for more sites the margin
-    under the best weights, which must be positive.
+    The lower panel shows the criterion for stability with any passive operators. For two sites,
+    this is Llewellyn's parameter of each joint, which must be at least 1. For more sites, it is
+    the margin under the best weights, which must be positive.
 
     Args:
-        ports: Analysis of the ports, the places at which operators hold the arms.
-        size: Width, type sizes and resolution of the figure.
+        ports: Analysis of the ports at which operators hold the arms.
+        size: Width, font sizes and resolution of the figure.
     """
     if ports.verdict == "unstable":
         return style.empty_figure(
@@ -285,9 +284,9 @@ _UNSTABLE: Any = {"color": "#cc3311", "alpha": 0.08, "linewidth": 0.0, "zorder":
 def draw_root_map(analysis: LinearAnalysis) -> Figure:
     """Draws the characteristic roots of the linearised control loop in the complex plane.
 
-    A root with a positive real part belongs to a motion that grows: the loop is unstable. This
-    half of the plane is shaded. The roots of the loop in continuous time and of the loop as it
-    is executed in ticks (control periods) have different marks.
+    A root with a positive real part belongs to a growing motion, which means that the loop is
+    unstable. This half of the plane is shaded. Different markers distinguish the roots of the
+    loop in continuous time from those of the loop as executed in ticks.
 
     Args:
         analysis: The linear analysis.
@@ -367,11 +366,11 @@ _TRANSPORT_STEP = 0.22
 
 
 def draw_network_delays(facts: Mapping[str, Any]) -> Figure:
-    """Draws the measured one-way delays of messages in a network, in ms, for several loads.
+    """Draws the measured one-way delays of a network, in ms, for several loads and transports.
 
-    A load (case) is a size of messages in bytes, and a number of messages per second. The load
-    that the benchmarked experiment needs is shaded. Transports are the protocols that were
-    measured.
+    A load (case) is a message size in bytes and a number of messages per second. The load
+    required by the benchmarked experiment is shaded. Transports are the network protocols that
+    were measured.
 
     Args:
         facts: Results of the network benchmark, from `NetworkBenchmark.to_dict`.
@@ -512,8 +511,8 @@ def draw_arm_gains(facts: Mapping[str, Any]) -> Figure:
     """Draws the largest stable stiffness of an arm that follows another arm over a delay.
 
     The horizontal axis is the delay. The vertical axis is the stiffness K of a joint divided by
-    its inertia, in 1/s^2. Marks show the gains that were chosen, and the simulated runs that
-    checked the largest stable stiffness.
+    its inertia, in 1/s^2. Markers show the chosen gains, and the simulated runs that verified
+    the largest stable stiffness.
 
     Args:
         facts: Results of the search for gains, from `ArmGains.to_dict`.

@@ -105,7 +105,7 @@ def draw_overview(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
 
     Args:
         log: Log of the run.
-        form: Width, type sizes and resolution of the figure.
+        form: Width, font sizes and resolution of the figure.
     """
     height_in = _NARROW_HEIGHT_IN if form.narrow else _HEIGHT_IN
     with style.time_figure(log, form, height_in) as plot:
@@ -145,7 +145,7 @@ def draw_overlay(logs: Mapping[str, Log], form: FigureSize = REPORT_SIZE) -> Fig
 
     Args:
         logs: Logs of the runs, by their names in the legend.
-        form: Width, type sizes and resolution of the figure.
+        form: Width, font sizes and resolution of the figure.
 
     Raises:
         UsageError: There is no log, or the errors of the runs have different units.

@@ -94,7 +94,7 @@ def draw_twins(pushed: PushedTwins, form: FigureSize = REPORT_SIZE) -> Figure:
 
     Args:
         pushed: The run and its twins.
-        form: Width, type sizes and resolution of the figure.
+        form: Width, font sizes and resolution of the figure.
     """
     growth = pushed.growth
     if growth.twins is None or growth.worst is None:
@@ -326,7 +326,7 @@ def _limit_differences(axes: Axes, form: FigureSize) -> None:
 
     Args:
         axes: Panel of the figure, as Matplotlib axes, in which the lines are already drawn.
-        form: Width, type sizes and resolution of the figure.
+        form: Width, font sizes and resolution of the figure.
     """
     axes.set_ylabel("difference of velocities (rad/s)")
     low, high = axes.get_ylim()
