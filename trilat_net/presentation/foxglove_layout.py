@@ -1,25 +1,24 @@
-"""Writes the layout in which Foxglove and Lichtblick, viewers for robot data, show a log.
+"""Writes the layout in which Foxglove and Lichtblick, two viewers for robot data, show a log.
 
-A layout is a JSON file next to the log, which a user imports into the viewer. It also serves a
-bag, a file of standard messages of ROS 2, into which a log can be exported. The file states
-which panels are shown, and which values of which topics they draw. The layout contains the
-plots of the layout for Rerun (`rerun_viewer.PlotLayout`), the modes of the arms' controllers,
-the events, and the arms in space.
+The layout is a JSON file next to the log, which the user imports into the viewer. It also works
+for a ROS 2 bag exported from the log. It defines which panels are shown, and which fields of
+which topics they plot: the plots of the Rerun layout (`rerun_viewer.PlotLayout`), the modes of
+the arms' controllers, the events, and the arms in space.
 
-The topics of the live bridge to ROS 2 and of exported bags differ from those of logs. The
-layout of a log therefore has two tabs: one for the log itself, and one for a running session of
-the same scenario, which reaches the viewer over ROS 2.
+The live ROS 2 bridge and exported bags use different topics than logs do. The layout of a log
+therefore has two tabs: one for the log itself, and one for a running session of the same
+scenario, which the viewer accesses over ROS 2.
 
 Invariant:
-    - Each message path of the layout refers to a value that exists in the file or in the topics
+    - Each message path in the layout refers to a field that exists in the file or in the topics
       of the live bridge.
-    - Panels without data take no space.
-    - Equal channels give layouts with equal bytes.
+    - Panels without data take up no space.
+    - Equal channels produce byte-identical layouts.
     - An existing file is replaced only with `force`.
 
-The format is that of files which the viewers export: `configById` contains the settings of each
-panel by its identifier, and `layout` is a binary tree of identifiers. Viewers ignore settings
-that they do not know.
+The file has the format that the viewers themselves export: `configById` maps panel identifiers
+to settings, and `layout` is a binary tree of identifiers. Viewers ignore settings that they do
+not know.
 """
 
 import json
@@ -63,7 +62,7 @@ Tree = str | JsonObject
 def write_foxglove_layout(log: Path, *, force: bool = False) -> Path:
     """Writes the layout of a log or a bag for the viewers Foxglove and Lichtblick.
 
-    With the layout, the viewer shows plots of all sites without manual arrangement.
+    With this layout, the viewer shows plots of all sites without any manual arrangement.
 
     Args:
         log: File of the log or bag.
@@ -73,7 +72,7 @@ def write_foxglove_layout(log: Path, *, force: bool = False) -> Path:
         The path of the layout, which is next to the log.
 
     Raises:
-        UsageError: The file contains no channels for viewers, or the layout exists.
+        UsageError: The file contains no channels for viewers, or the layout already exists.
         LogError: The log cannot be read.
     """
     path = log.with_suffix(_LAYOUT_SUFFIX)
@@ -133,7 +132,7 @@ class _Panels:
         self.settings: dict[str, JsonObject] = {}
 
     def add(self, kind: str, settings: JsonObject, title: str = "") -> str:
-        """Adds a panel, such as a plot, to the layout of the viewer Foxglove.
+        """Adds a panel, such as a plot, to the Foxglove layout.
 
         Args:
             kind: Type of the panel, such as "Plot".
@@ -149,10 +148,10 @@ class _Panels:
         return identifier
 
     def add_tabs(self, trees: Mapping[str, Tree]) -> str:
-        """Adds a panel with tabs to the layout, each of which contains other panels.
+        """Adds a panel with tabs, each of which contains other panels, to the layout.
 
         Args:
-            trees: Contents of each tab, by its title.
+            trees: Mapping from the title of each tab to its contents.
 
         Returns:
             The identifier of the panel.

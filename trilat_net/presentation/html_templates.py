@@ -1,13 +1,13 @@
 """Renders web pages from the Jinja templates in the folder `templates`.
 
 `report.html` is the page that reports a run. The other templates contain macros, each for a
-piece of HTML, such as a table. A module `page_...` computes the values of its section of the
-report, and the templates contain all of the HTML.
+piece of HTML such as a table. The `page_...` modules compute the values for their sections of
+the report; all HTML is in the templates.
 
 Invariant:
-    - Templates escape every value that is a plain string. Only values of the class `Markup` are
-      inserted as HTML. These are the results of other templates, and files of this package.
-    - If a template refers to a value that is not passed to it, an error is raised.
+    - Templates escape every plain string. Only `Markup` values, which are the results of other
+      templates or files of this package, are inserted as HTML.
+    - Referring to a value that was not passed to the template raises an error.
     - This module imports Jinja, and is itself imported only when HTML is rendered.
 """
 
@@ -26,19 +26,19 @@ _CODE = re.compile(r"`([^`]+)`")
 
 
 def render_template(name: str, /, **values: Any) -> Markup:
-    """Renders a whole Jinja template, such as the web page of a report.
+    """Renders a complete Jinja template, such as the web page of a report.
 
-    Values that are plain strings are escaped, so that they cannot insert HTML.
+    Plain strings are escaped, so that they cannot inject HTML.
 
     Args:
         name: File name of the template.
-        **values: Values that the template names.
+        **values: Values of the template's variables.
     """
     return Markup(_make_environment().get_template(name).render(values))
 
 
 def render_macro(template: str, macro: str, /, **values: Any) -> Markup:
-    """Renders a macro of a Jinja template, a part with parameters such as a table.
+    """Renders a single macro of a Jinja template, for example a table.
 
     Args:
         template: File name of the template.

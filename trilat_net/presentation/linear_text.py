@@ -1,13 +1,13 @@
-"""Composes the text that `trilat linear` prints: whether small motions of coupled arms decay.
+"""Composes the output of `trilat linear`: whether small motions of the coupled arms decay.
 
-The text contains the pose of rest at which the arms are linearised, the delays, a table of the
+The text contains the rest pose at which the arms are linearised, the delays, a table of the
 rightmost characteristic roots, the verdict, the largest stable delay, what operators feel, and
-the values of settings, such as gains, at which stability changes.
+the values at which settings such as gains change the stability.
 
 Invariant:
     - Every number has its unit.
-    - Roots that are zero by the structure of the system, whatever its parameters are, are
-      counted and not listed, because they say nothing about stability.
+    - Roots that are structurally zero, whatever the parameters, are counted but not listed,
+      because they are irrelevant to stability.
 """
 
 import math
@@ -29,12 +29,12 @@ def compose_linear(analysis: LinearAnalysis) -> Iterator[Block]:
     """Yields the text that says whether small motions of the coupled arms decay.
 
     The arms, their controllers and the network delays form a loop, which the analysis has
-    linearised at a pose of rest (equilibrium). The text contains, in order, the equilibrium,
-    the delays, the characteristic roots, the verdict about stability, the delay margin, notes,
-    what operators feel at the arms, and scans of settings.
+    linearised at a rest pose (equilibrium). The text contains, in order, the equilibrium, the
+    delays, the characteristic roots, the stability verdict, the delay margin, notes, what
+    operators feel at the arms, and scans of settings.
 
     Args:
-        analysis: The analysis.
+        analysis: The linear analysis.
     """
     yield from _describe_equilibrium(analysis)
     yield from _describe_effective_delays(analysis)
@@ -184,13 +184,13 @@ def _tabulate_roots(analysis: LinearAnalysis) -> TextTable:
 
 
 def describe_moving_states(states: Sequence[str]) -> str:
-    """Returns the states of a loop that move together, grouped by site.
+    """Returns a phrase with the states of a loop that move together, grouped by state.
 
-    Sites with the same state share a phrase: "q2 of m1, m2, s" stands for the second joint
+    Sites that share a state are listed together: "q2 of m1, m2, s" stands for the second joint
     angle of three sites.
 
     Args:
-        states: Names of the states, each after the name of its site, such as "m1.q2".
+        states: Names of the states, each prefixed with the name of its site, such as "m1.q2".
     """
     sites: dict[str, list[str]] = {}
     for state in states:
@@ -274,17 +274,17 @@ WEIGHTS_ALIKE = 1e-9
 
 
 def describe_ports(ports: PortAnalysis) -> list[str]:
-    """Returns lines for the user about what operators feel and whether arms stay stable.
+    """Returns lines that tell the user what operators feel and whether the arms stay stable.
 
-    The lines are about three properties:
+    The lines cover three properties:
 
     - passivity: the arms never supply energy to the operators,
     - absolute stability: the arms are stable with any passive operators,
     - transparency: the impedance that an operator feels while another arm is free or clamped.
 
-    If the arms are unstable without operators, the other properties are not defined and the
-    lines end there. If they are unstable while one of them is clamped, the lines about
-    transparency are left out.
+    If the arms are unstable even without operators, the other properties are undefined and the
+    text ends there. If they are unstable while one of them is clamped, the lines about
+    transparency are omitted.
 
     Args:
         ports: Results for the joints at which the operators act.

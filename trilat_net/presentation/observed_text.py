@@ -1,4 +1,4 @@
-"""Writes the sentences for users on the energies that control laws declare.
+"""Describes the energies declared by control laws in sentences for users.
 
 `analysis.certificate.observed_energy` compares these energies with the records, and returns
 names and numbers.

@@ -1,15 +1,15 @@
-"""Composes the text of `trilat log info`, which describes the contents of log files.
+"""Composes the output of `trilat log info`, which describes the contents of log files.
 
 The text has these parts:
 
-- The session, its arms, and the network connections between them, if trilat-net wrote the log.
-- The channels, which are the series of messages in the files.
+- The session, its arms and its links, if trilat-net wrote the log.
+- The channels (series of messages) in the files.
 - The number of messages, as counted by the process that wrote the log.
-- A line for each file.
+- One line per file.
 
 Invariant:
-    - Texts from a file are passed through `sanitize`, or are cells of a table, which
-      `result_text` sanitizes. A file therefore cannot control the terminal.
+    - Strings from a file are passed through `sanitize`, or are table cells, which `result_text`
+      sanitizes. A file therefore cannot control the terminal.
 """
 
 import re
@@ -35,7 +35,7 @@ def compose_overview(overview: FileOverview) -> Iterator[Block]:
     """Yields the text that describes the contents of log files.
 
     The text contains the session, the tables, the number of messages, the origin and the files.
-    If the files are not a log of trilat-net, only the channels and the files are described.
+    If trilat-net did not write the files, only the channels and the files are described.
 
     Args:
         overview: Contents of the files.

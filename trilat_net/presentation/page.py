@@ -1,22 +1,23 @@
-"""Writes the report of a recorded run: a web page, and a file with the key numbers of the run.
+"""Writes the report of a recorded run: a web page, and a file with the key figures of the run.
 
-`write_report` computes the key numbers of the run from its log, draws the figures that explain
+`write_report` computes the key figures of the run from its log, draws the figures that explain
 whether the run was stable, and writes two files:
 
 - `report.html`, a page for readers. `render_report` fills the template `templates/report.html`.
-  The sections about links and sites are composed in this module, the other ones in the modules
-  `page_...`. Interactive charts are drawn in the browser by scripts, from data that
-  `charts.ChartBuilder` computes.
+  The sections about links and sites are composed in this module, the others in the `page_...`
+  modules. Scripts draw interactive charts in the browser from data computed by
+  `charts.ChartBuilder`.
 - `summary.json`, the same numbers for programs.
 
 Invariant:
     - The page is a single file that contains its images, styles and scripts. It loads nothing
-      from a network, and can therefore be sent by mail and read offline.
-    - Every text that comes from a scenario or from a log is escaped by the template in which it
-      stands. Such a text therefore cannot add HTML to the page.
-    - The page has the same colours and type as the live page, because both read `theme.css`.
-    - Empty tables are left out.
-    - In a section about links or sites, a sentence with the main results comes first, and each
+      from the network, so it can be sent by mail and read offline.
+    - Every string that comes from a scenario or a log is escaped by the template that inserts
+      it, and therefore cannot add HTML to the page.
+    - The page has the same colours and typefaces as the live page, because both use
+      `theme.css`.
+    - Empty tables are omitted.
+    - Sections about links or sites start with a sentence that gives the main results, and each
       table has a legend.
 """
 
@@ -64,20 +65,20 @@ def write_report(
     twin: Log | None = None,
     verdicts: Iterable[Finding] = (),
 ) -> list[Path]:
-    """Writes the report of a run, report.html and summary.json, into a folder.
+    """Writes the report of a run, report.html and summary.json, to a folder.
 
-    The page shows the results of a run to readers, and the JSON file contains the same numbers
-    for programs.
+    The page presents the results to readers; the JSON file contains the same numbers for
+    programs.
 
     Args:
         log: Log of the run.
-        folder: Folder of both files. It is created if it does not exist.
+        folder: Folder for both files. Created if it does not exist.
         certificate: Stability certificate of the run.
-        twin: Log of the same run, simulated without the people or programs that move the arms.
-            The page shows the difference, which is the motion due to these operators. If
-            `None`, this section is left out.
-        verdicts: Results of the checks of the log. They are read only after the figures of the
-            certificate are drawn, because another process may still check the log until then.
+        twin: Log of the same run, simulated without operators. The page shows the difference,
+            which is the motion caused by the operators. If `None`, this section is omitted.
+        verdicts: Results of the log checks. They are read only after the figures of the
+            certificate are drawn, because another process may still be checking the log until
+            then.
 
     Returns:
         The paths of the page and of the summary.
@@ -114,19 +115,18 @@ def render_report(
     verdict: Markup = Markup(),  # noqa: B008
     reasons: Markup = Markup(),  # noqa: B008
 ) -> Markup:
-    """Composes the web page (HTML) that reports a run: judgement, charts and tables.
+    """Composes the web page (HTML) that reports a run: verdict, charts and tables.
 
     Args:
         log: Log of the run.
         twin: Log of the same run without operators, or `None`, see `write_report`.
-        verdicts: Results of the checks of the log.
-        facts: Key numbers of the run, from `summarise_run`.
-        verdict: HTML of the judgement about stability, with which the page begins. Empty for
-            none.
-        reasons: HTML of the section that explains the judgement. Empty for no such section.
+        verdicts: Results of the log checks.
+        facts: Key figures of the run, from `summarise_run`.
+        verdict: HTML of the stability verdict, shown at the top of the page. Empty for none.
+        reasons: HTML of the section that explains the verdict. Empty to omit the section.
 
     Returns:
-        The whole page.
+        The complete page.
     """
     scenario = log.scenario
     builder = ChartBuilder(log, twin)

@@ -1,10 +1,10 @@
 """Renders the section of a report that explains whether the run was stable.
 
-The section contains the sentences of `trilat certify`, and figures of V, the energy function of
+The section contains the sentences of `trilat certify`, and figures of V, the energy function in
 the stability proof.
 
 Invariant:
-    - The sentences are those that `trilat certify` prints, with longer names of the checks.
+    - The sentences are those printed by `trilat certify`, but with longer names for the checks.
     - The figures are embedded as PNG data, because the page must be a single file.
 """
 
@@ -68,8 +68,8 @@ _BALANCE_NOTE = (
 def render_certificate(log: Log, certificate: Certificate) -> Markup:
     """Renders the section of the report that explains why a run was judged stable or not.
 
-    The section contains the reasons as sentences, and tables and figures that a reader can
-    unfold. The judgement itself is at the beginning of the page.
+    The section contains the reasons as sentences, with collapsible tables and figures. The
+    verdict itself is at the top of the page.
 
     Args:
         log: Log of the run.

@@ -1,12 +1,11 @@
-"""Renders the empty containers on a report's page into which its scripts draw charts and arms.
+"""Renders the empty containers into which a report's scripts draw charts and arms.
 
-A report is a web page about a recorded run of several robot arms. The scripts `report.js` and
-`arms.js` draw the charts and the moving arms in the browser, into empty containers.
+The scripts `report.js` and `arms.js` fill the containers in the browser.
 
 Invariant:
-    - Each group of charts can be unfolded. At first at most `_MOST_OPEN_CHARTS` charts are
-      unfolded.
-    - The page names the charts for which the log has no value.
+    - Each group of charts is collapsible. At most `_MOST_OPEN_CHARTS` charts are expanded
+      initially.
+    - The page lists the charts for which the log has no data.
 """
 
 import tomllib
@@ -48,11 +47,12 @@ _ARM_NOTE = (
 def render_overview(log: Log, builder: ChartBuilder, charts: Sequence[Chart]) -> Markup:
     """Renders the top of a report: the moving arms, the leading users, errors and delays.
 
-    A reader who opens the page should understand the run without reading further.
+    This part lets a reader understand the run without reading further.
 
     Args:
         log: Log of the run.
-        builder: Builder of the charts, which provides the box around the motion and the scale.
+        builder: Builder of the charts, which provides the bounding box of the motion and the
+            scale.
         charts: Charts of the page.
     """
     html = Markup()
@@ -83,16 +83,16 @@ def render_overview(log: Log, builder: ChartBuilder, charts: Sequence[Chart]) ->
 def render_chart_groups(
     log: Log, place: str, charts: Sequence[Chart], missing: Mapping[str, Sequence[str]]
 ) -> Markup:
-    """Renders a section's groups of charts, and a note about the charts that the page lacks.
+    """Renders the chart groups of a section, with a note about the missing charts.
 
-    At first only a limited number of charts is unfolded, so that the page is quick to draw.
+    Only a limited number of charts is expanded initially, so that the page is drawn quickly.
 
     Args:
         log: Log of the run.
-        place: Part of the page, which is the name of a table in `report.toml`, such as "motion"
+        place: Part of the page, given as the name of a table in `report.toml`, such as "motion"
             or "links".
         charts: Charts of the page.
-        missing: Titles of the charts for which the log has no value, by section.
+        missing: Mapping from section to the titles of charts for which the log has no data.
     """
     has_chains = any(arm.chain for arm in log.scenario.arms.values())
     absence_reasons = {

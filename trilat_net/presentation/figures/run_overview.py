@@ -1,13 +1,12 @@
 """Draws an overview of one run, or compares several runs, in four panels over time.
 
-The panels show the largest tracking error, the largest joint speed, the largest torque and the
-age of the oldest state in use. An arm receives the states of other arms over the network, and
-the age of a state is the time since it was sent.
+The panels show the largest tracking error, the largest joint speed, the largest torque, and the
+age of the oldest sample in use.
 
 Invariant:
-    - In the figure of one run, each line is an arm.
-    - In the figure of several runs, each line is a run. The line shows the largest value of all
-      arms of the run at each time.
+    - In the figure of a single run, each line is an arm.
+    - In the figure of several runs, each line is a run and shows the largest value across all
+      arms at each time.
 """
 
 import textwrap
@@ -99,9 +98,9 @@ _PANELS = (
 
 @draws("overview", "errors, speeds, torques and ages of a run at a glance")
 def draw_overview(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
-    """Draws the most important quantities of one run in four panels, with a line per arm.
+    """Draws the most important quantities of a run in four panels, with one line per arm.
 
-    The title contains the judgement on whether the run was stable, and the settling time.
+    The title contains the stability verdict and the settling time.
 
     Args:
         log: Log of the run.
@@ -138,13 +137,13 @@ def _compose_title(log: Log, form: FigureSize) -> str:
 
 
 def draw_overlay(logs: Mapping[str, Log], form: FigureSize = REPORT_SIZE) -> Figure:
-    """Draws several runs over one another in one figure, to compare them.
+    """Draws several runs in one figure for comparison.
 
-    The figure has the four panels of a run's overview. Each panel has a line for each run, and
-    the legend names the settings in which the runs differ.
+    The figure has the same four panels as the overview of a run, with one line per run. The
+    legend lists the settings in which the runs differ.
 
     Args:
-        logs: Logs of the runs, by their names in the legend.
+        logs: Mapping from the legend name of each run to its log.
         form: Width, font sizes and resolution of the figure.
 
     Raises:

@@ -1,16 +1,15 @@
 """Draws how a small disturbance of a run grows or decays over time.
 
-The run was repeated with a small push at some time. Such a repetition is called a twin. The
-upper panel shows the differences between the joint velocities of twin and run on a logarithmic
-axis, on which exponential growth is a straight line. The slope of a dashed line next to them is
-the growth rate that the headline states. The lower panel shows the joint speeds of the run
-itself.
+Twins are repetitions of the run with a small push at some time. The upper panel shows the
+differences in joint velocity between each twin and the run on a logarithmic axis, on which
+exponential growth is a straight line. The slope of the dashed line next to them is the growth
+rate given in the headline. The lower panel shows the joint speeds of the run itself.
 
 Invariant:
-    - The differences are drawn as they were measured.
-    - The dashed line covers the times over which its rate was fitted.
-    - If a twin was pushed again, because its difference had decayed to rounding errors, its
-      line is interrupted there.
+    - The differences are drawn as measured.
+    - The dashed line covers the time interval over which its rate was fitted.
+    - The line of a twin is interrupted where the twin was pushed again because its difference
+      had decayed to rounding errors.
 """
 
 import textwrap
@@ -86,11 +85,11 @@ class _DifferenceLine(NamedTuple):
 def draw_twins(pushed: PushedTwins, form: FigureSize = REPORT_SIZE) -> Figure:
     """Draws how small pushes grow or decay in repetitions of a run.
 
-    Each repetition, called a twin, equals the run except for a small push. The upper panel
-    shows the differences between the joint velocities of the twins and of the run, in rad/s. It
-    has a line for each push, or a line for each joint if there was a single push. The lower
-    panel shows the joint speeds of the run. If there are no twins, the figure shows the reason.
-    The title is a sentence on how the pushes develop.
+    Each repetition (twin) is identical to the run except for a small push. The upper panel
+    shows the differences in joint velocity between the twins and the run, in rad/s, with one
+    line per push, or one line per joint if there was only one push. The lower panel shows the
+    joint speeds of the run. If there are no twins, the figure shows the reason. The title
+    describes in a sentence how the pushes develop.
 
     Args:
         pushed: The run and its twins.
