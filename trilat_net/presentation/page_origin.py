@@ -1,10 +1,10 @@
 """Renders the section of a report that says how the run was executed and how to repeat it.
 
-It contains the description of the scenario (the experiment), the facts about the recording, the
-commands that check and repeat the run, the assumptions, and the versions of the software.
+The section contains the description of the scenario, facts about the recording, the commands
+that check and repeat the run, the assumptions, and the software versions.
 
 Invariant:
-    - All parts of this section are folded, except the commands.
+    - All parts of this section except the commands are collapsed.
 """
 
 import shlex
@@ -39,14 +39,14 @@ _MAX_CHANGES = 3
 
 
 def render_origin(log: Log, facts: JsonObject, licence: str) -> Markup:
-    """Renders the section of a report with which a reader can repeat the run.
+    """Renders the section of a report that lets a reader repeat the run.
 
-    The section contains the commands, the scenario, the assumptions and the versions.
+    The section contains the commands, the scenario, the assumptions and the software versions.
 
     Args:
         log: Log of the run.
-        facts: Numbers of the run, from `summarise_run`.
-        licence: Licence of the plotting library in the page.
+        facts: Key figures of the run, from `summarise_run`.
+        licence: Licence of the plotting library embedded in the page.
     """
     scenario = log.scenario
     name, hint = _find_scenario_argument(scenario)
@@ -74,7 +74,7 @@ def render_origin(log: Log, facts: JsonObject, licence: str) -> Markup:
 
 
 def summarise_origin(log: Log) -> str:
-    """Returns the name, length and origin of a run in one line, for the head of the page.
+    """Returns the name, length and origin of a run on one line, for the top of the page.
 
     The origin is, for example, a live session or virtual time.
 
@@ -88,18 +88,18 @@ def summarise_origin(log: Log) -> str:
 
 
 def describe_changes(scenario: Scenario) -> str:
-    """Returns how a scenario differs from the shipped scenario of the same name and title.
+    """Returns how a scenario differs from the shipped scenario with the same name and title.
 
-    The title and the description of a scenario state its original settings. A run with other
-    settings, for example of `trilat rerun`, keeps title and description. The reader must
-    therefore be informed of the differences.
+    The title and description of a scenario refer to its original settings, but a run with other
+    settings, for example from `trilat rerun`, keeps them. The reader must therefore be told
+    about the differences.
 
     Args:
         scenario: Scenario of the run.
 
     Returns:
-        A phrase such as "every link: constant 800 ms instead of constant 400 ms". Empty if the
-        scenario has no such difference, or if no shipped scenario has its name.
+        A phrase such as "every link: constant 800 ms instead of constant 400 ms". Empty if
+        there are no such differences, or if no shipped scenario has this name.
     """
     if scenario.name not in list_shipped():
         return ""

@@ -1,14 +1,14 @@
-"""Renders the first lines of a report: the stability judgement, its checks and key numbers.
+"""Renders the top lines of a report: the stability verdict, its checks and key figures.
 
 These lines let a reader decide within seconds whether the run needs a closer look. One of the
-key numbers is the tracking error e, the difference between the motion of an arm and the motion
-that it should follow.
+key figures is the tracking error e, the difference between the motion of an arm and its
+reference.
 
 Invariant:
-    - If a number seems to contradict the judgement, a sentence names this number and explains
-      why both are true.
-    - A failed check is named in the first lines, and its details are unfolded.
-    - Every text that comes from a log is escaped, by the template `summary.html`.
+    - If a number seems to contradict the verdict, a sentence names the number and explains why
+      both are true.
+    - A failed check is named in the top lines, and its details are expanded.
+    - Every string that comes from a log is escaped by the template `summary.html`.
 """
 
 from collections.abc import Sequence
@@ -82,12 +82,12 @@ The clause about a run that converged contains values, see `_explain_end`.
 def render_verdict(log: Log, certificate: Certificate, findings: Sequence[Finding]) -> Markup:
     """Renders the verdict on whether a run was stable, with the evidence for it.
 
-    The page of a run begins with this verdict.
+    The verdict is at the top of the page of a run.
 
     Args:
         log: Log of the run.
-        certificate: The judgement, with its reasons.
-        findings: Results of the checks of the log. The judgement is in doubt if one failed.
+        certificate: Stability certificate of the run.
+        findings: Results of the log checks. If any failed, the verdict is in doubt.
     """
     if log.why_empty:
         return render_macro(
@@ -254,13 +254,13 @@ class _KeyNumber(NamedTuple):
 
 
 def render_key_numbers(log: Log, facts: JsonObject) -> Markup:
-    """Renders the most important numbers of a run: its errors and the delay in use.
+    """Renders the most important figures of a run: its errors and the delay in use.
 
-    The key numbers are shown below the judgement, for readers who read nothing else.
+    They are shown below the verdict, for readers who read nothing else.
 
     Args:
         log: Log of the run.
-        facts: Numbers of the run, from `summarise_run`.
+        facts: Key figures of the run, from `summarise_run`.
     """
     numbers = [
         *_list_error_cards(log),
@@ -280,7 +280,7 @@ def find_error_peak(log: Log, sites: Sequence[str] = ()) -> JointError | None:
         sites: Names of the sites to consider. Empty for all sites.
 
     Returns:
-        The first record with this error. `None` if no record has a finite error.
+        The earliest occurrence of the largest error. `None` if no record has a finite error.
     """
     peaks = [JointError.find_largest(log[site]) for site in sites or log.sites]
     known_peaks = [peak for peak in peaks if peak is not None]
@@ -393,11 +393,11 @@ def _describe_delay(facts: JsonObject) -> _KeyNumber:
 
 
 def render_alarms(log: Log) -> Markup:
-    """Renders the alarms of a run, such as an emergency stop, as a list in large type.
+    """Renders the alarms of a run, such as an emergency stop, as a list in large print.
 
-    Faults and stops are the severe alarms. If there are severe alarms, only these are listed,
-    because other alarms usually follow from them. At most `_MAX_ALARMS` alarms are listed, and
-    the number of the others is stated.
+    If there are severe alarms (faults and stops), only these are listed, because other alarms
+    usually follow from them. The list shows at most `_MAX_ALARMS` alarms and the number of
+    remaining ones.
 
     Args:
         log: Log of the run.
@@ -423,14 +423,14 @@ def render_alarms(log: Log) -> Markup:
 
 
 def render_checks(findings: Sequence[Finding], facts: JsonObject) -> Markup:
-    """Renders the results of the checks of the log as one line, which unfolds into a list.
+    """Renders the results of the log checks as one line, which expands into a list.
 
-    The list is unfolded at first if a check has failed.
+    The list is expanded initially if a check has failed.
 
     Args:
         findings: Results of the checks. Some may be undecided, for example because the code of
-            a user's control law may not run here.
-        facts: Numbers of the run, from `summarise_run`.
+            a user's control law is not allowed to run here.
+        facts: Key figures of the run, from `summarise_run`.
 
     Returns:
         HTML of the line. Empty if nothing was checked.

@@ -1,13 +1,13 @@
-"""Renders the section of a report that lists the events of the run, in order of time.
+"""Renders the section of a report that lists the events of the run, in chronological order.
 
 For example, a command changed the network delay at 5 s, or an operator pushed an arm at 7 s.
-The section also lists alarms, and changes of an arm's mode: it follows the other arms, holds
-its position, brakes or returns.
+The section also lists alarms and the mode changes of each arm, such as holding its position,
+braking or returning.
 
 Invariant:
-    - Every sentence comes from the scenario or from a record.
+    - Every sentence is based on the scenario or on a record.
     - Changes have the same numbers as their marks in the charts.
-    - Moments beyond `MAX_SHOWN` are folded, and moments beyond `_MAX_MOMENTS` are left out.
+    - Moments beyond `MAX_SHOWN` are collapsed, and moments beyond `_MAX_MOMENTS` are omitted.
 """
 
 from collections.abc import Iterator
@@ -72,14 +72,14 @@ class _RunMoment(NamedTuple):
 
 
 def render_timeline(log: Log, facts: JsonObject) -> Markup:
-    """Renders the section with the events of the run, in the order of time.
+    """Renders the section with the events of the run, in chronological order.
 
     Examples are a changed delay, a push by an operator, and an arm that stopped because the
     network was interrupted.
 
     Args:
         log: Log of the run.
-        facts: Numbers of the run, from `summarise_run`.
+        facts: Key figures of the run, from `summarise_run`.
     """
     moments = list_moments(log, facts)
     body = _render_moments(log, moments[:MAX_SHOWN])
@@ -106,13 +106,13 @@ def _render_moments(log: Log, moments: list[_RunMoment]) -> Markup:
 
 
 def list_moments(log: Log, facts: JsonObject) -> list[_RunMoment]:
-    """Lists the events of a run in the order of time: changes, pushes, modes and errors.
+    """Lists the events of a run in chronological order: changes, pushes, modes and errors.
 
-    The page of the run lists the events, so that a reader can relate the curves to them.
+    The list lets readers of the page relate the curves to the events.
 
     Args:
         log: Log of the run.
-        facts: Numbers of the run, from `summarise_run`.
+        facts: Key figures of the run, from `summarise_run`.
     """
     moments = [
         _RunMoment(0.0, f"The run starts; {describe_dominance(log.scenario)}."),
@@ -127,10 +127,9 @@ def list_moments(log: Log, facts: JsonObject) -> list[_RunMoment]:
 
 
 def describe_dominance(scenario: Scenario) -> str:
-    """Returns the peers that each site follows at the start, as in "m1 follows s 0.7, m2 0.3".
+    """Returns which peers each site follows initially, as in "m1 follows s 0.7, m2 0.3".
 
-    A peer is another site whose states the site receives. The number is the dominance factor,
-    the weight with which the site follows the peer. Peers with the factor 0 are left out.
+    The numbers are the dominance factors. Peers with a factor of 0 are omitted.
 
     Args:
         scenario: Scenario of the run.

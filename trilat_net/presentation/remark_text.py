@@ -1,7 +1,7 @@
-"""Writes the remarks on a run that matter to readers of its stability judgement.
+"""Describes circumstances of a run that readers of its stability verdict should know about.
 
-`analysis.run_remarks` finds the circumstances. For example, this module writes "m1 and m2 were
-at their torque limit for 0.56 s and 0.43 s".
+`analysis.run_remarks` finds these circumstances. This module writes, for example, "m1 and m2
+were at their torque limit for 0.56 s and 0.43 s".
 """
 
 from collections.abc import Callable, Iterable, Iterator

@@ -1,16 +1,16 @@
-"""Shows a log in the Rerun viewer, an interactive program for plots and 3D scenes.
+"""Shows a log in Rerun, an interactive viewer for plots and 3D scenes.
 
-Rerun reads the data of a log from its MCAP file, in channels with standard messages of ROS 2,
-and reads the layout of its views from another file, the "blueprint". `open_rerun` prepares both
-files and starts Rerun. The layout consists of pages of plots, with a column per arm and a row
-per quantity. The extra `view` of the package installs Rerun.
+Rerun reads the data of a log from its MCAP file, from channels with standard ROS 2 messages,
+and the layout of its views from another file, the "blueprint". `open_rerun` prepares both files
+and starts Rerun. The layout consists of pages of plots, with one column per arm and one row per
+quantity. Rerun is installed by the extra `view` of this package.
 
 Invariant:
-    - A finished log that has standard channels is opened as it is. Any other log is first
-      exported as a ROS 2 bag into a temporary folder.
+    - A finished log with standard channels is opened as is. Any other log is first exported as
+      a ROS 2 bag to a temporary folder.
     - All curves of a plot have the same unit, and every curve has a name.
-    - Quantities that a log lacks take no space.
-    - This module sets all views, names and colors instead of the viewer, so that all logs look
+    - Quantities that are not in the log take up no space.
+    - All views, names and colours are set here rather than by the viewer, so that all logs look
       alike.
 """
 
@@ -53,7 +53,7 @@ _QUIET_ENVIRONMENT = {"RERUN_ANALYTICS_ENABLED": "false", "RUST_LOG": "warn"}
 
 
 class ViewerOptions(NamedTuple):
-    """Options of the command that shows a log in the viewer Rerun.
+    """Options of the command that shows a log in Rerun.
 
     Attributes:
         full: True to show every record instead of the decimated standard channels.
@@ -79,7 +79,7 @@ def open_rerun(
     print_line: Callable[[str], None],
     run_command: RunCommand = _run_process,
 ) -> None:
-    """Shows a log in the viewer Rerun, and returns when the user closes the viewer.
+    """Shows a log in Rerun, and returns when the user closes the viewer.
 
     Args:
         paths: File of the log, or its parts.
@@ -91,7 +91,7 @@ def open_rerun(
     Raises:
         UsageError: Rerun is not installed, or there is no display.
         LogError: The log cannot be read.
-        RunFailed: Rerun ended with an error.
+        RunFailed: Rerun exited with an error.
     """
     import_extra("rerun", "view", "viewers")
     _require_display(options)
@@ -138,9 +138,9 @@ def _require_display(options: ViewerOptions) -> None:
 
 
 def make_application_id(path: Path) -> str:
-    """Returns the name under which the viewer Rerun stores the layout of a log.
+    """Returns the name under which Rerun stores the layout of a log.
 
-    The name is that of the log, with only the characters that Rerun allows.
+    This is the name of the log, restricted to the characters that Rerun allows.
 
     Args:
         path: Path of the log.
@@ -220,11 +220,11 @@ class _PlotCurves(NamedTuple):
 class CurvePlot(NamedTuple):
     """A plot of one quantity of one site over time, on a page of the viewer.
 
-    For example the joint angles of m1, with the actual and the desired curves.
+    An example is the plot of the joint angles of m1, with the actual and the desired curves.
 
     Attributes:
         title: Title of the plot, with its unit.
-        curves: Curves of each of its channels.
+        curves: Curves of each channel in the plot.
     """
 
     title: str
@@ -236,12 +236,12 @@ PlotPage = list[list[CurvePlot]]
 
 
 class PlotLayout(NamedTuple):
-    """Layout in which the viewer Rerun shows a log: pages, plots, and arms in space.
+    """Layout in which Rerun shows a log: pages, plots, and arms in space.
 
     Attributes:
-        pages: Rows of plots on each page, by the name of the page.
-        lines: Topic of the texts about events. Empty if the log has no such topic.
-        arms: True if the arms are shown in space.
+        pages: Mapping from the name of each page to its rows of plots.
+        lines: Topic of the event messages. Empty if the log has no such topic.
+        arms: True to show the arms in space.
     """
 
     pages: dict[str, PlotPage]
@@ -252,12 +252,12 @@ class PlotLayout(NamedTuple):
     def of_channels(cls, channels: Ros2Channels) -> "PlotLayout":
         """Arranges the channels (series of messages) of a log as plots on pages of the viewer.
 
-        A page has a row of plots per quantity and a plot per arm. Pages and rows without any
-        curve are left out.
+        A page has one row of plots per quantity, with one plot per arm. Pages and rows without
+        any curves are omitted.
 
         Args:
-            channels: Standard channels by topic. Topics of sites are `<root>/<site>/<name>`,
-                those of the session are `<root>/log` and others.
+            channels: Mapping from topic to standard channel. Topics of sites are
+                `<root>/<site>/<name>`; `<root>/log` is an example of a session topic.
         """
         session_topics = [
             topic for topic in channels if _get_channel_name(topic) in _SESSION_CHANNELS

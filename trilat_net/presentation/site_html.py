@@ -1,11 +1,11 @@
-"""Renders the recorded states of an arm as HTML, which Jupyter notebooks display.
+"""Renders the records of an arm as HTML for Jupyter notebooks.
 
-If `log["m1"]` is the last line of a notebook's cell, the notebook shows this HTML: a heading
-and a table that summarises each quantity over the run.
+A notebook shows this HTML when a cell ends with `log["m1"]`: a heading, and a table that
+summarises each quantity over the run.
 
 Invariant:
-    - The table contains only quantities that the records of this arm contain.
-    - Rendering does not change the records.
+    - The table contains only quantities that are present in the records of this arm.
+    - Rendering does not modify the records.
 """
 
 from collections.abc import Iterator
@@ -22,11 +22,11 @@ FIELDS = ("q", "qd", "q_des", "e", "tau", "tau_x", "theta_hat", "x", "xd", "wren
 
 
 def render_site_html(site: SiteLog) -> Markup:
-    """Renders the records of one site as HTML, for display in a notebook.
+    """Renders the records of a site as HTML, for display in a notebook.
 
-    The heading is followed by a table with a row per element of a record's vectors. A row
-    contains the first, last, smallest and largest value over the run. Without records there is
-    only the heading.
+    The heading is followed by a table with one row per vector component in a record. Each row
+    contains the first, last, smallest and largest value over the run. If there are no records,
+    only the heading is rendered.
 
     Args:
         site: Records of the site.

@@ -1,19 +1,19 @@
 """Composes the text that commands print about a run, a live session and this machine.
 
-Each function `compose_...` turns the result of one command into lines and tables, which
+Each `compose_...` function turns the result of one command into lines and tables, which
 `terminal_output` prints. The results are about:
 
-- a run: its summary, metrics, checks of its log, recovery of its log, and repeated execution,
+- a run: its summary, its metrics, the checks and recovery of its log, and its re-execution,
 - a live session: `compose_ping`,
 - this machine: `compose_doctor`, `compose_benchmark`.
 
 `format_run_lines` lists the notable facts of a run, such as alarms, changed settings, and
-messages of users' control laws.
+messages from users' control laws.
 
 Invariant:
     - Links with a constant delay and no loss are not listed among the notable facts.
-    - A dash stands for a missing number. If the quantity is meaningful for the run, the reason
-      why the number is missing is written below the tables.
+    - Missing numbers are shown as a dash. If the quantity is meaningful for the run, the reason
+      why it is missing is given below the tables.
 """
 
 import math
@@ -55,8 +55,8 @@ _MAX_FREQUENCIES = 16
 def compose_log(log: Log) -> Iterator[Block]:
     """Yields the text with which a command introduces a recorded run.
 
-    It consists of a line about the session, a table with a row per arm, and the notable facts
-    of the run, such as alarms and changes of settings.
+    The text consists of a line about the session, a table with one row per arm, and the notable
+    facts of the run, such as alarms and setting changes.
 
     Args:
         log: Log of the run.
@@ -73,16 +73,16 @@ def compose_log(log: Log) -> Iterator[Block]:
 
 
 def format_run_lines(log: Log) -> list[str]:
-    """Returns lines about notable facts of a run, such as alarms and changed delays.
+    """Returns lines about the notable facts of a run, such as alarms and changed delays.
 
-    The lines concern alarms, user code, links, changes, modes and clocks. Long lists are cut,
-    see `_limit_lines`.
+    The lines cover alarms, user code, links, changes, modes and clocks. Long lists are
+    truncated, see `_limit_lines`.
 
     Args:
         log: Log of the run.
 
     Raises:
-        LogError: A record names a change that does not exist in the log.
+        LogError: A record refers to a change that does not exist in the log.
     """
     return [
         *_limit_lines([f"*** {alarm}" for alarm in Timeline(log).alarms]),
@@ -307,7 +307,7 @@ def _limit_lines(lines: list[str]) -> list[str]:
 
 
 def compose_verification(report: LogCheckReport) -> Iterator[Block]:
-    """Yields the results of the checks of a log for the user, one line per check.
+    """Yields the results of the log checks for the user, one line per check.
 
     If all checks passed, the notable facts of the run follow.
 
@@ -321,9 +321,9 @@ def compose_verification(report: LogCheckReport) -> Iterator[Block]:
 
 
 def compose_log_check(report: LogCheckResult) -> Iterator[Block]:
-    """Yields the result of the checks of a log file: a line per check.
+    """Yields the results of checking a log file, one line per check.
 
-    After each failed check, lines name the places in the file at which it failed.
+    Each failed check is followed by lines that give the places in the file at which it failed.
 
     Args:
         report: Results of the checks.
@@ -345,7 +345,7 @@ def compose_log_check(report: LogCheckResult) -> Iterator[Block]:
 
 
 def compose_recovery(recovery: Recovery) -> Iterator[Block]:
-    """Yields the outcome of recovering a log that was cut off.
+    """Yields the outcome of recovering a truncated log.
 
     The first line names the new file. A table lists which records were recovered, and which
     were lost or are missing.
@@ -380,13 +380,13 @@ def compose_recovery(recovery: Recovery) -> Iterator[Block]:
 
 
 def compose_rerun(rerun: Rerun) -> Iterator[Block]:
-    """Yields the result of executing some sites of a log again with changed settings.
+    """Yields the result of re-executing some sites of a log with changed settings.
 
     The text names the executed sites and the changed settings, and compares the motion of each
-    site and the ages of the samples of each link with the log.
+    site and the sample ages of each link with the log.
 
     Args:
-        rerun: Result of the new execution.
+        rerun: Result of the re-execution.
     """
     request = rerun.request
     recorded = f"; {', '.join(request.recorded)} as recorded" if request.recorded else ""
@@ -528,7 +528,7 @@ def _format_difference(before: object, after: object) -> tuple[str, str]:
 def compose_doctor(report: Result) -> Iterator[Block]:
     """Yields the results of checking whether this machine is ready for a session.
 
-    Each finding has a line, with a mark for good, doubtful or bad.
+    Each finding is printed on its own line, marked as good, doubtful or bad.
 
     Args:
         report: Result of `trilat doctor`.
@@ -540,9 +540,9 @@ def compose_doctor(report: Result) -> Iterator[Block]:
 def compose_ping(report: Result) -> Iterator[Block]:
     """Yields tables of the round trip times in a session.
 
-    One table contains the times to the members, the processes that take part in the session:
-    sites and recorders. The other contains the times between sites. The second table exists
-    only if the sites have measured these times.
+    The first table contains the round trip times to the members of the session (sites and
+    recorders). A second table contains the times between sites, if the sites have measured
+    them.
 
     Args:
         report: Result of the measurement.
@@ -596,11 +596,11 @@ def _describe_clock(member: dict[str, Any]) -> str:
 
 
 def compose_benchmark(benchmark: Result) -> Iterator[Block]:
-    """Yields the delays of this machine's transports, and a judgement on each transport.
+    """Yields the delays of the transports on this machine, with a verdict on each transport.
 
-    A transport is a way to send messages between two processes. The table has a row per
-    transport, size of message and rate. The judgement compares the delay with the requirements
-    of a scenario.
+    A transport is a way to send messages between two processes. The table has one row per
+    transport, message size and rate. The verdict compares the delay with the requirements of a
+    scenario.
 
     Args:
         benchmark: Result of the measurement.
@@ -684,9 +684,9 @@ def _judge_transport(transport: dict[str, Any], needs: dict[str, Any]) -> str:
 def compose_metrics(metrics: LogMetrics) -> Iterator[Block]:
     """Yields the tables with the metrics of a run.
 
-    There is a table for each group of quantities, with a column for each subject: the run, an
-    arm, a network link, or a wall. Further tables describe what operators feel: forces,
-    stiffness and impedance. The reasons why numbers are missing come last.
+    There is one table per group of quantities, with one column per subject: the run, an arm, a
+    link, or a wall. Further tables describe what operators feel: forces, stiffness and
+    impedance. The reasons for missing numbers come last.
 
     Args:
         metrics: The metrics of the run.

@@ -1,7 +1,7 @@
-"""Writes the sentences for users on repetitions of a run with small pushes (twins).
+"""Describes repetitions of a run with small pushes (twins) in sentences for users.
 
 `analysis.twins` measures whether the effects of the pushes grow, and returns names and numbers.
-For example, this module writes that every push dies away, and which push does so most slowly.
+This module writes, for example, that every push dies away, and which one does so most slowly.
 """
 
 import math
@@ -62,7 +62,7 @@ def _describe_misses(growth: TwinGrowth) -> str:
 
 
 def describe_push(twins: PushedTwins, pushed: PushGrowth) -> str:
-    """Returns a sentence on whether the effect of one push grows or dies away.
+    """Returns a sentence that says whether the effect of a push grows or dies away.
 
     Args:
         twins: The run and its twins.

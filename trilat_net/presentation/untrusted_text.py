@@ -1,6 +1,6 @@
-"""Makes texts from files and from other computers safe to print.
+"""Makes strings from files and from other computers safe to print.
 
-Such a text could contain control characters that move the cursor or hide other texts.
+Such strings could contain control characters that move the cursor or hide other text.
 """
 
 import re
@@ -22,13 +22,13 @@ MAX_LETTERS = 4000
 
 
 def sanitize(text: object, most: int = 300) -> str:
-    """Replaces the harmful characters of a text of unknown origin, and truncates a long text.
+    """Replaces harmful characters in a string of unknown origin, and truncates long strings.
 
-    Control characters could otherwise control the terminal.
+    Without this, control characters could manipulate the terminal.
 
     Args:
-        text: The text, or an object that is converted to a string.
-        most: Largest number of characters.
+        text: The string, or an object that is converted to a string.
+        most: Maximum number of characters.
     """
     # One character more than the limit shows whether the text is too long.
     beginning = str(text)[: most + 1]

@@ -1,16 +1,15 @@
-"""Writes the sentences for users about V, the energy function of the stability proof.
+"""Writes sentences for users about V, the energy function in the stability proof.
 
-`analysis` determines whether and when V rose, and whether each condition of the theorem (a
-premise, such as constant delays) holds. It returns names and numbers. For example, this module
-writes that V rose by 0.2 J at 3.1 s, or which premise failed.
+`analysis` determines whether and when V rose, and whether each premise of the theorem, such as
+constant delays, holds. It returns names and numbers. This module writes, for example, that V
+rose by 0.2 J at 3.1 s, or which premise failed.
 
 Invariant:
     - Each class of `VerdictFacts` has exactly one function in `FACT_DESCRIBERS`, and each class
       of `premise_quantities` one in `PREMISE_DESCRIBERS`.
     - A sentence about a premise lists at most `MAX_LISTED_NAMES` arms, links or joints, and
-      states the number of the others.
-    - A sentence that names a condition (premise) that fails says in plain words what the
-      condition requires.
+      states how many more there are.
+    - A sentence about a failed premise explains in plain words what the premise requires.
     - The name of the theorem mentions its premise of continuous time, which no log can show.
 """
 
@@ -58,7 +57,7 @@ REQUIREMENTS = {
 
 
 def name_theorem() -> str:
-    """Returns the phrase by which judgements of runs refer to the paper's stability theorem."""
+    """Returns the phrase with which verdicts refer to the paper's stability theorem."""
     return THEOREM
 
 
@@ -237,9 +236,9 @@ _PARAMETER_FAULTS = {
 
 
 def describe_quantities(quantities: premise_quantities.PremiseQuantities) -> str:
-    """Returns a sentence on what a run shows about a condition of the stability theorem.
+    """Returns a sentence on what a run shows about a premise of the stability theorem.
 
-    An example of a condition is that all network delays are constant.
+    For example, one premise is that all network delays are constant.
 
     Args:
         quantities: The data on the premise.
@@ -248,16 +247,16 @@ def describe_quantities(quantities: premise_quantities.PremiseQuantities) -> str
 
 
 def explain_no_functional(scenario: Scenario) -> str:
-    """Explains for which arms the energy function V of the stability proof does not exist.
+    """Explains for which arms the energy function V in the stability proof does not exist.
 
-    A certificate then judges the run without V.
+    In that case, a certificate judges the run without V.
 
     Args:
-        scenario: The description of the experiment.
+        scenario: Scenario of the run.
 
     Returns:
-        The names of these arms' sites and the reasons, separated by semicolons. Empty if the
-        energy exists for every arm.
+        The names of these sites with the reasons, separated by semicolons. Empty if V exists
+        for every arm.
     """
     return _describe_missing_functionals(
         premise_quantities.MissingFunctional.list_of_scenario(scenario)
