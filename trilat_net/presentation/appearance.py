@@ -17,9 +17,9 @@ from ..errors import UsageError
 from ..scenario import Scenario
 
 SITE_COLOURS = ("#004488", "#bb5566", "#ddaa33", "#000000", "#66a3d2", "#7a7a7a")
-"""Colours of sites on white paper or a light page."""
+"""Site colours for white paper or a light page."""
 DARK_SITE_COLOURS = ("#79b0f2", "#f08a9b", "#e9bd4c", "#f2f2f2", "#9bd3f5", "#a3a3a3")
-"""Colours of the same sites on a dark page, in the same order."""
+"""Colours of the same sites for a dark page, in the same order."""
 
 
 def list_site_colours(scenario: Scenario, colours: Sequence[str] = SITE_COLOURS) -> list[str]:
@@ -36,7 +36,7 @@ def list_site_colours(scenario: Scenario, colours: Sequence[str] = SITE_COLOURS)
 
 
 COLUMN_IN = 3.5
-"""Width of a column of a paper, in inches."""
+"""Width of one column of a paper, in inches."""
 PAGE_IN = 7.0
 """Width of two columns of a paper, in inches."""
 
@@ -85,4 +85,4 @@ class FigureSize(NamedTuple):
 
 
 REPORT_SIZE = FigureSize(width_in=PAGE_IN, tick_pt=7.0, small_pt=6.0, dpi=200)
-"""Size of the figures beside the report."""
+"""Size of the figures that accompany the report."""

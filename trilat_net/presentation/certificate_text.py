@@ -39,15 +39,15 @@ from .end_text import name_behaviour
 from .result_text import MARKS, Block, MarkedText, TextTable
 
 MIN_ENERGY_SHARE = 1e-6
-"""Smallest listed energy, as a share of the largest energy."""
+"""Smallest energy to list, as a fraction of the largest energy."""
 MAX_LISTED_LINKS = 6
-"""Largest number of links that are listed. The energies of more links are summed."""
+"""Maximum number of links to list. If there are more, their energies are summed."""
 _SOURCE_NAMES = {
     "rule": "rule for stale peers",
     "shares": "change of shares",
     "estimates": "box, or wrong estimates",
 }
-"""Texts of the sources of energy other than links, by their names in a balance."""
+"""Display names of energy sources other than links, keyed by their names in a balance."""
 
 _OTHER_ENDS = {
     EndBehaviour.CONVERGED: "the record ends with slow arms",
@@ -59,8 +59,8 @@ _OTHER_ENDS = {
     EndBehaviour.DRIFTS: "an arm still drifts at the end of the record",
     EndBehaviour.GROWS: "the motion still grows at the end of the record",
 }
-"""Clauses about the end of a record, for runs whose judgement differs from that of the end
-alone.
+"""Clauses about the end of a record, for runs whose verdict differs from what the end alone
+suggests.
 """
 
 _HOLDS = {True: "holds", False: "fails", None: "undecided"}
@@ -119,7 +119,7 @@ def select_premises(certificate: Certificate) -> list[premise_quantities.Premise
 
 
 def _tabulate_premises(premises: Sequence[premise_quantities.Premise]) -> TextTable:
-    """Returns a table with a row per premise: whether it holds, and why."""
+    """Returns a table with one row per premise, stating whether it holds and why."""
     rows = [(premise.name, _HOLDS[premise.holds], premise.text) for premise in premises]
     styles = {"holds": "green", "fails": "yellow"}
     return TextTable(("premise", "", "finding"), rows, styles=styles)
@@ -221,13 +221,13 @@ def describe_in_words(certificate: Certificate) -> list[CertificateLine]:
 
 
 def _explain_judgement(certificate: Certificate) -> str:
-    """Returns a sentence in plain words on what a judgement means for small disturbances.
+    """Returns a sentence in plain words on what a verdict means for small disturbances.
 
     For example: "a small disturbance halves every 0.83 s".
 
     Returns:
-        The sentence. Empty for a run that diverged or is open (undecided), because the
-        judgement itself says why.
+        The sentence. Empty for a run that diverged or whose verdict is open, because the
+        verdict itself gives the reason.
     """
     stability = certificate.stability
     if certificate.end.behaviour is EndBehaviour.DIVERGED or stability is Stability.OPEN:
@@ -292,10 +292,10 @@ def describe_pace(certificate: Certificate) -> str:
 
 
 def _describe_verdict(certificate: Certificate) -> list[CertificateLine]:
-    """Returns the first lines of a certificate: judgement, stability theorem, end of the run.
+    """Returns the first lines of a certificate: verdict, stability theorem, end of the run.
 
     Each line has a mark such as "ok" or "FAIL". V is the energy function of the theorem, which
-    must not rise by itself in a stable run.
+    must not rise on its own in a stable run.
     """
     stability_mark = _JUDGEMENT_MARKS[certificate.stability]
     verdict_mark = "ok" if certificate.bounded_by_v else "open"
@@ -339,12 +339,12 @@ def describe_theorem(certificate: Certificate) -> list[str]:
 def _compare_rates(
     roots: decision_facts.LoopRoots | None, twins: TwinGrowth
 ) -> list[CertificateLine]:
-    """Returns a remark on why two rates of decay differ, if their printed values differ.
+    """Returns a remark on why two decay rates differ, if they are printed differently.
 
     A certificate states the rate of the characteristic roots, and the rate at which small
-    pushes of the arms died away in repetitions of the run (twins). Both are rates of
-    amplitudes. The roots describe small motions near one pose, whereas a push develops along
-    the motion of the run for a limited time.
+    pushes died away in repetitions of the run (twins). Both are amplitude rates. The roots
+    describe small motions near one pose, whereas a push develops along the motion of the run
+    for a limited time.
 
     Args:
         roots: Characteristic roots of the loop at its final pose. `None` if they were not
@@ -352,7 +352,7 @@ def _compare_rates(
         twins: Growth of the pushes.
 
     Returns:
-        A remark. Empty if the rates agree, or if one of them is unknown.
+        A list with the remark. Empty if the rates agree, or if one of them is unknown.
     """
     worst_push = twins.worst
     if roots is None or roots.rate_per_s is None or worst_push is None:
@@ -378,7 +378,7 @@ def _compare_rates(
 
 
 def _describe_evidence(certificate: Certificate) -> CertificateLine:
-    """Returns the line that says whether the log is complete and intact."""
+    """Returns a line that says whether the log is complete and intact."""
     evidence = certificate.evidence
     mark = "open" if evidence.reasons else "ok"
     if not evidence.integrity.passed:
@@ -387,13 +387,13 @@ def _describe_evidence(certificate: Certificate) -> CertificateLine:
 
 
 def _describe_paper_weights(certificate: Certificate) -> str:
-    """Returns a sentence on the rise that V would have had with the weights of the paper.
+    """Returns a sentence on how much V would have risen with the weights used in the paper.
 
-    V is the energy function of the stability proof, a weighted sum over the sites. The paper's
-    weights, all equal to 1, are right only for some networks.
+    V is the energy function in the stability proof, a weighted sum over the sites. The paper
+    sets all weights to 1, which is correct only for some networks.
 
     Returns:
-        A sentence. Empty if the paper's weights are right for this run.
+        A sentence. Empty if the paper's weights are correct for this run.
     """
     balance = certificate.paper_balance
     rise = certificate.paper_weights_rise
@@ -431,10 +431,10 @@ def compose_headline(certificate: Certificate) -> str:
 
 
 def _describe_end(certificate: Certificate) -> str:
-    """Returns a phrase on the end of a run's motion that claims no more than the judgement.
+    """Returns a phrase on the end of a run's motion that claims no more than the verdict.
 
-    Only the phrase for a run that is judged as settled contains values: the error e and the
-    joint speed |qd|.
+    Values (the error e and the joint speed |qd|) are included only if the run is judged to have
+    settled.
     """
     end = certificate.end
     if certificate.stability is not Stability.SETTLED:
@@ -500,8 +500,8 @@ _ROOT_MARKS = {"stable": "ok", "unstable": "open"}
 def _mark_twins(twins: TwinGrowth) -> str:
     """Returns the mark of the sentence about twins: "ok" if all pushes die away.
 
-    The mark is "FAIL" if a push grows or the repetition departs from the run, "note" without
-    pushes, and "open" otherwise.
+    The mark is "FAIL" if a push grows or a repetition deviates from the run, "note" if there
+    are no pushes, and "open" otherwise.
     """
     if not twins.pushes:
         return "note"
@@ -514,11 +514,11 @@ def _mark_twins(twins: TwinGrowth) -> str:
 def _describe_balance(balance: EnergyBalance) -> str:
     """Returns a sentence about how well the energy balance of a run closes.
 
-    V is the energy function of the stability proof, in J. Its change should equal the work that
-    was done on the arms minus the dissipated energy. The difference is the residual. One cause
-    is that the controller acts only once per tick (period of the control loop), while the proof
-    assumes continuous time. The work of this sampling is computed. The sentence therefore also
-    says how small the residual is without this work.
+    V is the energy function in the stability proof, in J. Its change should equal the work done
+    on the arms minus the dissipated energy. The difference is the residual. One cause of a
+    residual is sampling: the controller acts only once per tick, while the proof assumes
+    continuous time. Since the work caused by sampling is known, the sentence also states how
+    small the residual is without it.
 
     Args:
         balance: The energy balance of the run.
@@ -582,10 +582,10 @@ def list_energies(balance: EnergyBalance) -> list[tuple[str, float]]:
 
 
 def _compute_rest(balance: EnergyBalance) -> Array:
-    """Returns the change of the energy V that no known cause explains, shape (T,), in J.
+    """Returns the change of the energy V that no known cause explains, in J, shape (T,).
 
-    V belongs to the stability proof. The table of energies lists this change as "unexplained".
-    It should be close to 0, except in gaps of the records.
+    The table of energies lists this change as "unexplained". It should be close to 0, except in
+    gaps of the records.
     """
     gained = sum(balance.work.values())
     lost = sum(balance.dissipation.values())
@@ -597,8 +597,8 @@ def _compute_rest(balance: EnergyBalance) -> Array:
 def _describe_v(balance: EnergyBalance, index: int) -> tuple[str, float]:
     """Returns the name and the value in J of the energy function V at one tick.
 
-    The name is for example "V at 2.5 s". A tick is a control period. If V is smaller than the
-    rounding errors, 0 is returned.
+    The name is, for example, "V at 2.5 s". If V is smaller than the rounding errors, 0 is
+    returned.
     """
     energy_j = float(balance.V[index])
     shown_j = energy_j if energy_j > ZERO_ENERGY_J else 0.0

@@ -220,7 +220,7 @@ def conclude(
 
 
 def _run_without_operators(log: Log) -> Log | None:
-    """Simulates the run of a log again without the people or programs that moved the arms.
+    """Repeats the run of a log in simulation, without operators.
 
     The difference between the two runs shows how far the operators displaced the arms.
 
@@ -245,14 +245,14 @@ _TIMING_HEADERS = ("late p50 us", "p99", "max", "busy p50 us", "p99")
 
 
 def _tabulate_sites(log: Log, *, is_timed: bool) -> TextTable:
-    """Returns a table with a row per arm: number of records, timing, and largest final error.
+    """Returns a table with one row per arm: number of records, timing, and largest final error.
 
-    The error is the largest error of any joint in the last second, or of the whole run if the
-    run was shorter. The table names the joint.
+    The error is the largest error of any joint in the last second, or in the whole run if it
+    was shorter. The table names the joint.
 
     Args:
         log: Log of the run.
-        is_timed: False to leave out the timing. Loops in virtual time are never late.
+        is_timed: False to omit the timing, since loops in virtual time are never late.
     """
     timing_headers = _TIMING_HEADERS if is_timed else ()
     has_second = any(log[site].t_s[-1] >= END_WINDOW_S for site in log.sites if len(log[site]))
@@ -282,7 +282,7 @@ def _tabulate_sites(log: Log, *, is_timed: bool) -> TextTable:
 
 
 def _list_timing_cells(records: SiteLog) -> list[str]:
-    """Returns the percentiles of the lateness and of the computing time of a site's ticks."""
+    """Returns cells with percentiles of the lateness and computing time of a site's ticks."""
     late_us = np.percentile(records.late_us, (50, 99, 100))
     busy_us = np.zeros(2)
     # A record contains the computing time of the previous tick, so the first record has none.

@@ -27,10 +27,10 @@ from .appearance import SITE_COLOURS
 from .figures.arm_poses import project_arm_m, trace_bodies_m
 
 PANEL_PX = 240
-"""Side of a panel, in pixels."""
+"""Side length of a panel, in pixels."""
 _DPI = 100
 _MARGIN = 1.08
-"""Half the side of a panel, as a multiple of the reach of its arm."""
+"""Half the side length of a panel, as a multiple of the reach of its arm."""
 _GOAL: dict[str, Any] = {
     "marker": "x",
     "markersize": 9.0,
@@ -113,7 +113,7 @@ class EpisodePicture:
         Args:
             axes: Panel of the figure, as Matplotlib axes.
             site: Name of the site.
-            bodies: Pose of each body by name, shape (7,) each.
+            bodies: Mapping from body name to pose, shape (7,) each.
         """
         if not bodies:
             return
@@ -124,7 +124,7 @@ class EpisodePicture:
             axes.plot(*path[0].T, color=style.REFERENCE, linewidth=0.8)
 
     def _read_pixels(self) -> NDArray[np.uint8]:
-        """Returns the pixels of the figure without their opacity."""
+        """Returns the RGB pixels of the figure, without the alpha channel."""
         self._canvas.draw()  # type: ignore[no-untyped-call]
         rgba = np.asarray(self._canvas.buffer_rgba())  # type: ignore[no-untyped-call]
         pixels: NDArray[np.uint8] = rgba[:, :, :3].copy()
@@ -134,11 +134,11 @@ class EpisodePicture:
 def _scale_panel(axes: Axes, points_m: Array) -> None:
     """Sets the axis limits of a panel so that the arm fits in every pose.
 
-    The limits are the reach of the arm, the sum of its links' lengths.
+    The limits are based on the reach of the arm, which is the sum of its link lengths.
 
     Args:
         axes: Panel of the figure, as Matplotlib axes.
-        points_m: Base, joints and end effector in any pose, shape (L, 2) or (L, 3), in m.
+        points_m: Base, joints and end effector in any pose, in m, shape (L, 2) or (L, 3).
     """
     lengths_m = np.linalg.norm(np.diff(points_m, axis=0), axis=1)
     half_m = _MARGIN * float(lengths_m.sum())
@@ -147,11 +147,11 @@ def _scale_panel(axes: Axes, points_m: Array) -> None:
 
 
 def _draw_arm(axes: Axes, points_m: Array, colour: str) -> None:
-    """Draws the links, joints and base of an arm into a panel of a figure.
+    """Draws the links, joints and base of an arm in a panel.
 
     Args:
         axes: Panel of the figure, as Matplotlib axes.
-        points_m: Base, joints and end effector in the picture, shape (L, 2), in m.
+        points_m: Base, joints and end effector in the picture, in m, shape (L, 2).
         colour: Colour of the arm.
     """
     axes.plot(*points_m.T, color=colour, linewidth=3.0, solid_capstyle="round")

@@ -25,9 +25,9 @@ from ..results import JsonObject
 from . import exports
 
 EXPORT_MANIFEST = "about.json"
-"""Name of the file that describes an exported folder and marks the folder as an export."""
+"""Name of the file that describes an exported folder and identifies it as an export."""
 Written = Callable[[int], None]
-"""Function that is called with the number of records written since its last call."""
+"""Function that is called with the number of records written since the last call."""
 
 
 class ExportFormat(NamedTuple):
@@ -150,13 +150,13 @@ def _parse_settings(
 ) -> dict[str, Any]:
     """Converts the settings of an export, such as `fps=30`, to the types of their parameters.
 
-    The settings come from the command line as texts. A format declares its settings as
-    keyword-only parameters of its function, with default values that determine the types.
+    Settings from the command line are strings. A format declares its settings as keyword-only
+    parameters of its function, whose default values determine the types.
 
     Args:
         form: Name of the format.
         write: Function of the format that writes a log.
-        settings: Values of settings by name, as numbers or texts.
+        settings: Mapping from setting name to a number or string.
 
     Returns:
         The converted settings by name.
@@ -259,7 +259,7 @@ def write_table_files(
 
 
 def _describe_table(table: Table) -> JsonObject:
-    """Returns the meaning of a table's rows, and unit, meaning and source of its columns."""
+    """Returns the meaning of a table's rows, and unit, meaning and source of each column."""
     columns = {}
     for column in table.columns:
         columns[column.name] = {
@@ -271,12 +271,12 @@ def _describe_table(table: Table) -> JsonObject:
 
 
 def _describe_folder(log: Log, folder: Path, about: str) -> None:
-    """Writes files that explain an exported folder to its later readers.
+    """Writes files that explain an exported folder to later readers.
 
-    The files are a description of the columns, and the scenario of the run.
+    These are a description of the columns, and the scenario of the run.
 
     Args:
-        log: Log of the run that is exported.
+        log: Log of the run to export.
         folder: The exported folder.
         about: Description of the export, from `store_tables`.
     """

@@ -22,7 +22,7 @@ from markupsafe import Markup, escape
 from .untrusted_text import HASH
 
 _CODE = re.compile(r"`([^`]+)`")
-"""Text in backticks, which the page shows as code."""
+"""Matches text in backticks, which the page shows as code."""
 
 
 def render_template(name: str, /, **values: Any) -> Markup:
@@ -51,7 +51,7 @@ def render_macro(template: str, macro: str, /, **values: Any) -> Markup:
 
 @cache
 def _make_environment() -> Environment:
-    """Returns the Jinja environment of the report: settings and functions of all templates.
+    """Returns the Jinja environment of the report: settings and functions for all templates.
 
     The result is cached, so that each template is compiled only once.
     """
@@ -73,7 +73,7 @@ def _make_environment() -> Environment:
 
 
 def _mark_hashes(text: str) -> Markup:
-    """Converts plain text to HTML, and keeps each hash on a single line for copying.
+    """Converts plain text to HTML, keeping each hash on a single line for copying.
 
     A hash is a long hexadecimal number that identifies a file.
 
@@ -85,5 +85,5 @@ def _mark_hashes(text: str) -> Markup:
 
 
 def _mark_code(text: str) -> Markup:
-    """Converts plain text to HTML, with text in backticks as code."""
+    """Converts plain text to HTML, showing text in backticks as code."""
     return Markup(_CODE.sub(r"<code>\1</code>", str(escape(text))))

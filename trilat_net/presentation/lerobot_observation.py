@@ -21,18 +21,18 @@ from ..log import Ints, Log
 from ..scenario import TASK_AXES, LiveHand
 
 _HAND_ACTIONS = {"tip": "tip", "joint": "joints"}
-"""Kind of exported actions that an operator accepts as commands, by mode of the operator."""
+"""Kind of exported actions that an operator accepts as commands, keyed by operator mode."""
 
 
 def _find_plugin_hand(log: Log, site: str) -> LiveHand:
-    """Finds the operator of an arm through which the program of a plugin moves the arm.
+    """Finds the operator model through which a plugin's program moves an arm.
 
     Args:
         log: Log of the run.
-        site: Name of the site, the process that controls the arm.
+        site: Name of the site.
 
     Raises:
-        UsageError: No program can move the arm of this site in the scenario.
+        UsageError: The scenario does not allow a program to move the arm of this site.
     """
     hand = log.scenario.sites[site].find_live_hand()
     if hand is None:
@@ -126,8 +126,8 @@ def observe_as_plugin(
 def _compute_pull(hand: LiveHand, vectors: Array, pose: Array, pose_rate: Array) -> Array:
     """Computes the force of an operator model on its arm, as `Hand.force` does in a session.
 
-    The operator is modelled as a spring and damper that pulls the arm to a target. With the
-    stiffness K and the damping B, the force is
+    The operator is modelled as a spring and damper that pulls the arm towards a target. With
+    stiffness K and damping B, the force is
 
         F = K (target - pose) + B (target rate - pose rate)
 
@@ -137,7 +137,7 @@ def _compute_pull(hand: LiveHand, vectors: Array, pose: Array, pose_rate: Array)
         hand: The operator.
         vectors: Field `hand` of the records (`HandInForce`), shape (F, 3 + 2 n).
         pose: Pose of the arm in the coordinates of the operator, shape (F, n).
-        pose_rate: Its time derivative, shape (F, n).
+        pose_rate: Time derivative of the pose, shape (F, n).
 
     Returns:
         The force in N, or in mode `joint` the torques in N m, shape (F, n).

@@ -27,16 +27,17 @@ from .page_html import render_details, render_note
 _TEXTS: dict[str, dict[str, Any]] = tomllib.loads(
     (resources.files("trilat_net.presentation") / "assets" / "report.toml").read_text("utf-8")
 )
-"""Heading and note of each section of charts, by part of the page and section, and other notes.
+"""Heading and note of each section of charts, keyed by part of the page and section, and other
+notes.
 """
 _OPEN_SECTIONS = ("torques", "errors", "positions")
-"""Sections of charts that may be unfolded at first."""
+"""Sections of charts that may be expanded initially."""
 _MOST_OPEN_CHARTS = 10
-"""Largest number of charts in a part of the page that are unfolded at first."""
+"""Maximum number of charts in a part of the page that are expanded initially."""
 _MOST_HALF_CHARTS = 2
-"""Largest number of charts in a group that takes half of the width of the page."""
+"""Maximum number of charts in a group that occupies half the width of the page."""
 _NO_VALUE = "the log has no value to draw"
-"""Reason why a chart is left out."""
+"""Reason why a chart is omitted."""
 
 _ARM_NOTE = (
     "Solid: the arm; dashed: where the other arms lead it, delayed and weighted. The arms "
@@ -137,17 +138,17 @@ def render_chart_groups(
 def _render_group(
     section: str, heading: str, note: str, count: int, is_open: bool, is_small: bool
 ) -> Markup:
-    """Renders a group of charts that readers can unfold.
+    """Renders a collapsible group of charts.
 
-    The group is an empty container, into which a script of the page draws the charts.
+    The group is an empty container, which a script of the page fills with charts.
 
     Args:
         section: Key of the section, as in `report.toml`.
         heading: Heading of the group.
         note: Sentence about the charts.
         count: Number of charts.
-        is_open: True if the group is unfolded at first.
-        is_small: True for small charts without legends, of which there are many.
+        is_open: True to expand the group initially.
+        is_small: True for small charts without legends, used if there are many.
     """
     return render_macro(
         "charts.html",

@@ -21,7 +21,7 @@ import msgspec
 Colour = int | Literal["limit"]
 """Index of a site in the palette of the page, or "limit".
 
-The lines of references, true values and limits have the colour "limit".
+Lines for references, true values and limits have the colour "limit".
 """
 
 

@@ -16,7 +16,7 @@ from markupsafe import Markup
 from .html_templates import render_macro
 
 NO_NUMBER = "–"
-"""Cell of a missing number."""
+"""Cell content for a missing number."""
 
 
 def render_section(heading: str, intro: str, body: Markup, name: str = "") -> Markup:
@@ -90,9 +90,9 @@ def render_table(
 
 
 def _render_scrolling(content: Markup, label: str) -> Markup:
-    """Renders wide content in a region that scrolls sideways, also by the keyboard.
+    """Renders wide content in a region that scrolls sideways, also with the keyboard.
 
-    The page itself then never becomes wider than the screen.
+    This keeps the page itself from becoming wider than the screen.
 
     Args:
         content: HTML of the content of the region.
@@ -102,7 +102,7 @@ def _render_scrolling(content: Markup, label: str) -> Markup:
 
 
 def _render(macro: str, **values: Any) -> Markup:
-    """Renders a macro of the template that contains the pieces of a page."""
+    """Renders a macro of the template for pieces of a page."""
     return render_macro("parts.html", macro, **values)
 
 

@@ -24,15 +24,15 @@ from .html_templates import render_macro
 from .page_data import PageData
 
 _MAX_BARS = 4
-"""Largest number of slaves with a bar or a sentence."""
+"""Maximum number of slaves with a bar or a sentence."""
 _MAX_PHASES = 6
-"""Largest number of spans of time that the text beside a bar describes."""
+"""Maximum number of time spans described in the text beside a bar."""
 _INSTANTS = 600
 """Number of equally spaced instants at which the factors are computed."""
 _STEP_S = 1e-6
 """Time before a sudden change at which the old factors still apply, in s."""
 _SAME_SHARE = 1e-9
-"""Largest difference of two factors that count as equal."""
+"""Maximum difference between two factors that are considered equal."""
 
 
 class SlaveLead(NamedTuple):
@@ -82,10 +82,10 @@ class SlaveLead(NamedTuple):
 
     @classmethod
     def _trace(cls, log: Log, slave: str) -> "SlaveLead":
-        """Returns the weights (dominance factors) with which a slave follows its peers.
+        """Computes the dominance factors with which a slave follows its peers.
 
-        The points are those at which the slopes of the weights change. Straight lines between
-        the points therefore show the weights at all times.
+        The points are those at which the slope of any factor changes, so that straight lines
+        between them represent the factors at all times.
         """
         end_s = Timeline(log).end_s
 
@@ -202,10 +202,10 @@ class SlaveLead(NamedTuple):
 
 
 def _find_corners(t_s: Array, shares: Array) -> list[int]:
-    """Returns the indices of the points that are needed to draw weights over time as a line.
+    """Returns the indices of the points needed to draw factors over time as a line.
 
-    Points on a straight line between other points are left out. The first and the last point
-    are kept.
+    Points on a straight line between other points are omitted. The first and the last point are
+    kept.
     """
     slopes = np.diff(shares, axis=0) / np.diff(t_s)[:, np.newaxis]
     turns = np.abs(np.diff(slopes, axis=0)).max(axis=1, initial=0.0)
@@ -214,17 +214,17 @@ def _find_corners(t_s: Array, shares: Array) -> list[int]:
 
 
 def _list_points(t_s: Array, heights: Array) -> list[str]:
-    """Returns points of an SVG shape, with the time in s to the right."""
+    """Formats points for an SVG shape, with time in s increasing to the right."""
     points = zip(t_s.tolist(), heights.tolist(), strict=True)
     return [f"{time_s:.6g},{height:.4f}" for time_s, height in points]
 
 
 def _name_slave(scenario: Scenario, slave: str) -> str:
-    """Returns "the slave", with its name if there are several slaves."""
+    """Returns "the slave", including its name if there are several slaves."""
     roles = [spec.role for spec in scenario.sites.values()]
     return "the slave" if roles.count("slave") == 1 else f"the slave {slave}"
 
 
 def _format_percent(share: float) -> str:
-    """Returns a dominance factor in percent, with three digits."""
+    """Formats a dominance factor as a percentage with three digits."""
     return f"{100.0 * share:.3g} %"

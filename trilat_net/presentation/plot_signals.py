@@ -110,14 +110,14 @@ def sites_with_operator(log: Log) -> list[str]:
 
 
 class _DecimatedTrace(NamedTuple):
-    """Signals reduced to few points, so that they can be drawn quickly.
+    """Signals decimated to a few points, for fast drawing.
 
     A gap in the records that would be visible is marked by a row of NaN, which interrupts the
     curve.
 
     Attributes:
         tick: Ticks of the P points, shape (P,).
-        t_s: Times of the points, shape (P,), in s.
+        t_s: Times of the points, in s, shape (P,).
         values: Values of the C signals, shape (P, C).
     """
 

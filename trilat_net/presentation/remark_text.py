@@ -12,7 +12,7 @@ from ..errors import count_nouns, join_words
 
 
 def _list_remarks(run: run_remarks.RunCircumstances) -> Iterator[str]:
-    """Yields a sentence without a full stop for each circumstance that occurred."""
+    """Yields one sentence, without a full stop, for each circumstance that occurred."""
     if run.at_limit_s:
         verb = "was at its" if len(run.at_limit_s) == 1 else "were at their"
         durations = [f"{time_s:.3g} s" for time_s in run.at_limit_s.values()]
@@ -55,4 +55,5 @@ def _list_remarks(run: run_remarks.RunCircumstances) -> Iterator[str]:
 SENTENCE_LISTERS: dict[type, Callable[[Any], Iterable[str]]] = {
     run_remarks.RunCircumstances: _list_remarks
 }
-"""The function that lists the remarks on a run, by the class of the circumstances."""
+"""Function that lists the remarks on a run, keyed by the class that contains its circumstances.
+"""

@@ -35,7 +35,7 @@ _COLOURS = {
 }
 MARKS = {state: f"[{colour}]{state:<4}[/{colour}]" for state, colour in _COLOURS.items()}
 MARKS["note"] = "note"
-"""Marks in Rich's markup, by the state of a finding."""
+"""Marks in Rich markup, keyed by the state of a finding."""
 
 
 class TextTable(NamedTuple):
@@ -109,11 +109,11 @@ class TextTable(NamedTuple):
         return table
 
     def _list_cells(self, index: int) -> list[str]:
-        """Returns the cells of a column. Rows that are too short have no cell in it."""
+        """Returns the cells of a column, skipping rows that are too short to have one."""
         return [row[index] for row in self.rows if index < len(row)]
 
     def _find_hash_width(self, index: int) -> int | None:
-        """Returns the length of the longest hash in a column. `None` if it contains no hash."""
+        """Returns the length of the longest hash in a column, or `None` if there is no hash."""
         widths = []
         for cell in self._list_cells(index):
             widths += [len(digits) for digits in HASH.findall(cell)]
@@ -227,7 +227,7 @@ class MarkedText(NamedTuple):
 
 
 Block = str | MarkedText | TextTable
-"""A part of a result's text. An empty text is an empty line."""
+"""A part of a result's text. An empty string is an empty line."""
 
 _COMPOSERS = {
     "Certificate": "certificate_text:compose_certificate",
@@ -241,12 +241,14 @@ _COMPOSERS = {
     "PushedTwins": "certificate_text:compose_twins",
     "Rerun": "summary_text:compose_rerun",
 }
-"""Functions that compose the text of results, as "module:function", by class name."""
+"""Functions that compose the text of results, given as "module:function" and keyed by class
+name.
+"""
 _BRIEF_COMPOSERS = {
     "Certificate": "brief_text:compose_key_reasons",
     "LogMetrics": "brief_text:compose_key_metrics",
 }
-"""Functions that compose the ten most important lines of long results, by class name."""
+"""Functions that compose the ten most important lines of long results, keyed by class name."""
 
 
 def compose(result: Result, *, brief: bool = False) -> list[MarkedText | TextTable]:
@@ -279,14 +281,14 @@ def compose(result: Result, *, brief: bool = False) -> list[MarkedText | TextTab
 def _import_composer(
     result: Result, composers: Mapping[str, str]
 ) -> Callable[[Result], Iterable[Block]]:
-    """Imports the function that composes the text of a result, only when it is needed.
+    """Imports the function that composes the text of a result, when it is first needed.
 
-    If all such modules were imported at the start, every command would be slow. For a subclass
-    of a listed class, the function of the listed class is used.
+    Importing all such modules at startup would make every command slow. For a subclass of a
+    listed class, the function of the listed class is used.
 
     Args:
         result: The result.
-        composers: Functions as "module:function", by class name, such as `_COMPOSERS`.
+        composers: Functions as "module:function", keyed by class name, such as `_COMPOSERS`.
     """
     classes = [cls.__name__ for cls in type(result).__mro__]
     listed_class = next(name for name in classes if name in composers)

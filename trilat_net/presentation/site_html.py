@@ -18,7 +18,7 @@ from .html_templates import render_macro
 from .result_text import TextTable, format_number
 
 FIELDS = ("q", "qd", "q_des", "e", "tau", "tau_x", "theta_hat", "x", "xd", "wrench")
-"""Vectors of a record that the table shows, a row per element."""
+"""Record vectors shown in the table, with one row per component."""
 
 
 def render_site_html(site: SiteLog) -> Markup:
@@ -41,7 +41,7 @@ def render_site_html(site: SiteLog) -> Markup:
 
 
 def _list_rows(site: SiteLog) -> Iterator[list[str]]:
-    """Yields the rows of the table: the time, then a row per element of each vector."""
+    """Yields the rows of the table: the time, then one row per component of each vector."""
     start = format_number(float(site.t_s[0]))
     end = format_number(float(site.t_s[-1]))
     yield ["t_s", start, end, start, end, "time, s"]
@@ -54,7 +54,7 @@ def _list_rows(site: SiteLog) -> Iterator[list[str]]:
 
 
 def _summarize(values: Array) -> list[str]:
-    """Returns the first, last, smallest and largest of the values, shape (K,), as texts."""
+    """Returns the first, last, minimum and maximum of the values, shape (K,), as strings."""
     numbers = (values[0], values[-1], values.min(), values.max())
     return [format_number(float(number)) for number in numbers]
 

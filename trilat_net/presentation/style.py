@@ -46,11 +46,11 @@ from .appearance import REPORT_SIZE, SITE_COLOURS, FigureSize, list_site_colours
 from .plot_signals import decimate
 
 AxesGrid = NDArray[np.object_]
-"""Panels of a figure, shape (rows, columns), of `Axes`."""
+"""Grid of panels in a figure: an array of `Axes` with shape (rows, columns)."""
 LineOptions = dict[str, Any]
 """Options of a line: keyword arguments of `Axes.plot`."""
 LegendEntry = tuple[str, LineOptions]
-"""Text of a line in a legend, and the options of the line."""
+"""Legend label of a line, and the options of the line."""
 LegendEntries = Sequence[LegendEntry]
 
 DASHES: tuple[Any, ...] = (
@@ -59,27 +59,27 @@ DASHES: tuple[Any, ...] = (
     (0, (1, 1)),
     (0, (5, 1.5, 1, 1.5)),
 )
-"""Line styles: solid, and three patterns of dashes."""
+"""Line styles: solid, and three dash patterns."""
 REFERENCE = "#333333"
-"""Dark grey, the colour of references, limits and marks."""
+"""Dark grey, the colour of references, limits and markers."""
 FAINT = "#8c8c8c"
-"""Light grey, the colour of texts in empty panels and of bands."""
+"""Light grey, the colour of text in empty panels and of bands."""
 
 LIMIT_LINE: LineOptions = {
     "color": REFERENCE,
     "linestyle": (0, (4, 2)),
     "linewidth": 0.8,
 }
-"""Options of the line of a desired, true, stated or allowed value."""
+"""Options of a line at a desired, true, specified or permitted value."""
 
 REPORT_DPI = REPORT_SIZE.dpi
 _NOTEBOOK_DPI = 200
 _LEAST_RANGE = 1e-9
-"""If the range of values is smaller than this, they differ by rounding errors only."""
+"""If the range of values is smaller than this, they differ only by rounding errors."""
 BUCKETS_PER_PANEL = 700
-"""Number of intervals of time to which the signals of a panel are decimated.
+"""Number of time intervals to which the signals of a panel are decimated.
 
-Half a page is 700 pixels wide, and more points would not be visible.
+Half a page is 700 pixels wide, so more points would not be visible.
 """
 
 _STYLE_SHEET = resources.files("trilat_net.presentation") / "assets" / "figures.mplstyle"
@@ -115,14 +115,14 @@ def styled_figure(form: FigureSize, height_in: float) -> Iterator[Figure]:
 
 
 class _NotebookFigure(Figure):
-    """A Matplotlib figure that a Jupyter notebook displays as a picture.
+    """A Matplotlib figure that Jupyter notebooks display as a picture.
 
-    Without this class, a notebook would display only the size of the figure in words, because
-    figures are made without pyplot.
+    A notebook would otherwise display only a line of text with the size of the figure, because
+    figures are created without pyplot.
     """
 
     def _repr_png_(self) -> bytes:
-        """Returns the picture. Jupyter calls this method by its name."""
+        """Returns the picture as PNG. Jupyter calls this method by its name."""
         return _render_figure(self, "png", _NOTEBOOK_DPI)
 
     def _repr_html_(self) -> str:
@@ -164,9 +164,9 @@ def site_colour(log: Log, site: str) -> str:
 
 
 _WIDEST_PT = 2.0
-"""Width of the line of the first site in a panel of all sites."""
+"""Line width of the first site in a panel that shows all sites, in pt."""
 _THINNER_PT = 1.2
-"""Difference between the line widths of the first and the last site in such a panel."""
+"""Difference in line width between the first and the last site in such a panel, in pt."""
 
 
 def site_line(log: Log, site: str, width: float | None = None) -> LineOptions:
@@ -301,15 +301,16 @@ def flatten_rounding(axes: Axes) -> None:
 
 
 class _JointPanels(NamedTuple):
-    """Panels of a figure in which each joint of the arms has a panel of its own.
+    """Panels of a figure in which each joint of the arms has its own panel.
 
-    `TimeFigure.add_joint_panels` creates them.
+    Created by `TimeFigure.add_joint_panels`.
 
     Attributes:
-        joints: A panel per joint.
+        joints: One panel per joint.
         columns: Number of panels in a row.
-        lowest: Lowest panel of each column, which has the time axis.
-        below: Panel below the others, over the whole width. `None` if there is no such panel.
+        lowest: Bottom panel of each column, which has the time axis.
+        below: Panel below the others, spanning the whole width. `None` if there is no such
+            panel.
     """
 
     joints: list[Axes]
@@ -456,7 +457,7 @@ def annotate_empty_panel(axes: Axes, text: str) -> None:
 
 
 FIGURE_FORMATS = ("pdf", "png", "svg")
-"""Suffixes of the files to which figures can be written."""
+"""Suffixes of the file formats in which figures can be written."""
 
 _FILE_RC: Any = {
     "pdf.fonttype": 42,
@@ -488,9 +489,10 @@ def write_figure(figure: Figure, path: Path, dpi: int) -> None:
 
 
 def _render_figure(figure: Figure, kind: str, dpi: int) -> bytes:
-    """Returns a figure as the bytes of a file that contains no date.
+    """Renders a figure to the bytes of a file that contains no date.
 
-    Without a date, the same figure always has the same bytes, so that files can be compared.
+    Without a date, the same figure always results in the same bytes, so that files can be
+    compared.
 
     Args:
         figure: The Matplotlib figure.
@@ -504,23 +506,25 @@ def _render_figure(figure: Figure, kind: str, dpi: int) -> bytes:
 
 
 MOST_EXPLAINED_CHANGES = 12
-"""Largest number of changes explained in a figure; the page lists all changes."""
+"""Maximum number of changes explained in a figure; the page lists all changes."""
 
 SiteSignal = Callable[[str], tuple[Ints, Array, Array]]
-"""Function of a site that returns ticks (K,), times in s (K,), and values (K, J)."""
+"""Function that takes the name of a site and returns ticks (K,), times in s (K,), and values
+(K, J).
+"""
 
 _HOLD_ALPHA = 0.22
 """Opacity of the shading while a site holds or brakes."""
 _RETURN_ALPHA = 0.09
 """Opacity of the shading while a site returns."""
 _LETTERS_PER_IN = 120.0
-"""Average number of letters per inch of a font of 1 pt."""
+"""Average number of letters per inch of a font with a size of 1 pt."""
 _CHANGE_LINE: LineOptions = {
     "color": REFERENCE,
     "linestyle": (0, (1, 1.5)),
     "linewidth": 0.7,
 }
-"""Options of the vertical line at a change."""
+"""Options of the vertical line that marks a change."""
 _CHANGE_NUMBER: dict[str, Any] = {
     "xytext": (1.5, -0.5),
     "textcoords": "offset points",
@@ -675,14 +679,13 @@ class TimeFigure:
         plot_decimated(axes, records.tick, records.t_s, values, **line_options)
 
     def joint_row(self, row: Sequence[Axes], sites: Sequence[str], signal: SiteSignal) -> None:
-        """Plots a signal over time in a row of panels, with a panel per joint and a line per
-        arm.
+        """Plots a signal over time, with one panel per joint and one line per arm.
 
         Intervals in which an arm does not follow the others are shaded, and setting changes are
         marked.
 
         Args:
-            row: The panels, as Matplotlib axes.
+            row: One panel per joint, as Matplotlib axes.
             sites: Names of the sites.
             signal: Function that takes the name of a site and returns its ticks, times and
                 values.
@@ -725,8 +728,8 @@ class TimeFigure:
     def _shade_modes(self, axes: Axes, site: str) -> None:
         """Shades a panel in the colour of a site while the site does not follow its peers.
 
-        The shading shows when an arm held its position, braked or returned, for example after
-        the network was interrupted.
+        The shading shows when an arm held its position, braked or returned, for example after a
+        network interruption.
         """
         colour = site_colour(self.log, site)
         for mode, from_s, to_s in self._modes[site]:
@@ -748,7 +751,7 @@ class TimeFigure:
         Args:
             axes: Panel of the figure, as Matplotlib axes.
             at_s: Time of the change, in s.
-            number: Number of the change as text. Empty to write no number.
+            number: Number of the change, as a string. Empty to omit the number.
         """
         axes.axvline(at_s, zorder=0.6, **_CHANGE_LINE)
         if number:
@@ -790,9 +793,9 @@ class TimeFigure:
         self._add_footnote(self._explain_changes(links=links), self._explain_shading())
 
     def _add_footnote(self, *sentences: str) -> None:
-        """Writes sentences below the panels, each on a new line. Empty sentences are left out.
+        """Writes sentences below the panels, each on a new line. Empty sentences are skipped.
 
-        For example, the sentences explain the marked changes and the shaded times.
+        These can explain, for example, the marked changes and the shaded intervals.
         """
         letters_per_line = int(
             _LETTERS_PER_IN * self.figure.get_figwidth() / self._form.small_pt
@@ -810,12 +813,12 @@ class TimeFigure:
             )
 
     def _explain_changes(self, *, links: bool) -> str:
-        """Returns a sentence that explains the numbered marks of changes in a figure.
+        """Returns a sentence that explains the numbered change marks in a figure.
 
-        An example of a change is a new network delay from a certain time on.
+        An example of a change is a network delay that differs from a certain time on.
 
         Args:
-            links: True to explain changes of links only.
+            links: True to explain only link changes.
 
         Returns:
             The sentence. Empty if there are no changes.
@@ -834,7 +837,7 @@ class TimeFigure:
         return f"Changes: {'; '.join(listed_texts)}"
 
     def _explain_shading(self) -> str:
-        """Returns a sentence that explains the shaded times. Empty if nothing is shaded."""
+        """Returns a sentence that explains the shaded intervals. Empty if nothing is shaded."""
         meanings = set()
         for intervals in self._modes.values():
             meanings |= {interval.meaning for interval in intervals}

@@ -57,17 +57,17 @@ out = TextConsole(highlight=False)
 err = TextConsole(stderr=True, highlight=False)
 
 PATIENCE_S = 1.0
-"""Time until a progress bar appears, in s."""
+"""Time after which a progress bar appears, in s."""
 _REDRAW_PERIOD_S = 0.1
-"""Shortest time between two drawings of a progress bar, in s."""
+"""Minimum time between two updates of a progress bar, in s."""
 LINES_AFTER_S = 1.0
-"""Time until `progress_lines` names the current work, in s."""
+"""Time after which `progress_lines` names the current task, in s."""
 LINES_PERIOD_S = 10.0
 """Time between two lines of `progress_lines`, in s."""
 _MAX_DAMAGED = 3
-"""Largest number of damaged parts of a log that are listed."""
+"""Maximum number of damaged parts of a log to list."""
 _PIPE_WIDTH = 160
-"""Least width of tables, in characters, when the output is not a terminal."""
+"""Minimum width of tables, in characters, if the output is not a terminal."""
 
 
 def print_text(text: object, console: Console = out, head: str = "") -> None:
@@ -400,11 +400,12 @@ def warn_if_unfinished(path: Path) -> None:
 
 
 def _escape_controls(text: str) -> str:
-    """Replaces control characters of a text by their names, as in <U+001B>.
+    """Replaces control characters in a string with their names, as in <U+001B>.
 
-    Otherwise a text from another program could control the terminal, for example clear it.
+    Otherwise output from another program could control the terminal, for example by clearing
+    it.
 
     Args:
-        text: The text.
+        text: The string.
     """
     return CONTROLS.sub(lambda match: f"<U+{ord(match[0]):04X}>", text)

@@ -10,15 +10,15 @@ CONTROLS = re.compile(
 )
 """Characters that move the cursor, ring the bell, set colours, or change the text direction.
 
-Line feeds and tabs are not among them.
+Line feeds and tabs are not included.
 """
 HASH = re.compile(r"\b(?=[0-9a-f]*[a-f])(?=[0-9a-f]*[0-9])[0-9a-f]{12,64}\b")
-"""Pattern of a hash in hexadecimal digits, or of the first 12 or more digits of a hash.
+"""Matches a hexadecimal hash, or at least the first 12 digits of one.
 
-A hash is kept on one line so that it can be copied.
+Hashes are kept on one line so that they can be copied.
 """
 MAX_LETTERS = 4000
-"""Largest length of a printed line."""
+"""Maximum length of a printed line."""
 
 
 def sanitize(text: object, most: int = 300) -> str:

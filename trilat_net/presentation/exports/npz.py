@@ -18,9 +18,9 @@ def _write(log: Log, path: Path, written: Written) -> None:
     """Exports a log as a NumPy .npz file: columns as arrays, with description and scenario.
 
     Args:
-        log: Log of the run that is exported.
+        log: Log of the run to export.
         path: The file.
-        written: Function that is called with the number of records written since its last call.
+        written: Function that is called with the number of records written since the last call.
     """
     arrays: dict[str, NDArray[Any]] = {}
 

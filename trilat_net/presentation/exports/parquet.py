@@ -16,9 +16,9 @@ def _write(log: Log, folder: Path, written: Written) -> None:
     """Exports a log as Parquet tables in a folder, with their description and the scenario.
 
     Args:
-        log: Log of the run that is exported.
-        folder: Existing folder of the files.
-        written: Function that is called with the number of records written since its last call.
+        log: Log of the run to export.
+        folder: Existing folder for the files.
+        written: Function that is called with the number of records written since the last call.
     """
     write_table_files(log, folder, written, ".parquet", _write_table)
 

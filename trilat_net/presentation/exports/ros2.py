@@ -39,16 +39,16 @@ SOURCE_METADATA = "trilat.source"
 """Name of the metadata record that describes the exported session."""
 _QOS_FILE = cdr.DEFINITIONS / "qos.yaml"
 _QOS = _QOS_FILE.read_text(encoding="utf-8")
-"""Template of a quality of service, as rosbag2 writes it: reliable."""
+"""Template of a reliable quality of service (QoS) profile in rosbag2 notation."""
 _VOLATILE = {"DEPTH": "10", "DURABILITY": "2"}
-"""Values for `_QOS`: the last ten messages, for present subscribers."""
+"""Values for `_QOS`: keep the last ten messages, for current subscribers only."""
 _LATCHED = {"DEPTH": "1", "DURABILITY": "1"}
-"""Values for `_QOS`: the last message, for late subscribers as well (transient local)."""
+"""Values for `_QOS`: keep the last message for late subscribers too (transient local)."""
 _RECORDS_PER_REPORT = 1000
-"""Number of records between two reports of progress."""
+"""Number of records between two progress reports."""
 
 TopicMessages = list[tuple[str, bytes]]
-"""Encoded messages, each with its topic."""
+"""Pairs of topic and encoded message."""
 TimedMessages = tuple[int, int, TopicMessages]
 """Log time in ns, publish time in ns, and the topic and data of each message with these times.
 """
@@ -124,7 +124,7 @@ def export_ros2(
 
 
 def _add_quality(channel: ros2_messages.Ros2Channel) -> ros2_messages.Ros2Channel:
-    """Adds the quality of service to the metadata of a channel, as rosbag2 writes it."""
+    """Adds the quality of service (QoS) to the metadata of a channel, in rosbag2 notation."""
     text = _QOS
     values = _LATCHED if channel.latched else _VOLATILE
     for placeholder, value in values.items():
@@ -134,14 +134,14 @@ def _add_quality(channel: ros2_messages.Ros2Channel) -> ros2_messages.Ros2Channe
 
 
 class _SiteBag:
-    """Converts the messages of one arm to standard ROS 2 messages in a bag, a file of messages.
+    """Converts the records of one arm to standard ROS 2 messages for a bag.
 
     Args:
-        log: Log of the run that is exported.
+        log: Log of the run to export.
         site: Name of the site.
         session: Name of the session in topics.
-        table: Names of the topics.
-        progress: Function that is called with the number of records since its last call.
+        table: Topic names.
+        progress: Function that is called with the number of records since the last call.
     """
 
     def __init__(
@@ -165,7 +165,7 @@ class _SiteBag:
         return self._table.find(self._session, self._site, topic)
 
     def _name_messages(self, messages: ros2_messages.NamedMessages) -> TopicMessages:
-        """Returns messages with the full names of their topics."""
+        """Returns the messages with fully qualified topic names."""
         topic_messages: TopicMessages = []
         for name, data in messages:
             topic = self._find_topic(name)
@@ -222,13 +222,13 @@ class _SiteBag:
 
 
 def _find_epoch_ns(log: Log) -> int:
-    """Returns the Unix time of a session's common start, in ns, or 0 in virtual time."""
+    """Returns the Unix time at which a session started, in ns, or 0 in virtual time."""
     epoch_text = log.session.get("epoch_unix_ns", "0")
     return int(epoch_text)
 
 
 def _iterate_events(log: Log, session: str) -> Iterator[TimedMessages]:
-    """Yields the messages about the events of a session."""
+    """Yields the messages for the events of a session."""
     timed = log.timed_events()
     log_times_ns = timed.log_ns.tolist()
     publish_times_ns = timed.publish_ns.tolist()
@@ -240,10 +240,10 @@ def _iterate_events(log: Log, session: str) -> Iterator[TimedMessages]:
 
 
 def _iterate_diagnostics(log: Log, session: str) -> Iterator[TimedMessages]:
-    """Yields a ROS message per second about the state of all sites, for monitoring tools.
+    """Yields one ROS message per second about the state of all sites, for monitoring tools.
 
-    Each message is composed from the newest record of every site. Its times are the latest
-    times of these records, and never earlier than those of the previous message, because a bag
+    Each message is composed from the most recent record of every site. Its times are the latest
+    times of these records, but never earlier than those of the previous message, because a bag
     must be sorted by time.
     """
     site_logs = [log[site] for site in log.sites if len(log[site])]

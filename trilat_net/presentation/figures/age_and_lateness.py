@@ -33,31 +33,31 @@ from ..plot_signals import sample_ages_ms
 from .figure_entry import draws, unless
 
 _POINTS = 400
-"""Number of points of a distribution."""
+"""Number of points on a distribution curve."""
 _RARE_RATIO = 6.0
-"""An axis is logarithmic if the largest value exceeds the 95th percentile by this factor."""
+"""The axis is logarithmic if the largest value exceeds the 95th percentile by this factor."""
 _STEP_MS = 1.5
-"""If an age falls by more than this from one tick to the next, it counts as a fluctuation.
+"""A drop in age from one tick to the next counts as a fluctuation if it exceeds this value.
 
-If two samples arrive in the same tick of 1 ms, the age falls by about 1 ms, which is normal.
+A drop of about 1 ms is normal: it occurs whenever two samples arrive in the same tick of 1 ms.
 """
 NO_LOOP_CLOCK = "virtual time: no clock was read, so no loop was late and no tick was timed"
 NO_LOOP_TIMES = "no lateness and no computing time in this log"
 _SPREAD_BUCKETS = 120
-"""Number of intervals of time for which `_plot_spread` draws a median and a band."""
+"""Number of time intervals for which `_plot_spread` draws a median and a band."""
 _SPREAD: style.LineOptions = {"color": style.FAINT, "alpha": 0.35, "linewidth": 6.0}
-"""Options of the line that represents the band of a spread in a legend."""
+"""Options of the legend line that represents the band of a spread."""
 _BINS_PER_DECADE = 20
-"""Number of bins of a histogram per decade, for example between 1 us and 10 us."""
+"""Number of histogram bins per decade, for example between 1 us and 10 us."""
 
 
 @draws("sample_age", "age of the samples in use, per link", in_report=True)
 def _draw_sample_age(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
     """Draws the age of the sample in use on every link over time, in ms.
 
-    The age of a sample of a peer's state is the time from its sending until its use. The figure
-    has a row per receiver. An age that fluctuates is drawn as a band with its median, because a
-    line would fill the area between its extremes.
+    The age is the time since the sample was sent. The figure has one row per receiver. An age
+    that fluctuates is drawn as a band with its median, because a line would fill the area
+    between its extremes.
 
     Args:
         log: Log of the run.
@@ -206,9 +206,9 @@ class DelayAxis(NamedTuple):
 def _draw_delay_distributions(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
     """Draws the distributions of the delay and of the age of samples on every link.
 
-    The delay of a sample is the time until its arrival, its age the time until its use. A curve
-    at x shows the percentage of samples with a delay of at most x ms, or of ticks with an age
-    of at most x ms. The figure has a row per receiver.
+    The delay of a sample is the time from sending to arrival, and its age the time from sending
+    to use. A curve at x shows the percentage of samples with a delay of at most x ms, or of
+    ticks with an age of at most x ms. The figure has one row per receiver.
 
     Args:
         log: Log of the run.
@@ -298,17 +298,17 @@ def _is_unsteady(ages_ms: Array) -> bool:
 
 
 def _plot_spread(axes: Axes, t_s: Array, values: Array, **options: Any) -> None:
-    """Draws a fluctuating signal as its median in a band from least to largest value.
+    """Plots a fluctuating signal as its median within a band from minimum to maximum.
 
-    The time is divided into `_SPREAD_BUCKETS` intervals with equal numbers of values. Each
-    interval gives a point of the median and of the edges of the band.
+    The time axis is divided into `_SPREAD_BUCKETS` intervals with equal numbers of values. Each
+    interval contributes one point of the median and of the band edges.
 
     Args:
         axes: Panel of the figure, as Matplotlib axes.
         t_s: Times of the values, in s, shape (K,).
         values: The values, shape (K,). NaN values are ignored.
-        **options: Options of the line of the median. They must include a "color", which also
-            applies to the band.
+        **options: Options of the median line. They must include a "color", which also applies
+            to the band.
     """
     buckets = np.array_split(np.arange(len(values)), _SPREAD_BUCKETS)
     points = []
@@ -330,7 +330,7 @@ def _plot_spread(axes: Axes, t_s: Array, values: Array, **options: Any) -> None:
 
 
 def _compute_spread(values: Array) -> tuple[float, float, float]:
-    """Returns the least, median and largest of the finite values, or NaN if there are none."""
+    """Returns the minimum, median and maximum of the finite values. NaN if there are none."""
     # NumPy prints a warning if all values are NaN.
     if not np.isfinite(values).any():
         return np.nan, np.nan, np.nan
@@ -338,7 +338,7 @@ def _compute_spread(values: Array) -> tuple[float, float, float]:
 
 
 def _scale_age_axis(axes: Axes, values_ms: Array) -> None:
-    """Scales the value axis of ages to all values, shape (K,). NaN values are ignored."""
+    """Scales the age axis to fit all values, shape (K,). NaN values are ignored."""
     known = values_ms[np.isfinite(values_ms)]
     if needs_log_axis(known):
         least_ms = float(known[known > 0.0].min())
@@ -349,7 +349,7 @@ def _scale_age_axis(axes: Axes, values_ms: Array) -> None:
 
 
 def _list_sender_entries(log: Log) -> list[tuple[str, dict[str, Any]]]:
-    """Returns the legend entries of the senders of samples."""
+    """Returns the legend entries for the senders of samples."""
     return [
         (f"from {style.site_title(log, site)}", style.site_line(log, site, 1.8))
         for site in log.sites
@@ -423,9 +423,9 @@ class LoopTimeBins(NamedTuple):
     in_report=True,
 )
 def _draw_loop_timing(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
-    """Draws histograms of how late the control loops began their periods, in us.
+    """Draws histograms of how late the control loops started their ticks, in us.
 
-    Further histograms show how long the computation of a period (tick) took.
+    Further histograms show how long the computation of a tick took.
 
     Args:
         log: Log of the run.
@@ -465,7 +465,7 @@ def _draw_histogram(axes: Axes, times_us: Ints, bins: LoopTimeBins, colour: str)
 
 
 def _title_histogram(axes: Axes, site: str, times_us: Ints, form: FigureSize) -> None:
-    """Writes the site and the percentiles of its times, shape (K,), above a histogram."""
+    """Adds a title with the site and percentiles of its times, shape (K,), to a histogram."""
     if not len(times_us):
         style.annotate_empty_panel(axes, f"no times of {site}")
         return

@@ -30,16 +30,16 @@ from ..plot_signals import reference_angles
 from .figure_entry import draws
 
 INSTANTS = 6
-"""Number of times at which the arms are drawn."""
+"""Number of moments at which the arms are drawn."""
 _NARROW_INSTANTS = 3
-"""Number of times in a figure that is as wide as one column of a paper."""
+"""Number of moments in a figure that is as wide as one column of a paper."""
 _PATH_POINTS = 400
-"""Largest number of points of the path of an end effector."""
+"""Maximum number of points on the path of an end effector."""
 _AZIMUTH = np.deg2rad(-50.0)
-"""Direction of view of chains: angle about the vertical, from the x axis of the base, in rad.
+"""Viewing direction for chains: angle about the vertical, from the x axis of the base, in rad.
 """
 _ELEVATION = np.deg2rad(22.0)
-"""Direction of view of chains: angle above the floor, in rad."""
+"""Viewing direction for chains: angle above the floor, in rad."""
 _SHADOW: dict[str, Any] = {
     "color": "#c9c9c9",
     "linewidth": 1.6,
@@ -54,12 +54,12 @@ _DESIRED: dict[str, Any] = {
 PictureBox = tuple[float, float, float, float]
 """Left, right, bottom and top of a picture."""
 _CORNERS_ON_PATH = np.array([0, 1, 3, 2, 0, 4, 5, 1, 5, 7, 3, 7, 6, 2, 6, 4])
-"""Numbers of a box's corners along a path that visits all of its edges.
+"""Corner numbers of a box along a path that visits all of its edges.
 
-The bits of a number state on which side of the box the corner lies, along x, y and z.
+The bits of a number state on which side of the box the corner lies along x, y and z.
 """
 _BOX_PATH = 0.5 - (_CORNERS_ON_PATH[:, np.newaxis] >> np.arange(3) & 1)
-"""The path as points of a box with sides of length 1 around the origin, shape (16, 3)."""
+"""The path along the edges of a unit cube centred at the origin, shape (16, 3)."""
 _BASE: dict[str, Any] = {
     "linestyle": "none",
     "marker": "s",
@@ -69,15 +69,15 @@ _BASE: dict[str, Any] = {
 
 
 class _ArmPose(NamedTuple):
-    """Pose of an arm at one time, as points in the plane of a picture.
+    """Pose of an arm at one moment, as points in the picture plane.
 
     Attributes:
-        actual: Base, joints and end effector, shape (L, 2), in m.
-        desired: The same points for the reference pose, shape (L, 2), in m.
-        path: Path of the end effector from the start of the run, shape (P, 2), in m.
-        shadow: Shadow of a chain on a floor at its base, with light from straight above, shape
-            (L, 2), in m. Planar arms have no shadow: shape (0, 2).
-        bodies: For each body that the arm can touch, its edges as a path, shape (16, 2), in m.
+        actual: Base, joints and end effector, in m, shape (L, 2).
+        desired: The same points for the reference pose, in m, shape (L, 2).
+        path: Path of the end effector from the start of the run, in m, shape (P, 2).
+        shadow: Shadow of a chain on a floor at its base, with light from straight above, in m,
+            shape (L, 2). Planar arms have no shadow: shape (0, 2).
+        bodies: For each body that the arm can touch, its edges as a path, in m, shape (16, 2).
     """
 
     actual: Array
@@ -295,9 +295,9 @@ def compute_pose_box_m(poses: Sequence[_ArmPose | None]) -> PictureBox:
 
 @draws("arms", "the arms at a few instants", in_report=True)
 def _draw_arms(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
-    """Draws the poses of all arms at a few times, with a row per site and a column per time.
+    """Draws the poses of all arms at a few moments, one row per site and one column per moment.
 
-    A reader sees at one glance how the arms moved, and how closely they followed each other.
+    The figure shows at a glance how the arms moved, and how closely they followed each other.
 
     Args:
         log: Log of the run.
@@ -343,7 +343,7 @@ def _draw_arms(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
 
 
 def _draw_pose(axes: Axes, pose: _ArmPose | None, colour: str) -> None:
-    """Draws a pose into a panel, or a note if `pose` is `None` for lack of a record."""
+    """Draws a pose in a panel, or a note if `pose` is `None` because there is no record."""
     axes.set_aspect("equal")
     if pose is None:
         style.annotate_empty_panel(axes, "no record")
@@ -410,13 +410,13 @@ def render_arms_svg(log: Log, bounds_m: PictureBox, factor: float) -> Markup:
 def _measure_picture(
     pose: _ArmPose | None, index: int, bounds: PictureBox, label: str
 ) -> dict[str, Any]:
-    """Returns the coordinates that the SVG template of a pose needs: lines, joints, view box.
+    """Returns the coordinates needed by the SVG template of a pose: lines, joints, view box.
 
-    The page of the report contains such a picture for each arm, at a few times.
+    The report page contains such a picture for each arm at a few moments.
 
     Args:
-        pose: The pose in units of the picture. `None` for a picture without an arm.
-        index: Index of the site, on which its colour depends.
+        pose: The pose in picture units. `None` for a picture without an arm.
+        index: Index of the site, which determines its colour.
         bounds: Left, right, bottom and top of the picture.
         label: Description of the picture for screen readers.
     """
@@ -450,5 +450,5 @@ def _measure_picture(
 
 
 def _format_points(points: Array) -> str:
-    """Returns points, shape (K, 2), as text for SVG, whose y axis points downwards."""
+    """Formats points, shape (K, 2), for SVG, whose y axis points downwards."""
     return " ".join(f"{x:.3f},{-y:.3f}" for x, y in points)

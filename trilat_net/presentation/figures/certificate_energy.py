@@ -63,9 +63,9 @@ _OBSERVED_PANELS = {
     "store": "stored (J)",
     "given": "given, taken (J)",
 }
-"""Label of the panel of each kind of declared energy.
+"""Panel label for each kind of declared energy.
 
-The panel "given" also shows the kind "taken", the energy that a law dissipated.
+The panel "given" also shows the kind "taken", the energy dissipated by a law.
 """
 
 
@@ -121,10 +121,10 @@ def draw_functional(
     in_report=True,
 )
 def _draw_certificate(log: Log, form: FigureSize) -> Figure:
-    """Draws the energy function V of the stability proof over the time of a run.
+    """Draws the energy function V of the stability proof over the time of a run, in J.
 
-    V must never rise without supplied energy. This function is called through the registry of
-    figures.
+    V must never rise unless energy is supplied. This function is called through the figure
+    registry.
     """
     own_laws = log.may_run_user_laws
     return draw_functional(log, Certificate.of_log(log, own_laws=own_laws), form)
@@ -184,14 +184,14 @@ def _has_declared_energies(log: Log) -> bool:
     in_report=True,
 )
 def _draw_observed(log: Log, form: FigureSize) -> Figure:
-    """Draws the declared energies of a log's control laws, for the registry of figures."""
+    """Draws the energies declared by a log's control laws, for the figure registry."""
     observed = ObservedEnergy.of_log(log, own_laws=log.may_run_user_laws)
     assert observed is not None
     return draw_observed_energy(log, observed, form)
 
 
 def _draw_line(balance: EnergyBalance, axes: Axes, values: Array, **options: Any) -> None:
-    """Draws values at the ticks of a balance, shape (T,)."""
+    """Plots values at the ticks of a balance, shape (T,)."""
     ticks = np.arange(len(balance.t_s))
     style.plot_decimated(axes, ticks, balance.t_s, values, **options)
 
@@ -208,7 +208,7 @@ def _add_panel_legend(axes: Axes, form: FigureSize) -> None:
 
 
 def _choose_legend_pt(form: FigureSize) -> float:
-    """Returns the type size of a legend inside a panel, in pt."""
+    """Returns the font size for a legend inside a panel, in pt."""
     is_uniform = form.small_pt == form.tick_pt
     return form.small_pt if is_uniform else form.small_pt + 0.5
 
@@ -216,8 +216,8 @@ def _choose_legend_pt(form: FigureSize) -> float:
 def _draw_total(axes: Axes, log: Log, certificate: Certificate, balance: EnergyBalance) -> None:
     """Draws the energy V of the stability proof, and the contribution of each arm.
 
-    If the weights of the arms that the paper states do not apply, V with these weights is drawn
-    as a dashed line for comparison.
+    If the arm weights given in the paper do not apply, V with these weights is drawn as a
+    dashed line for comparison.
     """
     _draw_line(balance, axes, balance.V, **_TOTAL)
     paper_balance = certificate.paper_balance
@@ -230,11 +230,10 @@ def _draw_total(axes: Axes, log: Log, certificate: Certificate, balance: EnergyB
 
 
 def _draw_parts(axes: Axes, balance: EnergyBalance, form: FigureSize) -> None:
-    """Draws the parts of the energy function V over time, in J.
+    """Draws the components of the energy function V over time, in J.
 
-    V is the energy function of the stability proof. Its parts are the kinetic energy, the
-    energies of the errors of parameters and positions, and the energy of messages that are in
-    transit.
+    These are the kinetic energy, the energies of the parameter and position errors, and the
+    energy of samples in transit.
     """
     for (name, values), dashes in zip(balance.parts.items(), style.DASHES, strict=True):
         _draw_line(
@@ -250,10 +249,9 @@ def _draw_parts(axes: Axes, balance: EnergyBalance, form: FigureSize) -> None:
 
 
 def _draw_work(axes: Axes, balance: EnergyBalance, form: FigureSize) -> None:
-    """Draws the energy that was dissipated in a run, and the work that supplied it, in J.
+    """Draws the energy dissipated in a run, and the work that supplied energy, in J.
 
-    The work of all links between sites is drawn as one line. Sources with negligible work are
-    left out.
+    The work of all links is drawn as a single line. Sources with negligible work are omitted.
     """
     dissipations = balance.dissipation.items()
     for (name, values), line_pattern in zip(dissipations, style.DASHES, strict=False):
@@ -282,11 +280,11 @@ def _draw_work(axes: Axes, balance: EnergyBalance, form: FigureSize) -> None:
 def _draw_residual(axes: Axes, balance: EnergyBalance, form: FigureSize) -> None:
     """Draws the residual of the energy balance, which shows whether the log fits the model.
 
-    The solid line is the residual: the change of the energy function V that neither dissipation
-    ("taken") nor the work on the arms ("given") explains. Part of the residual arises because
-    the control law is executed in ticks ("sampling"). The dotted line is the residual without
-    this part. The value axis is logarithmic, so that the residual can be compared with the
-    largest energy.
+    The solid line is the residual: the change of the energy function V that is explained
+    neither by dissipation ("taken") nor by work on the arms ("given"). Part of the residual is
+    caused by executing the control law in ticks ("sampling"). The dotted line is the residual
+    without this part. The value axis is logarithmic, so that the residual can be compared with
+    the largest energy.
 
     Args:
         axes: Panel of the figure, as Matplotlib axes.

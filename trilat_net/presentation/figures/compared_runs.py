@@ -24,22 +24,22 @@ from ..appearance import REPORT_SIZE, FigureSize
 from .joint_motion import add_joint_rows, choose_height_in
 
 _MOST_SETTINGS = 3
-"""Largest number of differing settings that the legend names for each run."""
+"""Maximum number of differing settings listed in the legend for each run."""
 _FIRST_ALPHA = 0.45
 """Opacity of the lines of the first run."""
 _LETTERS_PER_IN = 15.0
-"""Average number of letters of the legend per inch."""
+"""Average number of legend letters per inch."""
 
 
 class _ComparedSignal(NamedTuple):
-    """A quantity of the arms, such as the error, that a figure compares between runs.
+    """A quantity of the arms, such as the error, that a figure compares across runs.
 
     Attributes:
         name: Name for the labels of the value axes.
         find_unit: Function that returns the unit of the signal in a log.
         compute: Function that returns the signal of a site, shape (K, n).
         shares_poses: True if the columns are the coordinates that the sites exchange. In task
-            space these are axes of the end effectors instead of joints.
+            space, these are the axes of the end effectors instead of joints.
     """
 
     name: str
@@ -57,7 +57,7 @@ COMPARED_SIGNALS = {
         "torque", lambda _: "N m", site_signals.controller_torques
     ),
 }
-"""Signals that `draw_compared_runs` draws, by the names of the figures of one run."""
+"""Signals that `draw_compared_runs` can draw, keyed by the figure name for a single run."""
 
 
 def draw_compared_runs(
@@ -128,12 +128,12 @@ def draw_compared_runs(
 
 
 def _style_run(number: int, form: FigureSize) -> style.LineOptions:
-    """Returns the options of the lines of a run: dashes, width and opacity, without the colour.
+    """Returns the line options for a run: dash pattern, width and opacity, but no colour.
 
-    The first run is solid, wide and pale, so that dashed lines on top of it stay visible.
+    The first run is solid, wide and pale, so that dashed lines on top of it remain visible.
 
     Args:
-        number: Number of the run, from 0.
+        number: Index of the run, starting from 0.
         form: Size of the figure.
     """
     width_pt = 0.8 if form.narrow else 1.0

@@ -22,11 +22,12 @@ from ...log import Log
 from ..appearance import FigureSize
 
 Draw = Callable[[Log, FigureSize], Figure]
-"""Function that draws a figure of a log with a given size."""
+"""Function that draws a figure of a log at a given size."""
 Absent = Callable[[Log], str]
-"""Function that returns the reason why the figure of a log would be empty, or an empty text."""
+"""Function that returns the reason why the figure of a log would be empty, or an empty string.
+"""
 Drawing = TypeVar("Drawing", bound=Callable[..., Figure])
-"""Type of a decorated function, which the decorator `draws` keeps."""
+"""Type of a decorated function, which the decorator `draws` preserves."""
 
 
 class FigureEntry(NamedTuple):
@@ -64,7 +65,7 @@ _PAPER_ORDER = (
     "certificate", "observed_energy", "twins", "arms", "paths", "sample_age",
     "delay_distributions", "loop_timing",
 )  # fmt: skip
-"""Names of figures in the order of a paper. Figures that are not listed follow at the end."""
+"""Figure names in the order in which a paper shows them. Figures not listed here come last."""
 
 
 def draws(

@@ -39,11 +39,13 @@ _PROOF: dict[str, Any] = {
     "linestyle": (0, (5, 1.5, 1, 1.5)),
 }
 _MAX_SHOWN_PARAMETER = 2.5
-"""Upper end of the axis of Llewellyn's parameter. Differences between values far above 1 do not
-matter.
+"""Upper end of the axis of Llewellyn's parameter. Differences between values far above 1 are
+irrelevant.
 """
 _CROWDED_TICKS_HZ = (0.1, 1.0, 10.0)
-"""Axis ticks of a narrow panel. Labels at its ends would overlap those of the next panel."""
+"""Axis ticks of a narrow panel, without labels at the ends, which would overlap those of the
+next panel.
+"""
 
 
 def draw_port_impedance(ports: PortAnalysis, size: FigureSize = REPORT_SIZE) -> Figure:
@@ -96,10 +98,10 @@ def draw_port_impedance(ports: PortAnalysis, size: FigureSize = REPORT_SIZE) -> 
 
 
 def _list_impedance_entries(ports: PortAnalysis) -> list[tuple[str, dict[str, Any]]]:
-    """Returns the texts and line styles for the legend of a figure of impedances.
+    """Returns the labels and line styles for the legend of an impedance figure.
 
-    The impedance that an operator feels at one arm depends on another arm, which is free to
-    move or clamped.
+    The impedance that an operator feels at one arm depends on whether another arm is free or
+    clamped.
     """
     operator_sites = dict.fromkeys(response.operator_site for response in ports.transparency)
     entries: list[tuple[str, dict[str, Any]]] = [
@@ -115,13 +117,13 @@ def _list_impedance_entries(ports: PortAnalysis) -> list[tuple[str, dict[str, An
 
 
 def _plot_impedance(ports: PortAnalysis, joint: int, magnitude: Axes, phase: Axes) -> None:
-    """Draws the impedance that each operator feels along one joint, over frequency.
+    """Plots the impedance that each operator feels at one joint, over frequency.
 
     Each arm has two lines: the impedance while another arm is free, and while it is clamped.
 
     Args:
-        ports: Analysis of the ports, the places at which operators hold the arms.
-        joint: Number of the joint or axis, from 1.
+        ports: Analysis of the ports at which operators hold the arms.
+        joint: Number of the joint or axis, starting from 1.
         magnitude: Panel of the magnitude.
         phase: Panel of the phase.
     """
@@ -148,7 +150,7 @@ def _plot_impedance(ports: PortAnalysis, joint: int, magnitude: Axes, phase: Axe
 
 
 def _describe_ratios(ports: PortAnalysis, joint: int) -> str:
-    """Returns a line of a title with each site's ratio of clamped to free impedance, in dB."""
+    """Returns a title line with each site's ratio of clamped to free impedance, in dB."""
     ratios = [
         f"{response.operator_site} {response.ratio_db:+.1f} dB"
         for response in ports.transparency
@@ -204,7 +206,7 @@ def draw_port_passivity(ports: PortAnalysis, size: FigureSize = REPORT_SIZE) -> 
 
 
 def _list_passivity_entries(ports: PortAnalysis) -> list[tuple[str, dict[str, Any]]]:
-    """Returns the legend entries of the figure of passivity."""
+    """Returns the legend entries for the passivity figure."""
     noun = "axes" if ports.axes else "joints"
     entries = [(f"all {noun}", _ALL)]
     entries += [
@@ -217,7 +219,7 @@ def _list_passivity_entries(ports: PortAnalysis) -> list[tuple[str, dict[str, An
 
 
 def _style_joint(joint: int) -> dict[str, Any]:
-    """Returns the options of the line of a joint."""
+    """Returns the line options of a joint."""
     return {
         "color": SITE_COLOURS[joint % len(SITE_COLOURS)],
         "linestyle": style.DASHES[joint % len(style.DASHES)],
@@ -226,22 +228,22 @@ def _style_joint(joint: int) -> dict[str, Any]:
 
 
 def _plot_over_hz(axes: Axes, w_rad_s: Array, values: Array, **options: Any) -> None:
-    """Draws values over angular frequencies, both of shape (F,), on an axis in Hz."""
+    """Plots values over angular frequencies, both of shape (F,), on an axis in Hz."""
     axes.semilogx(_convert_to_hz(w_rad_s), values, **options)
 
 
 def _shade_failures(axes: Axes, bands: Iterable[tuple[float, float]]) -> None:
-    """Shades the bands of frequency, in Hz, in which a curve lies below its limit."""
+    """Shades the frequency bands, in Hz, in which a curve is below its limit."""
     for band in bands:
         axes.axvspan(*band, **_FAILS)
 
 
 def _plot_eigenvalues(ports: PortAnalysis, axes: Axes) -> None:
-    """Draws the smallest eigenvalue of Y + Y^H over frequency, per joint and for all joints.
+    """Plots the smallest eigenvalue of Y + Y^H over frequency, per joint and for all joints.
 
-    Y is the admittance matrix of the places at which operators hold the arms. Eigenvalues below
-    0 mean that the arms could supply energy to an operator. They are divided by their bound 2
-    |Y|.
+    Y is the admittance matrix of the ports at which operators hold the arms. Eigenvalues below
+    0 mean that the arms could supply energy to an operator. They are divided by their bound,
+    which is twice the norm of Y.
     """
     curves = [(passivity, _style_joint(joint)) for joint, passivity in ports.joints.items()]
     if ports.proof is not None:
@@ -257,7 +259,7 @@ def _plot_eigenvalues(ports: PortAnalysis, axes: Axes) -> None:
 
 
 def _plot_parameters(ports: PortAnalysis, axes: Axes) -> None:
-    """Draws Llewellyn's parameter of every joint, with the limit 1."""
+    """Plots Llewellyn's parameter of every joint, with the limit 1."""
     for two_port in ports.two_ports:
         line = _style_joint(two_port.joint)
         minima = two_port.minima
@@ -268,7 +270,7 @@ def _plot_parameters(ports: PortAnalysis, axes: Axes) -> None:
 
 
 def _plot_margin(ports: PortAnalysis, axes: Axes) -> None:
-    """Draws the smallest eigenvalue under the best weights, with the limit 0."""
+    """Plots the smallest eigenvalue under the best weights, with the limit 0."""
     minima = ports.absolute
     _plot_over_hz(axes, minima.w_rad_s, minima.values, **_ALL)
     _shade_failures(axes, minima.below)
@@ -334,17 +336,17 @@ def draw_root_map(analysis: LinearAnalysis) -> Figure:
 def _plot_roots(
     axes: Axes, roots: Sequence[complex], mark: str, colour: str, label: str
 ) -> None:
-    """Draws characteristic roots of a linear system in the complex plane.
+    """Plots characteristic roots of a linear system in the complex plane.
 
-    The system is unstable if any root has a positive real part. The conjugate of each complex
-    root is drawn too.
+    The system is unstable if any root has a positive real part. For each complex root, its
+    conjugate is plotted too.
 
     Args:
         axes: Panel of the figure, as Matplotlib axes.
-        roots: The roots, of which each complex pair is listed once.
-        mark: Marker of Matplotlib.
+        roots: The roots. Each complex pair is listed only once.
+        mark: Matplotlib marker.
         colour: Colour of the markers.
-        label: Text in the legend.
+        label: Label in the legend.
     """
     conjugates = [root.conjugate() for root in roots if root.imag]
     all_roots = np.array([*roots, *conjugates])
@@ -362,7 +364,7 @@ def _plot_roots(
 _MARKS = ("o", "s", "^", "v")
 _LOST: Any = {"marker": "x", "color": "#cc3311", "linestyle": "none", "markersize": 5.0}
 _TRANSPORT_STEP = 0.22
-"""Distance between the transports of one case, relative to the distance between cases."""
+"""Distance between the transports of a case, relative to the distance between cases."""
 
 
 def draw_network_delays(facts: Mapping[str, Any]) -> Figure:
@@ -413,7 +415,7 @@ def draw_network_delays(facts: Mapping[str, Any]) -> Figure:
 def _list_network_handles(
     rows: Sequence[Mapping[str, Any]], transports: Sequence[str]
 ) -> list[Line2D]:
-    """Returns the Matplotlib objects for the legend of network delays."""
+    """Returns the Matplotlib artists for the legend of network delays."""
     handles = []
     for number, name in enumerate(transports):
         handles.append(
@@ -432,16 +434,16 @@ def _list_network_handles(
 
 
 def _plot_case(axes: Axes, x: float, row: Mapping[str, Any], transport: int) -> None:
-    """Draws the delays of one transport in one case, and a cross if messages were lost.
+    """Plots the delays of one transport in one case, with a cross if messages were lost.
 
-    A mark is the median. A thick line leads from the median to the 99th percentile, and a thin
-    line to the largest delay.
+    The marker is the median. A thick line extends from the median to the 99th percentile, and a
+    thin line to the maximum.
 
     Args:
         axes: Panel of the figure, as Matplotlib axes.
         x: Position along the axis of cases.
         row: Row of the benchmark.
-        transport: Number of the transport, on which its colour and its mark depend.
+        transport: Index of the transport, which determines its colour and marker.
     """
     times_us = row["one_way_us"]
     if times_us is not None:  # None if all messages were lost
@@ -459,7 +461,7 @@ def _plot_case(axes: Axes, x: float, row: Mapping[str, Any], transport: int) -> 
 
 
 def _plot_bounds(axes: Axes, facts: Mapping[str, Any]) -> None:
-    """Draws horizontal lines at the times with which the delays are to be compared, in ms.
+    """Draws horizontal lines at the times with which the delays should be compared, in ms.
 
     These are the tick period of the scenario, the time for which its links hold samples, and
     the ends of intervals of stable delays: of the first interval, and of those that contain a
@@ -504,7 +506,7 @@ _RUN_MARKS = {
     False: ("x", "run grows"),
     None: ("s", "run undecided"),
 }
-"""Mark and label of a run by `stable`."""
+"""Marker and label of a run, keyed by `stable`."""
 
 
 def draw_arm_gains(facts: Mapping[str, Any]) -> Figure:

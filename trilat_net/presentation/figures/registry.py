@@ -230,11 +230,11 @@ def _write(
     does not leave an incomplete set of files.
 
     Args:
-        drawings: Functions that draw the figures, by the names of the files.
-        folder: Folder of the files. It is created if it does not exist.
+        drawings: Mapping from file name to the function that draws the figure.
+        folder: Folder for the files. Created if it does not exist.
         form: Size of the figures.
-        formats: Formats of the files, of `FIGURE_FORMATS`.
-        progress: Function that is called with the number of drawn figures and of all figures.
+        formats: File formats, from `FIGURE_FORMATS`.
+        progress: Function that is called with the number of drawn figures and the total number.
         force: True to overwrite existing files.
 
     Returns:
@@ -268,7 +268,7 @@ def _write(
 
 
 def _find_figure(log: Log, name: str) -> FigureEntry:
-    """Finds the figure with the name that a user gave.
+    """Looks up a figure by the name given by the user.
 
     Args:
         log: Log from which the figure will be drawn.
