@@ -160,7 +160,7 @@ def _describe_basis(certificate: Certificate) -> str:
     if decision.stability is not Stability.OPEN:
         return f"{meaning} – {decision.rests_on}."
 
-    # The judgement is open. The first reason is stated, and the others are counted.
+    # The verdict is open. The first reason is stated, and the others are counted.
     reason, *other_reasons = [text for text in (decision.rests_on, *decision.reasons) if text]
     count_text = (
         f" ({count_nouns(len(other_reasons), 'more reason')} below)" if other_reasons else ""
@@ -206,7 +206,7 @@ def _explain_end(log: Log, certificate: Certificate) -> str:
     if end.behaviour is EndBehaviour.DIVERGED:
         text = f"The record ends soon after {clause}."
 
-    # Why the end and the judgement are both true.
+    # Why the end does not contradict the verdict.
     if is_stable and end.stability is Stability.NOT_STABLE:
         return f"{text} The proof and the pushes show that such motion dies away."
     if is_stable and error_remains:

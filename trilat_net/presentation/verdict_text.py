@@ -134,7 +134,7 @@ def _describe_course(course: facts.FunctionalCourse) -> str:
 
 
 def _describe_failed(names: Sequence[str]) -> str:
-    """Returns a sentence that the theorem does not apply, listing the failed requirements."""
+    """Returns a sentence stating why the theorem does not apply: its failed requirements."""
     premises = [f"{name} {REQUIREMENTS[name]}" for name in names]
     return f"the theorem does not apply (premises that fail: {'; '.join(premises)})"
 
