@@ -1,12 +1,12 @@
 """Defines the possible findings about the energy function V of a run, one class each.
 
 V is the energy function of the stability proof, which must not rise by itself. For example,
-`FunctionalRise` says when V rose and by how much, and `NoFunctional` for which arms V does not
-exist. `stability_certificate` selects the finding, and the package `presentation` writes the
+`FunctionalRise` states when V rose and by how much, and `NoFunctional` for which arms V does
+not exist. `stability_certificate` selects the finding, and the package `presentation` words the
 sentence about it.
 
 Invariant:
-    - A finding contains only names and numbers, no sentence.
+    - A finding contains only names and numeric values, never sentences.
     - Each verdict has exactly one finding. An empty collection means that nothing of this kind
       was found in the run.
 """
@@ -22,7 +22,7 @@ from .premise_quantities import MissingFunctional, PremiseQuantities
 class StabilityFinding(Enum):
     """Possible results of examining V, the energy function of the stability proof, over a run.
 
-    In JSON output, the values of `verdict` are the names of the members in lower case.
+    In JSON output, the value of `verdict` is the name of a member in lower case.
     """
 
     COVERED = auto()
@@ -42,15 +42,15 @@ class StabilityFinding(Enum):
 class FunctionalRise(NamedTuple):
     """Largest rise of the energy function V without energy supplied from outside.
 
-    V is the total energy of the arms in the stability proof. The work of operators and walls is
-    subtracted from it. What remains must not rise.
+    V is the total energy of the arms in the stability proof, minus the work of operators and
+    walls. What remains must not rise.
 
     Attributes:
-        from_s: Time of the minimum of V before the rise, in s.
-        at_s: Time of the highest V, in s.
+        from_s: When V was at its minimum before the rise, in s.
+        at_s: When V was highest, in s.
         amount: Size of the rise, in J.
-        causes: Energy that each source supplied during the rise, in J, largest first. Only
-            sources of more than 5 % of the rise are listed.
+        causes: Energy that each source supplied during the rise, in J, in descending order.
+            Only sources of more than 5 % of the rise are listed.
     """
 
     from_s: float
@@ -62,11 +62,12 @@ class FunctionalRise(NamedTuple):
 class UnsuppliedGrowth(NamedTuple):
     """Finding that the energy function V grew at the end of a run without supplied energy.
 
-    V belongs to the stability proof, and must not rise unless an operator or wall does work.
+    V belongs to the stability proof and must not rise unless an operator or wall does work.
 
     Attributes:
         energy_j: Size of the growth, in J.
-        from_s: Time from which V rises, in s. `None` if V is compared with its beginning.
+        from_s: Time from which V rises, in s, or `None` if V is compared with its initial
+            value.
     """
 
     energy_j: float
@@ -74,27 +75,27 @@ class UnsuppliedGrowth(NamedTuple):
 
     @property
     def text(self) -> str:
-        """The finding as a sentence for the user, which the package `presentation` writes."""
+        """The finding as a sentence for the user, worded by the package `presentation`."""
         return str(find_hook("describe a finding")(self))
 
 
 class NoFunctional(NamedTuple):
     """Finding that the energy function V does not exist for some arms.
 
-    One reason is the control law, because V exists only for certain laws. Without V, the run is
-    judged by other evidence.
+    One possible reason is the control law, because V exists only for certain laws. Without V,
+    the run is judged from other evidence.
 
     Attributes:
-        missing: Sites of these arms, grouped by the reason.
+        missing: Sites of these arms, grouped by reason.
     """
 
     missing: tuple[MissingFunctional, ...]
 
 
 class RecordGap(Enum):
-    """Finding that records are missing, so the energy function V cannot be computed.
+    """Finding that the energy function V cannot be computed because records are missing.
 
-    V, the energy of the stability proof, exists for the control laws of this run.
+    V, the energy in the stability proof, does exist for the control laws of this run.
     """
 
     NO_COMMON_TIME = auto()
@@ -106,17 +107,17 @@ class RecordGap(Enum):
 class UnclosedBalance(NamedTuple):
     """Finding that the energy of an arm changed by more than the known causes explain.
 
-    The energies of a run that obeys the equations of the log add up. If the energies do not add
-    up, the log or the simulation is wrong, or the control period is too long.
+    If a run obeys the equations stated in the log, its energies balance. If they do not, the
+    log or the simulation is wrong, or the tick period is too long.
 
     Attributes:
         site: Site with the largest error.
-        from_s: Time from which the energy does not add up, in s.
+        from_s: Time from which the energies do not balance, in s.
         error_j: Largest error, in J.
         scale_j: Largest energy of the run, in J.
-        external: External arms, if only these are concerned. Empty if the site is simulated.
-        is_certain: True if the records are certainly false. Otherwise a tick period that is
-            too long for the gains may be the cause.
+        external: External arms, if only these are affected. Empty if the site is simulated.
+        is_certain: True if the records are certainly false. Otherwise, the cause may be a tick
+            period that is too long for the gains.
     """
 
     site: str
@@ -130,12 +131,12 @@ class UnclosedBalance(NamedTuple):
 class WrongTorque(NamedTuple):
     """Finding that recorded torques of an arm do not follow from its control law, Eq. (13).
 
-    The log is then inconsistent, for example because it was changed or the arm ran a different
+    The log is then inconsistent, for example because it was modified or the arm ran a different
     law.
 
     Attributes:
-        site: Name of the site, the process that controls the arm.
-        from_s: Time from which they differ, in s.
+        site: Name of the site.
+        from_s: Time from which the torques differ, in s.
         error_nm: Largest difference, in N m.
     """
 
@@ -145,7 +146,7 @@ class WrongTorque(NamedTuple):
 
 
 class AmbiguousWeights(NamedTuple):
-    """Finding that V is not unique, because its weights beta are not.
+    """Finding that V is not unique because its weights beta are not.
 
     V is the weighted sum of the energies of all arms. The weights are unique if every arm
     follows every other arm, directly or through further arms.
@@ -164,7 +165,7 @@ class CoarseEnergies(NamedTuple):
     V is the energy function of the stability proof, which must never rise.
 
     Attributes:
-        tolerance_j: Size that a rise must exceed to count, in J.
+        tolerance_j: Threshold that a rise must exceed to count, in J.
         scale_j: Largest energy of the run, in J.
     """
 
@@ -173,20 +174,20 @@ class CoarseEnergies(NamedTuple):
 
 
 class FunctionalCourse(NamedTuple):
-    """The energy function V during a run: first, last and largest value, and largest rise.
+    """First, last and largest value of the energy function V in a run, and its largest rise.
 
-    V is the energy of the stability proof. V must never rise without supplied energy.
+    V is the energy in the stability proof, and must never rise without supplied energy.
 
     Attributes:
-        failed: Names of the premises that fail. The theorem does not apply if there are any.
-        undecided: Quantities of the premises on which the log does not decide.
-        external: Names of operators and environments that did work, as in "hands".
+        failed: Names of the premises that fail. If there are any, the theorem does not apply.
+        undecided: Quantities of the premises that the log does not decide.
+        external: Operators and environments that did work, named as in "hands".
         from_s: First time at which V is known, in s.
         to_s: Last time at which V is known, in s.
-        first_j: V at the first time, in J. 0 if V is a rounding error.
-        last_j: V at the last time, in J. 0 if V is a rounding error.
+        first_j: V at the first time, in J. 0 if V is only a rounding error.
+        last_j: V at the last time, in J. 0 if V is only a rounding error.
         largest_j: Largest V, in J.
-        rise: Largest rise of V without supplied energy. `None` if V did not rise.
+        rise: Largest rise of V without supplied energy, or `None` if V did not rise.
     """
 
     failed: tuple[str, ...]
@@ -219,10 +220,10 @@ class StabilityVerdict(NamedTuple):
     hold for the run.
 
     Attributes:
-        finding: The finding, such as that V never rose.
-        facts: The numbers behind the finding.
-        rise: The largest rise of V beyond the tolerance. `None` if V did not rise.
-        tolerance: Size that a rise must exceed to count, in J.
+        finding: The finding, for example that V never rose.
+        facts: The data behind the finding.
+        rise: The largest rise of V beyond the tolerance, or `None` if V did not rise.
+        tolerance: Threshold that a rise must exceed to count, in J.
     """
 
     finding: StabilityFinding
@@ -232,25 +233,24 @@ class StabilityVerdict(NamedTuple):
 
     @property
     def text(self) -> str:
-        """The finding as a sentence for the user, such as that V never rose.
+        """The finding as a sentence for the user, for example that V never rose.
 
-        The package `presentation` writes it. V is the energy function of the stability proof.
+        V is the energy function of the stability proof. The package `presentation` words the
+        sentence.
         """
         return str(find_hook("describe a finding")(self))
 
 
 class Evidence(NamedTuple):
-    """The records on which a stability certificate is based, and whether they suffice.
-
-    A site, the process that runs one arm, stores a record in every tick (control period).
+    """The records on which a stability certificate is based, and whether they are sufficient.
 
     Attributes:
         coverage: Recorded ticks and expected ticks of every site.
         functional_share: Fraction of the tick periods in which the energy of the stability
-            proof is known from records. Periods in which a site was absent do not count. `None`
-            if this energy is not judged.
-        min_coverage: Least fraction that suffices, for the ticks and for the periods.
-        integrity: Whether the log is unchanged since it was written.
+            proof is known from records, excluding periods in which a site was absent. `None` if
+            this energy is not judged.
+        min_coverage: Smallest sufficient fraction, for both ticks and periods.
+        integrity: Whether the log is unmodified since it was written.
         unmet: Sites that did not react to the other sites, because the run is a repetition in
             which their motion was copied from an earlier run.
     """
@@ -263,9 +263,9 @@ class Evidence(NamedTuple):
 
     @property
     def doubts(self) -> "tuple[EvidenceDoubt, ...]":
-        """Reasons why the records do not suffice to call the run stable. Empty if they suffice.
+        """Reasons why the records are not sufficient to call the run stable, if any.
 
-        Examples are a log that was changed after the run, or too many missing records.
+        Examples are a log that was modified after the run, or too many missing records.
         """
         doubts = []
         if not self.integrity.passed:
@@ -281,26 +281,26 @@ class Evidence(NamedTuple):
 
     @property
     def reasons(self) -> list[str]:
-        """Sentences that say why the log does not suffice to call the run stable.
+        """Sentences on why the log is not sufficient to call the run stable, one per doubt.
 
-        There is one for each doubt. The package `presentation` writes them.
+        The package `presentation` words them.
         """
         return list(find_hook("list the sentences of a finding")(self))
 
     @property
     def text(self) -> str:
-        """A sentence for the user: how many records exist, and whether the log is unchanged.
+        """A sentence for the user on how many records exist and whether the log is unmodified.
 
-        The certificate prints this sentence for every run, even if the records suffice.
+        The certificate prints this sentence for every run, even if the records are sufficient.
         """
         return str(find_hook("describe a finding")(self))
 
     def to_json(self) -> dict[str, Any]:
-        """Returns the extent and authenticity of the records as plain values.
+        """Returns the completeness and authenticity of the records as plain values.
 
         The keys are those of `trilat certify --json`. For example, "coverage" is the smallest
-        share of a site's ticks that have a record, from 0 to 1, and "integrity" states whether
-        the log is unchanged.
+        fraction of a site's ticks that have a record, from 0 to 1, and "integrity" states
+        whether the log is unmodified.
         """
         return {
             "coverage": self.coverage.share,
@@ -313,14 +313,14 @@ class Evidence(NamedTuple):
 
 
 class EvidenceDoubt(NamedTuple):
-    """Finding that records do not suffice to call a run stable.
+    """Finding that the records are not sufficient to call a run stable.
 
     Attributes:
-        name: Name of the finding. "changed log": the log was changed after it was written.
+        name: Name of the finding. "changed log": the log was modified after it was written.
             "missing records": too few ticks of a site are recorded. "missing periods": the
             energy function V is known in too few tick periods. "copied sites": the motion of
             some sites was copied from an earlier run.
-        evidence: The evidence on the records, with the numbers behind the finding.
+        evidence: The evidence on the records, including the values behind the finding.
     """
 
     name: Literal["changed log", "missing records", "missing periods", "copied sites"]
@@ -328,5 +328,5 @@ class EvidenceDoubt(NamedTuple):
 
     @property
     def text(self) -> str:
-        """The finding as a sentence for the user, which the package `presentation` writes."""
+        """The finding as a sentence for the user, worded by the package `presentation`."""
         return str(find_hook("describe a finding")(self))
