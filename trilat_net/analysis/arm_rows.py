@@ -526,7 +526,7 @@ class PlanarArmRows(NamedTuple):
     def least_inertia_kg_m2(self) -> float:
         """A lower bound on the eigenvalues of the inertia matrix M(q) for all poses q.
 
-        The least eigenvalue occurs at cos q2 = 1 or -1.
+        The smallest eigenvalue occurs at cos q2 = 1 or -1.
         """
         poses = np.array([[0.0, 0.0], [0.0, np.pi]])
         extreme_poses = PlacedArm(0.0, self.lengths_m, poses)

@@ -548,21 +548,8 @@ class SiteMotion:
     def compute_dissipation(self) -> "dict[str, Increment]":
         """Computes the energy that the controller of a site dissipates in each tick period.
 
-        The result has these kinds of energy:
-        - damping: the work of the damping and of the robust torque, which both act against the
-          filtered error r.
-        - disagreement: half the squared difference between the velocity of the site and the
-          delayed velocity of each peer, weighted with the dominance factor of the peer and the
-          gain Kd.
-        - friction, if the joints have any: the work r'(friction(qd) - friction(qd - r)), with
-          the joint velocities qd.
-        - open axes: the energy that the site gives to others along the axes of space that not
-          all sites follow. It is missing if all sites follow along all axes.
-
-        Returns:
-            A mapping from kind to energy.
-
         The kinds of energy are:
+
         - damping: the work of the damping and of the robust torque, which both oppose the
           filtered error r.
         - disagreement: half the squared difference between the velocity of the site and the
@@ -572,6 +559,9 @@ class SiteMotion:
           the joint velocities qd.
         - open axes: the energy that the site passes to others along axes that not all sites
           follow. It is missing if all sites follow all axes.
+
+        Returns:
+            A mapping from kind to energy.
         """
         records = self.records
         c = self.constants

@@ -165,7 +165,7 @@ class LogMetrics(Result):
     @staticmethod
     @np.errstate(over="ignore", invalid="ignore", divide="ignore")  # as in of_log
     def measure_run(log: Log, keys: Iterable[str]) -> dict[str, Metric]:
-        """Computes only some quantities of a whole run, which is faster than computing all.
+        """Computes only some quantities of a run, which is faster than computing all of them.
 
         Commands use this to compare a few quantities across many runs, for example the points
         of a sweep.
