@@ -1,7 +1,7 @@
 """Defines the evidence on the stability of a run, and the decision based on it.
 
-`stability_decision` decides. The package `presentation` words the sentences about the basis of
-a decision and the reasons against a better one.
+`stability_decision` decides. The package `presentation` generates the sentences about the basis
+of a decision and the reasons against a better one.
 
 Invariant:
     - A decision and its evidence contain only names and numeric values, apart from phrases that
@@ -127,7 +127,7 @@ class LoopRoots(NamedTuple):
     def text(self) -> str:
         """A sentence for the user on the roots, or on why there are none.
 
-        The package `presentation` words it.
+        The package `presentation` generates it.
         """
         return str(find_hook("describe a finding")(self))
 
@@ -135,7 +135,7 @@ class LoopRoots(NamedTuple):
     def leaves_out(self) -> str:
         """A phrase on what the linearised loop omits. Empty if it includes everything.
 
-        The package `presentation` words it.
+        The package `presentation` generates it.
         """
         return str(find_hook("describe what roots leave out")(self))
 
@@ -284,7 +284,7 @@ class StabilityDecision(NamedTuple):
     def rests_on(self) -> str:
         """A phrase for the user that names the evidence for the decision. May be empty.
 
-        The package `presentation` words it.
+        The package `presentation` generates it.
         """
         return str(find_hook("describe a finding")(self))
 
@@ -292,7 +292,7 @@ class StabilityDecision(NamedTuple):
     def reasons(self) -> tuple[str, ...]:
         """Sentences on the reasons that prevent a better decision. Empty if the run is stable.
 
-        The package `presentation` words them.
+        The package `presentation` generates them.
         """
         return tuple(find_hook("list the sentences of a finding")(self))
 

@@ -233,7 +233,7 @@ class RunEnd(NamedTuple):
         """A sentence for the user on how the motion ends, with the values that show it.
 
         The sentence also states the reasons why the run cannot be called stable. The package
-        `presentation` words it.
+        `presentation` generates it.
         """
         return str(find_hook("describe a finding")(self))
 
@@ -241,7 +241,7 @@ class RunEnd(NamedTuple):
     def reasons(self) -> tuple[str, ...]:
         """Sentences on why the stability of the run remains open, one per doubt.
 
-        Empty if the stability is decided. The package `presentation` words the sentences.
+        Empty if the stability is decided. The package `presentation` generates the sentences.
         """
         return tuple(find_hook("list the sentences of a finding")(self))
 

@@ -13,7 +13,7 @@ limits. The circumstances are:
 
 Invariant:
     - Each named arm comes with a number that shows the circumstance.
-    - The package `presentation` words one remark for each circumstance that occurred.
+    - The package `presentation` generates one remark for each circumstance that occurred.
 """
 
 from collections.abc import Mapping
@@ -101,7 +101,7 @@ class RunCircumstances(NamedTuple):
         """Sentences for the user, one per circumstance that occurred, without a full stop.
 
         An example is "m1 and m2 were at their torque limit for 0.56 s and 0.43 s". The package
-        `presentation` words them.
+        `presentation` generates them.
         """
         return tuple(find_hook("list the sentences of a finding")(self))
 

@@ -3,8 +3,8 @@
 A condition of the theorem is called a premise. For example, the premise "the delays are
 constant" is judged from `DelayQuantities`, which contains the delays of the network links.
 `premises` and `observed_energy` create these objects from the log of a run. The package
-`presentation` words the sentences about them, so the wording can be changed without touching
-the analysis.
+`presentation` generates the sentences about them, so the wording can be changed without
+touching the analysis.
 
 Invariant:
     - An empty collection means that nothing of this kind was found in the run.
@@ -578,7 +578,7 @@ class Premise(NamedTuple):
         """A sentence for the user on what the log shows about the condition.
 
         For constant delays, for example, the sentence names the links whose delays varied. The
-        package `presentation` words it from the values in `quantities`.
+        package `presentation` generates it from the values in `quantities`.
         """
         return str(find_hook("describe a premise")(self.quantities))
 

@@ -16,7 +16,7 @@ The module also finds time spans in which records are missing.
 
 Invariant:
     - A premise holds, fails, or cannot be decided, and always contains the quantities that show
-      which. The package `presentation` words the sentences.
+      which. The package `presentation` generates the sentences.
     - Missing information never makes a run stable. The verdict stays open if too many records
       are missing, or if the run was repeated with the recorded motion of some arms.
     - A log that was modified after it was written does not pass.

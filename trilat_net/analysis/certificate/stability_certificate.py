@@ -16,7 +16,7 @@ Invariant:
     - The certificate names every question that a log cannot answer. If V does not exist, only
       the end of the run decides.
     - Keys of the JSON output end in their unit, and unknown values are null.
-    - The package `presentation` words every sentence on request.
+    - The package `presentation` generates every sentence on request.
 """
 
 from collections.abc import Collection, Mapping
@@ -317,7 +317,7 @@ class Certificate(Result):
         """Returns the verdict and its basis as one line for people.
 
         An example is "stable: converged; rests on: exact roots, slowest -0.832 /s". The package
-        `presentation` words the line.
+        `presentation` generates the line.
         """
         return str(find_hook("head a certificate")(self))
 

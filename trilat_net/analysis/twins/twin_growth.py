@@ -342,7 +342,7 @@ class TwinGrowth(NamedTuple):
         The sentence describes the push that grows most or decays most slowly. If the arms
         departed from rest by themselves, the sentence describes that motion instead. If the run
         was not repeated with pushes, the sentence states the reason. The package `presentation`
-        words it.
+        generates it.
         """
         return str(find_hook("describe a finding")(self))
 
