@@ -186,7 +186,7 @@ class RunEnd(NamedTuple):
         frequency_hz: Frequency of a bounded oscillation, in Hz, or `None` if there is none.
         missing_sites: Sites without any record, which leave the run undecided.
         error_unit: Unit of |e|: "rad", or "m" if the sites follow positions in task space.
-        counts_from_s: Time from which the run is considered, in s. The judged part is the
+        counts_from_s: Only the run after this time is considered, in s. The judged part is the
             second half of the time after it.
         quiet_from_s: Time from which no operator acts and the control loop does not change, in
             s.

@@ -85,7 +85,7 @@ class JointError(NamedTuple):
 
         Args:
             site_log: Log of the site.
-            from_s: Time from which records are considered, in s.
+            from_s: Only records after this time are considered, in s.
 
         Returns:
             The error, or `None` if no record has a finite error.

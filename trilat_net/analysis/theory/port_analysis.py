@@ -249,7 +249,7 @@ class PortAnalysis(NamedTuple):
         The two-ports of a group have the same sites, and the same third site clamped (or none).
 
         Args:
-            by_joint: True to also group by joint.
+            by_joint: True to also separate the joints.
         """
         groups: dict[tuple[object, ...], list[_TwoPort]] = {}
         for two_port in self.two_ports:

@@ -420,8 +420,8 @@ class TwinGrowth(NamedTuple):
         Args:
             scenario: The scenario.
             twins: The twins.
-            counts_from_s: Time from which the run is considered, in s. The second half of the
-                time after it is judged.
+            counts_from_s: Only the run after this time is considered, in s. The second half of
+                the time after it is judged.
             quiet_from_s: Time after which no operator acts on the run and its control loop does
                 not change, in s. Departures from rest are searched for after this time.
         """
