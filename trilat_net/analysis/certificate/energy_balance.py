@@ -59,10 +59,10 @@ class SiteEnergy:
     Attributes:
         motion: Motion of the site, from which its energies are computed.
         parts: The values of V_i, split into its parts.
-        dissipation: Dissipated energy in each period, by kind, such as damping.
+        dissipation: Dissipated energy in each period, keyed by kind, such as damping.
         transfer: Energy that the site passes to its followers in each period, minus the energy
             that it receives from the sites that it follows.
-        work: Work on the site in each period, by source, such as the operator.
+        work: Work on the site in each period, keyed by source, such as the operator.
         sampling: Work in each period caused by executing the continuous control law only once
             per tick.
     """
@@ -350,8 +350,8 @@ class EnergyBalance:
         beta: Weights of the N sites over time, shape (T, N).
         sites: beta_i V_i, keyed by site.
         parts: The named parts of V, each summed over the sites.
-        dissipation: Dissipated energy, by kind.
-        work: Work, by source.
+        dissipation: Dissipated energy, keyed by kind.
+        work: Work, keyed by source.
         sampling: Work caused by executing the law in ticks. It is not part of the balance (see
             `unexplained`).
         transfer: Transferred energy that the weights do not cancel. 0 if the weights are

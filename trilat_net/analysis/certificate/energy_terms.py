@@ -84,8 +84,8 @@ class SiteConstants(NamedTuple):
         low: Lower limits of the estimates.
         high: Upper limits of the estimates.
         tau_limit: Largest torque of a joint, in N m, shape () or (n,).
-        axes: For each coordinate of the task, 1 if the site follows along it, else 0. Lambda
-            and Kd are then 0 too. Empty in joint space.
+        axes: For each coordinate of the task, 1 if the site follows along it, else 0. In the
+            latter case, Lambda and Kd are also 0. Empty in joint space.
         rho: Largest robust torque of each joint, an additional torque against r, in N m. 0 if
             the law has none.
         width: Value of r at which the robust torque is 0.71 of the largest, in rad/s.
@@ -247,7 +247,7 @@ class SiteMotion:
         dominance: Dominance factors of the site.
         peers: Motion of the peers as received by the site, in the order of the dominance
             factors.
-        torque: External torque on the arm, by source.
+        torque: External torque on the arm, divided into operator and environment.
         scheme: Whether the controller holds the torque of a tick until the next tick, or
             extrapolates it.
         common: 1 for each coordinate that all sites follow, and 0 for the others. Empty if all
