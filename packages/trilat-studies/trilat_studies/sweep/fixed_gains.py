@@ -1,12 +1,12 @@
 """Lists the gains that a parameter sweep did not vary, as a note for its figures.
 
-A stability map over two parameters also depends on all gains that were the same in every run.
-Without these gains, the map could not be reproduced. An entry of the list is, for example, "p_d
-of s: K 10, gravity 1".
+A stability map over two parameters also depends on all the gains that were the same in every
+run, and could not be reproduced without them. A typical entry of the list is "p_d of s: K 10,
+gravity 1".
 
 Invariant:
-    - A gain is named unless an axis of the sweep changes it for every arm. The defaults of a
-      user's law are named too.
+    - A gain is listed unless an axis of the sweep changes it for every arm. The defaults of a
+      user's law are listed too.
 """
 
 from collections.abc import Iterator
@@ -22,13 +22,13 @@ FAIR_COMPARISON = "to compare laws at their best gains, use: trilat compare --tu
 
 
 def describe_fixed_gains(plan: SweepPlan) -> list[str]:
-    """Lists the gains that a sweep did not vary, but on which its results also depend.
+    """Lists the gains that affect the results of a sweep but were not varied.
 
-    An entry is a text such as "p_d of s: K 10, gravity 1". Sites with the same law and the same
-    gains share a string. A string that applies to all sites names no site.
+    A typical entry is "p_d of s: K 10, gravity 1". Sites with the same law and gains share one
+    entry. An entry that applies to all sites does not name a site.
 
     Args:
-        plan: The sweep: its scenario, axes, control laws and seeds.
+        plan: The sweep.
     """
     texts = list[str]()
     first_values = [axis.override(0) for axis in plan.axes]
