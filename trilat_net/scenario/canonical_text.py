@@ -1,10 +1,9 @@
-"""Writes a complete scenario as a TOML text in a unique (canonical) form.
+"""Writes a complete scenario as TOML in canonical form.
 
-A scenario is the description of an experiment. The SHA-256 hash of its canonical text
-identifies the experiment.
+The SHA-256 hash of the canonical text identifies the experiment.
 
 Invariant:
-    - Keys without effect are left out, so that they do not change the hash of a scenario.
+    - Keys that have no effect are omitted, so they do not change the hash of a scenario.
 """
 
 import re
@@ -34,10 +33,11 @@ _NUMBER_LIST = re.compile(r"\[\n(?:    [-+.\de]+,\n)+\]")
 
 
 def write_canonical_text(tables: dict[str, Any]) -> str:
-    """Returns a complete scenario as a TOML text in its canonical form.
+    """Formats a complete scenario as TOML in canonical form.
 
     Args:
-        tables: All keys of the scenario as nested tables. Keys without effect are removed.
+        tables: All keys of the scenario as nested tables. Keys that have no effect are omitted
+            from the text.
     """
     descriptions = {key: tables.pop(key) for key in ("name", "title", "about", "assumed")}
     descriptions = {key: value for key, value in descriptions.items() if value}

@@ -1,18 +1,17 @@
-"""Defines what the delay models of all network links have in common: loss, duplicates, outages.
+"""Common base of all delay models of network links, including loss, duplication and outages.
 
-A link carries the state of one arm to another arm. Its delay model computes how long each
-message takes, for example "uniform between 10 ms and 20 ms". Each model is one class in a file
-of this folder. There is no list of models: to add one, add a file.
+A delay model computes how long each message takes, for example "uniform between 10 ms and 20
+ms". Each model is a class in its own file in this folder; adding a file adds a model.
 
-A model that the simulation kernel computes itself names a `DelayKind`. Any other model has its
-own function, which is compiled.
+A model that is built into the simulation kernel names its `DelayKind`. Other models define a
+function of their own, which is compiled.
 
 Invariant:
     - Each model states the mean and the standard deviation of its delay in closed form. The
       kernel draws from exactly the distribution that has these moments.
-    - The loss of samples is described by two measurable quantities: the fraction of lost
-      samples and the mean length of bursts. The parameters of the two-state Markov chain that
-      draws the losses follow from them in closed form.
+    - Sample loss is described by two measurable quantities: the fraction of lost samples and
+      the mean burst length. The parameters of the two-state Markov chain that draws the losses
+      are derived from them in closed form.
     - The name of a key ends in its unit.
 """
 
@@ -55,10 +54,9 @@ class _DelayMoments(NamedTuple):
 
 
 def ms_to_us(milliseconds: float) -> int:
-    """Converts a time in milliseconds to whole microseconds.
+    """Converts a time in milliseconds to microseconds, rounded to an integer.
 
-    Delays are rounded, because the compiled simulation must give the same bits on every
-    machine.
+    Integer delays make the compiled simulation reproduce the same bits on every machine.
     """
     return round(milliseconds * 1_000)
 
@@ -92,24 +90,22 @@ class _LossChain(NamedTuple):
 
 
 class LinkBase(Frozen, frozen=True, tag_field="model", omit_defaults=True):
-    """Network link from one arm's process to another's, with everything except the delay.
+    """Settings of a network link between two sites, apart from its delay.
 
-    Each process sends its state once per control period, as a sample. The link states how many
-    samples are lost, duplicated or reordered. A subclass defines the delay by overriding the
-    methods whose names begin with an underscore.
+    They specify how many samples are lost, duplicated or reordered. Subclasses define the delay
+    by overriding the methods whose names begin with an underscore.
 
     Attributes:
-        loss: Fraction of samples that are lost in the long run.
-        loss_burst: Mean number of consecutive lost samples. 0 means that losses are
-            independent.
-        loss_bad: Fraction of the samples of a burst that are lost. Below 1, bursts have gaps.
-        duplicate: Fraction of samples that arrive twice. The copy has its own delay.
-        outages_s: Intervals in which all samples are lost, in s. A sample belongs to an
-            interval by its send time.
-        order: "newest": A newer sample replaces an older one that arrives later. "in_order": A
-            sample does not overtake an older one.
-        playout_ms: Shortest time for which every sample is held, in ms. Delays below this time
-            all become equal, so jitter disappears.
+        loss: Long-run fraction of samples that are lost.
+        loss_burst: Mean number of consecutive lost samples. If 0, losses are independent.
+        loss_bad: Fraction of samples lost within a burst. If below 1, bursts have gaps.
+        duplicate: Fraction of samples that arrive twice. The delay of the copy is drawn
+            separately.
+        outages_s: Intervals of send time, in s, in which every sample is lost.
+        order: "newest" to discard a sample that arrives after a newer one, or "in_order" to
+            hold back a sample until the earlier ones have arrived.
+        playout_ms: Play-out delay, in ms. Every sample is held until at least this long after
+            it was sent, which removes the jitter of all shorter delays.
     """
 
     loss: Probability = 0.0
@@ -124,18 +120,19 @@ class LinkBase(Frozen, frozen=True, tag_field="model", omit_defaults=True):
 
     @classmethod
     def derive_keys(cls, table: TomlTable) -> TomlTable:  # noqa: ARG003 - subclasses use it
-        """Returns the keys that an author may leave out because they follow from other keys.
+        """Returns defaults for keys that can be computed from other keys.
 
-        A delay model with such keys overrides this method. By default, there are none.
+        A delay model that has such keys overrides this method. Returns an empty table by
+        default.
 
         Args:
-            table: Table of the link as its author wrote it.
+            table: The link table as written by its author.
         """
         return {}
 
     @property
     def constant_delay_ms(self) -> float | None:
-        """Delay of every message, in ms, if all messages have the same. Otherwise None."""
+        """Delay of every message, in ms, or None if the delay varies."""
         return None
 
     def _delay(self) -> LinkModel:
@@ -168,47 +165,40 @@ class LinkBase(Frozen, frozen=True, tag_field="model", omit_defaults=True):
         return f"{self.__struct_config__.tag} {mean_ms:.4g} +- {deviation_ms:.3g} ms"
 
     def moments(self) -> _DelayMoments:
-        """Mean and standard deviation of the random delay that a link is described with.
+        """Mean and standard deviation of the delay distribution configured for the link.
 
-        A link is the one-way network connection between two sites, the processes of the arms.
-        The delay in a run can differ, because three effects are not included: the hold time
-        `playout_ms`, the enforced order of messages (`order`), and the upper limit of all
-        delays, `MAX_DELAY_MS`.
+        The delay in a run can differ, since three effects are not included: the play-out delay
+        `playout_ms`, in-order delivery (`order`), and the upper limit on all delays,
+        `MAX_DELAY_MS`.
         """
         return _DelayMoments(*self._moments())
 
     @property
     def random(self) -> bool:
-        """True if the network link draws its delays, losses or duplicates at random.
+        """True if delays, losses or duplicates of the link are random.
 
-        Another seed then gives another run. Losses are random only if some messages are lost,
-        but not all.
+        The run then depends on the seed. Losses are random only if the loss fraction is between
+        0 and 1, exclusive.
         """
         is_delay_drawn = self._delay().kind not in _DETERMINISTIC_KINDS
         return is_delay_drawn or 0.0 < self.loss < 1.0 or 0.0 < self.duplicate < 1.0
 
     @property
     def measured(self) -> bool:
-        """True if the link adds no artificial delay.
+        """True if the link adds no artificial delay to that of the real network.
 
-        Samples then arrive as the real network of a live session delivers them. Such a link
-        cannot be simulated without the log of a session.
+        Such a link cannot be simulated without the log of a live session.
         """
         return self._delay().kind == DelayKind.MEASURED
 
     @property
     def points(self) -> Points | None:
-        """Measured delays over time, for a link that repeats a recorded trace of delays.
-
-        A link is the one-way network connection between two sites, the processes of the arms.
-        The value is None for links whose delay is not recorded.
-        """
+        """Recorded delays over time, for a link that replays a delay trace; otherwise None."""
         return None
 
     def to_core_model(self, from_ns: int = 0) -> LinkModel:
-        """Converts the delay and losses of a link to numbers for the compiled simulation.
-
-        The simulation draws the random delays and losses from them.
+        """Converts the link to the parameters from which the simulation draws delays and
+        losses.
 
         Args:
             from_ns: Send time of the first message to which these settings apply, in ns after
@@ -229,8 +219,8 @@ class LinkBase(Frozen, frozen=True, tag_field="model", omit_defaults=True):
     def find_effective_delay(self, receiver_hz: int) -> float:
         """Returns the delay with which the receiver of the link uses samples, in s.
 
-        A constant delay is rounded up to whole control periods of the receiver. The result is
-        NaN for a delay that varies, and for a link that loses samples.
+        A constant delay is rounded up to a multiple of the receiver's control period. Returns
+        NaN if the delay varies or the link loses samples.
 
         Args:
             receiver_hz: Tick rate of the receiver, in Hz.
@@ -263,13 +253,13 @@ class LinkBase(Frozen, frozen=True, tag_field="model", omit_defaults=True):
         return _LossChain(loss_good=0.0, loss_bad=self.loss_bad, enter=enter, leave=leave)
 
     def find_problem(self) -> KeyProblem | None:
-        """Returns a contradiction between several keys of the link, if there is one.
+        """Checks the keys of the link for contradictions between them.
 
-        For example, an outage must not end before it starts. Problems of a single key are found
-        earlier, by the type of the key.
+        For example, an outage must not end before it starts. Single keys have already been
+        checked by their types.
 
         Returns:
-            The key and the reason. None if the keys agree with each other.
+            The key and the reason, or None if the keys are consistent.
         """
         delay_problem = self._find_delay_problem()
         if delay_problem is not None:
@@ -323,19 +313,20 @@ class LinkBase(Frozen, frozen=True, tag_field="model", omit_defaults=True):
     def draw_used_samples(
         self, key: int, receiver_hz: int, sender_hz: int, duration_s: float
     ) -> IntArray:
-        """Computes which message of another arm is in use in each control period of an arm.
+        """Computes which sample of the peer is in use in each tick of the receiver.
 
-        Messages are delayed and lost by the network link between the two arms; other links of
-        the arm are not considered. A message is called a sample.
+        Accounts for delays and losses of this link only; other links of the receiver are
+        ignored.
 
         Args:
             key: Key of the link's random draws.
-            receiver_hz: Tick rate of the site, in Hz.
+            receiver_hz: Tick rate of the receiving site, in Hz.
             sender_hz: Tick rate of the peer, in Hz.
             duration_s: Duration of the run, in s.
 
         Returns:
-            Number of the sample in every tick, shape (ticks,). -1 before the first sample.
+            Index of the sample in use at every tick, shape (ticks,); -1 before the first
+            sample.
         """
         setup = LinkSetup(
             peer="peer",
@@ -351,10 +342,10 @@ class LinkBase(Frozen, frozen=True, tag_field="model", omit_defaults=True):
         return used
 
     def describe(self) -> str:
-        """Returns a short text for the user about the link.
+        """Returns a short human-readable description of the link.
 
-        It contains the kind of the delay with its mean and standard deviation, and the other
-        properties that the link has, such as losses.
+        Contains the kind of delay with its mean and standard deviation, and any other
+        properties of the link, such as losses.
         """
         parts = [self._describe_delay()]
         if self.loss:
@@ -372,10 +363,10 @@ class LinkBase(Frozen, frozen=True, tag_field="model", omit_defaults=True):
 
 
 class OwnDelay(LinkBase, frozen=True, kw_only=True):
-    """Delay model that consists of a Python file with a function for the delay of one message.
+    """Base class for a delay model that computes the delay of one message in Python.
 
-    To add a model, a contributor adds a file to this folder with a subclass. The attributes of
-    the class are the numerical settings of the model. The subclass defines
+    To add a model, add a file with a subclass to this folder. The attributes of the class are
+    the numeric settings of the model. The subclass defines
 
     - `draw`, which computes the delay of one message,
     - `_moments`, which returns the mean and standard deviation of the delay in ms,
@@ -384,26 +375,25 @@ class OwnDelay(LinkBase, frozen=True, kw_only=True):
     """
 
     def draw(self, now: Any) -> None:
-        """Computes the delay of one message, and stores it in `now.drawn_us`, in microseconds.
+        """Computes the delay of one message and stores it in `now.drawn_us`, in microseconds.
 
-        A sample is the state that a site publishes in one tick. This method is compiled. It may
-        use `now.sample`, the number of the sample, and `now.stamp_ns`, its send time. Random
-        numbers must come from `core.links.delay.draw_pair`: they are a function of the key of
-        the link and an index, so that a repeated run draws the same numbers (law L4 of
-        docs/develop/design.md).
+        This method is compiled. It may use the sample number `now.sample` and the send time
+        `now.stamp_ns`. Draw random numbers with `core.links.delay.draw_pair` only: its results
+        depend only on the key of the link and an index, so a repeated run draws the same
+        numbers (law L4 of docs/develop/design.md).
 
         Args:
-            now: The sample, and the field for the result.
+            now: The sample, and the field that receives the result.
         """
         raise NotImplementedError
 
     @property
     def points(self) -> Points:
-        """Numerical settings of this delay model, packed for the compiled simulation.
+        """Numeric settings of the delay model, packed for the compiled simulation.
 
-        The compiled simulation has one table of integers for each link. A link with recorded
-        delays stores its measurements there. This model stores its floating-point settings bit
-        by bit in the same table, two in each row.
+        The compiled simulation has one integer table per link, which normally holds a recorded
+        delay trace. The bit patterns of the floating-point settings are stored in this table,
+        two per row.
         """
         numbers = UserModel(self).numbers
         rows = math.ceil(max(len(numbers), 1) / 2)
@@ -417,10 +407,9 @@ class OwnDelay(LinkBase, frozen=True, kw_only=True):
         return LinkModel(kind=DelayKind.CUSTOM, location=1e3 * self._reach_ms())
 
     def to_core_model(self, from_ns: int = 0) -> LinkModel:
-        """Converts the link to the record that the compiled simulation reads.
+        """Converts the link to the record read by the compiled simulation.
 
-        The record contains the address of the compiled method `draw`, which computes the
-        delays.
+        The record contains the address of the compiled `draw` method.
 
         Args:
             from_ns: Send time of the first message to which these settings apply, in ns after

@@ -1,14 +1,12 @@
-"""Defines the network delay models that the simulation kernel computes itself.
+"""Delay models that are built into the simulation kernel.
 
-The author of an experiment gives the delay of each network link as a table, for example with a
-mean and a jitter. Each class of this module represents one kind of table. It translates the
-keys to the parameters of a probability distribution or of a function of time, and states the
-mean and the standard deviation of the delay.
+Each class describes one kind of link table, for example a table with a mean and a jitter. It
+converts the keys to the parameters of a probability distribution or of a function of time, and
+computes the mean and the standard deviation of the delay.
 
 Invariant:
-    - Each model names the `DelayKind` by which the kernel, the compiled simulation, knows it.
-      The kernel draws delays from exactly the distribution whose mean and standard deviation
-      the model states.
+    - Each model names its `DelayKind` in the kernel, the compiled simulation. The kernel draws
+      delays from exactly the distribution whose mean and standard deviation the model states.
 """
 
 import math
@@ -40,7 +38,7 @@ def _normal_probability(x: float) -> float:
 
 
 class UniformDelay(LinkBase, frozen=True, kw_only=True, tag="uniform"):
-    """Delay of each message drawn uniformly between the mean minus and plus a half width.
+    """Delay drawn uniformly from mean minus half width to mean plus half width.
 
     For example, a mean of 50 ms and a half width of 10 ms give delays from 40 to 60 ms.
 
@@ -55,15 +53,13 @@ class UniformDelay(LinkBase, frozen=True, kw_only=True, tag="uniform"):
 
     @classmethod
     def derive_keys(cls, table: TomlTable) -> TomlTable:
-        """Returns the default width of the distribution: half of the mean to each side.
-
-        Because of this default, the description of a link may state the mean delay alone.
+        """Returns the default half width: half of the mean delay.
 
         Args:
-            table: Settings of the link as the author of the scenario wrote them.
+            table: The link table as written by its author.
 
         Returns:
-            The setting `half_width_ms`. Empty if the mean is missing or not a number.
+            The key `half_width_ms`. Empty if the mean is missing or not a number.
         """
         delay_ms = table.get("delay_ms")
         return {"half_width_ms": 0.5 * delay_ms} if is_number(delay_ms) else {}
@@ -96,13 +92,13 @@ class UniformDelay(LinkBase, frozen=True, kw_only=True, tag="uniform"):
 
 
 class NormalDelay(LinkBase, frozen=True, kw_only=True, tag="normal"):
-    """Delay of each message drawn from a normal distribution that is cut off at zero.
+    """Delay drawn from a normal distribution truncated at zero.
 
-    A message cannot arrive before it was sent. Therefore a negative delay is drawn again.
+    A message cannot arrive before it was sent, so negative delays are redrawn.
 
     Attributes:
-        delay_ms: Mean of the normal distribution, before negative delays are excluded, in ms.
-        deviation_ms: Standard deviation of this distribution, in ms.
+        delay_ms: Mean of the normal distribution before truncation, in ms.
+        deviation_ms: Standard deviation of the normal distribution before truncation, in ms.
     """
 
     delay_ms: Milliseconds
@@ -129,7 +125,7 @@ class NormalDelay(LinkBase, frozen=True, kw_only=True, tag="normal"):
 
 
 class MeanDeviationDelay(LinkBase, frozen=True, kw_only=True):
-    """Base of the delay models whose author states the mean and the standard deviation.
+    """Base class for delay models configured with a mean and a standard deviation.
 
     Attributes:
         delay_ms: Mean delay, in ms.
@@ -158,9 +154,9 @@ class MeanDeviationDelay(LinkBase, frozen=True, kw_only=True):
 
 
 class GammaDelay(MeanDeviationDelay, frozen=True, kw_only=True, tag="gamma"):
-    """Delay of each message drawn from a gamma distribution: never negative, with a long tail.
+    """Delay drawn from a gamma distribution: never negative, with a long tail.
 
-    The author of a scenario states the mean and the standard deviation.
+    Configured with the mean and the standard deviation of the delay.
     """
 
     def _delay(self) -> LinkModel:
@@ -174,9 +170,10 @@ class GammaDelay(MeanDeviationDelay, frozen=True, kw_only=True, tag="gamma"):
 
 
 class LogNormalDelay(MeanDeviationDelay, frozen=True, kw_only=True, tag="lognormal"):
-    """Delay whose logarithm is normally distributed: mostly short, and very long at times.
+    """Delay drawn from a log-normal distribution: mostly short, occasionally very long.
 
-    The author of a scenario states the mean and the standard deviation of the delay itself.
+    Configured with the mean and the standard deviation of the delay itself, not of its
+    logarithm.
     """
 
     def _delay(self) -> LinkModel:
@@ -193,9 +190,9 @@ class LogNormalDelay(MeanDeviationDelay, frozen=True, kw_only=True, tag="lognorm
 
 
 class HyperExponentialDelay(LinkBase, frozen=True, kw_only=True, tag="hyperexponential"):
-    """Fixed delay plus a random part from one of two exponential distributions.
+    """Fixed delay plus a random part drawn from one of two exponential distributions.
 
-    Mobile networks have such delays: most messages are fast, and some wait much longer.
+    Typical of mobile networks, where most messages are fast but some wait much longer.
 
     Attributes:
         floor_ms: Fixed part of the delay, in ms.
@@ -235,14 +232,14 @@ class HyperExponentialDelay(LinkBase, frozen=True, kw_only=True, tag="hyperexpon
 
 
 class CorrelatedDelay(NormalDelay, frozen=True, kw_only=True, tag="ar1"):
-    """Delay that changes slowly: if one message is slow, the next message is probably slow too.
+    """Delay that varies slowly: a slow message is likely to be followed by another slow one.
 
-    The delays are normally distributed and correlated from message to message. Negative delays
-    become zero.
+    Delays are normally distributed and correlated between messages. Negative delays are set to
+    zero.
 
     Attributes:
         correlation: Correlation between the delays of two consecutive samples, before negative
-            delays become zero.
+            delays are set to zero.
     """
 
     correlation: Correlation
@@ -269,15 +266,15 @@ class CorrelatedDelay(NormalDelay, frozen=True, kw_only=True, tag="ar1"):
 
 
 class NoDelay(LinkBase, frozen=True, kw_only=True, tag="none"):
-    """Ideal network link, which delays and loses nothing.
+    """Ideal network link with no delay and no loss.
 
-    The receiver still uses a message from its next control period on, because a message cannot
-    act in the period in which it was sent.
+    The receiver uses a message from its next control period on, since a message cannot act in
+    the period in which it was sent.
     """
 
     @property
     def constant_delay_ms(self) -> float:
-        """Delay of every message, in ms: none."""
+        """Delay of every message, in ms: always 0."""
         return 0.0
 
     def _delay(self) -> LinkModel:
@@ -294,11 +291,11 @@ class NoDelay(LinkBase, frozen=True, kw_only=True, tag="none"):
 
 
 class ConstantDelay(LinkBase, frozen=True, kw_only=True, tag="constant"):
-    """Network link that delays every message by the same time.
+    """Network link with the same delay for every message.
 
     Attributes:
-        delay_ms: Delay, in ms. A delay of 0 still means one period, because the receiver uses a
-            sample from its next tick on.
+        delay_ms: Delay, in ms. Even with a delay of 0, the receiver uses a sample only from its
+            next tick on, one period later.
     """
 
     delay_ms: Milliseconds
@@ -322,7 +319,7 @@ class ConstantDelay(LinkBase, frozen=True, kw_only=True, tag="constant"):
 
 
 class SineDelay(LinkBase, frozen=True, kw_only=True, tag="sine"):
-    """Network delay that rises and falls as a sine of the time t at which a message is sent.
+    """Delay that varies sinusoidally with the send time t of the message.
 
         T(t) = delay + amplitude sin(2 pi t / period + phase)
 
@@ -364,16 +361,16 @@ class SineDelay(LinkBase, frozen=True, kw_only=True, tag="sine"):
 
 
 class TraceDelay(LinkBase, frozen=True, kw_only=True, tag="trace"):
-    """Network delay that repeats a measurement: a table of sending times and delays.
+    """Delay replayed from a recorded trace of send times and delays.
 
-    An author names a file with the table. A resolved scenario contains the table itself, so
-    that the experiment can be repeated without the file.
+    A scenario names a file that contains the trace. A resolved scenario contains the trace
+    itself, so the experiment can be repeated without the file.
 
     Attributes:
-        trace: Points of the table as the text "t_us delay_us, t_us delay_us, ...". A lost
-            sample has "lost" in place of its delay.
-        at_end: What happens after the last point. "hold": The last delay is kept. "loop": The
-            table is repeated.
+        trace: The trace as a string "t_us delay_us, t_us delay_us, ...", with "lost" in place
+            of the delay of a lost sample.
+        at_end: What happens after the last point: "hold" to keep the last delay, or "loop" to
+            repeat the trace.
     """
 
     trace: str
@@ -381,7 +378,7 @@ class TraceDelay(LinkBase, frozen=True, kw_only=True, tag="trace"):
 
     @property
     def points(self) -> Points:
-        """Points of the table: send times and delays in microseconds, shape (n, 2)."""
+        """Send times and delays of the trace, in microseconds, shape (n, 2)."""
         return parse_trace(self.trace)
 
     def _delay(self) -> LinkModel:
@@ -424,10 +421,10 @@ class TraceDelay(LinkBase, frozen=True, kw_only=True, tag="trace"):
 
 
 class NoInjectedDelay(LinkBase, frozen=True, kw_only=True, tag="measured"):
-    """Network link of a live session to which the program adds no artificial delay.
+    """Network link of a live session with no artificial delay.
 
-    The receiver uses a message as soon as it has arrived over the real network. A simulation
-    cannot know these arrivals.
+    The receiver uses a message as soon as it arrives over the real network. These arrival times
+    cannot be simulated.
     """
 
     def _delay(self) -> LinkModel:
