@@ -225,8 +225,7 @@ class Task(fields.Frozen, frozen=True, omit_defaults=True):
 
     @property
     def shared(self) -> int:
-        """Number of end effector coordinates that the arms exchange: 3 or 6, or 0 for joint
-        angles.
+        """Number of shared end effector coordinates: 3 or 6, or 0 for joint angles.
 
         A position has 3 coordinates and a pose has 6. For joint angles the value is 0, since
         the number of joints depends on the arm.
@@ -416,7 +415,7 @@ class ArmModel(NamedTuple):
         Exact for the planar arm, a bound for a chain. The upper bound is the sum of the
         distances between consecutive joints (including the end effector) and the travel of all
         prismatic joints. Without prismatic joints, the lower bound is the length of the longest
-        link minus the sum of the others, or 0 if that is negative.
+        link minus the sum of the others, or 0 if this is negative.
         """
         if self.chain is None:
             l1, l2 = self.lengths_m
@@ -499,8 +498,9 @@ class ArmModel(NamedTuple):
         return task_J[: self.counts.shared]
 
     def largest_gravity(self, g_m_s2: float) -> tuple[float, ...]:
-        """Returns upper bounds, over all poses, on the gravity torques of the planar arm, in N
-        m.
+        """Returns upper bounds on the gravity torques of the planar arm, in N m.
+
+        The bounds hold in every pose.
 
         Args:
             g_m_s2: Gravitational acceleration, in m/s^2.

@@ -1,25 +1,25 @@
-"""Reads delay traces: tables of send times and the delay that each message had.
+"""Reads delay traces: tables of the send time and the delay of each message.
 
-A link of the model "trace" repeats the delays of a trace. The table is a CSV file such as
+A link with the delay model "trace" replays the delays of a trace. A trace is read from a CSV
+file such as
 
     t_s,delay_ms
     0.000,41.2
     0.001,lost
 
-or it is taken from the log of a run. `import_trace` builds such a table from the output of
-`irtt` or `ping`, programs that measure the delay of a network. A resolved scenario contains the
-trace as a string, see `format_trace`.
+or from the log of a run. `import_trace` creates a trace from the output of network measurement
+programs such as `irtt` or `ping`. A resolved scenario contains the trace as a string (see
+`format_trace`).
 
 Invariant:
-    - A resolved scenario does not need the file any more.
-    - Times count from the first point of the trace, and in a measurement from the first sent
-      message. Times and delays are whole microseconds.
-    - A message without an answer is lost. A message whose delay exceeds the longest permitted
-      delay of a link also counts as lost.
-    - The delay in one direction is taken as half of the round trip, unless it was measured and
-      the caller requests it.
-    - Published measurements of other people are not part of the package. The user names their
-      files.
+    - A resolved scenario no longer needs the file.
+    - Times are relative to the first point of the trace or, for a measurement, to the first
+      message sent. Times and delays are integers in microseconds.
+    - A message with no reply is lost. A message also counts as lost if its delay exceeds the
+      longest permitted delay of a link.
+    - The one-way delay is half the round-trip time, unless one-way delays were measured and the
+      caller asks for them.
+    - The package contains no published measurements by third parties. Users supply the files.
 """
 
 import csv
@@ -166,19 +166,17 @@ def _is_number(cell: str) -> bool:
 
 
 def read_trace(path: Path, link: str) -> str:
-    """Reads a delay trace from a CSV file, or from the log of a run.
-
-    A trace of a real network lets a simulation repeat its delays.
+    """Reads a delay trace from a CSV file or from the log of a run.
 
     Args:
         path: CSV file with the columns `t_s,delay_ms`, or a log.
-        link: Name of the link whose delays are taken from a log, for example "m1->s".
+        link: Name of the link whose delays are read from a log, for example "m1->s".
 
     Returns:
-        The trace as text in the format of `format_trace`.
+        The trace as a string in the format of `format_trace`.
 
     Raises:
-        ScenarioError: The file cannot be read, or contains no trace.
+        ScenarioError: The file cannot be read or contains no trace.
     """
     try:
         if path.suffix != ".mcap":
@@ -193,19 +191,18 @@ def read_trace(path: Path, link: str) -> str:
 
 
 def format_trace(points: Sequence[TracePoint]) -> str:
-    """Returns recorded delays as text, which becomes part of a scenario.
+    """Formats a delay trace as a string, to be stored in a scenario.
 
-    The recording is a table of sending times and delays. The format of the text is "t_us
-    delay_us, t_us delay_us, ...", in microseconds, with "lost" in place of the delay of a lost
-    message. Times count from the first point.
+    The format is "t_us delay_us, t_us delay_us, ...", in microseconds, with "lost" in place of
+    the delay of a lost message. Times are relative to the first point.
 
     Args:
-        points: Send time in s and delay in ms of each message. A lost message has an infinite
-            delay.
+        points: Send time in s and delay in ms of each message. The delay of a lost message is
+            infinite.
 
     Raises:
-        ValueError: There are no points or too many, a number is out of range, or the times do
-            not increase.
+        ValueError: There are no points or too many, a number is out of range, or the times are
+            not increasing.
     """
     if not points:
         raise ValueError("has no points")
@@ -243,20 +240,19 @@ def format_trace(points: Sequence[TracePoint]) -> str:
 
 @lru_cache(maxsize=64)
 def parse_trace(text: str) -> Points:
-    """Converts a delay trace from text to an array.
+    """Parses the string form of a delay trace into an array.
 
-    A delay trace is a table of send times and the delay that each message had. The result is
-    cached, because the trace of a link is needed many times.
+    The result is cached, since the trace of a link is needed many times.
 
     Args:
-        text: Trace as a string that `format_trace` returned.
+        text: A string returned by `format_trace`.
 
     Returns:
-        Read-only array of times and delays in microseconds, shape (n, 2). A lost message has
-        the delay `LOST`, see `core.vectors.Points`.
+        Read-only array of times and delays in microseconds, shape (n, 2). The delay of a lost
+        message is `LOST` (see `core.vectors.Points`).
 
     Raises:
-        ValueError: The text does not have this format, or a number is out of range.
+        ValueError: The string is malformed, or a number is out of range.
     """
     pairs = []
     for part in text.split(", "):
@@ -304,19 +300,18 @@ _DELAY_NAMES = ("delay", "rtt", "latency")
 
 @dataclass(frozen=True, repr=False)
 class MeasuredTrace(Result):
-    """Delays of a real network, imported from the output of a measuring program.
+    """Delays of a real network, imported from the output of a measurement program.
 
-    `import_trace` returns them. A simulated network link can then repeat the same delays.
+    Returned by `import_trace`. A simulated network link can replay these delays.
 
     Attributes:
-        points: Send time of each message since the first one in s, and its delay in ms. The
-            delay of a lost message is infinite.
-        too_long: Number of messages that count as lost because their delays exceed the longest
-            delay of a link.
-        doubled: Number of messages that were left out because another message has the same send
-            time.
-        cut: Number of messages that were left out at the end, because a trace has at most
-            `MAX_TRACE_POINTS` points.
+        points: Send time in s (relative to the first message) and delay in ms of each message.
+            The delay of a lost message is infinite.
+        too_long: Number of messages counted as lost because their delay exceeds the longest
+            permitted delay of a link.
+        doubled: Number of messages dropped because another message has the same send time.
+        cut: Number of messages cut off at the end, since a trace has at most `MAX_TRACE_POINTS`
+            points.
         begin_known: False if messages before the first point may be missing from the file.
         end_known: False if messages after the last point may be missing from the file.
     """
@@ -330,18 +325,15 @@ class MeasuredTrace(Result):
 
     @property
     def delay_ms(self) -> Array:
-        """Delays of all messages that were not lost, in ms, in the order of sending.
-
-        Statistics of the measured network are computed from them.
-        """
+        """Delays of all messages that were not lost, in ms, in the order of sending."""
         return np.array([ms for _, ms in self.points if math.isfinite(ms)])
 
     def to_dict(self) -> dict[str, Any]:
-        """Returns statistics of the trace as plain values, ready for JSON.
+        """Returns summary statistics of the trace as JSON-compatible values.
 
         The keys are those of `trilat trace import --json`. The statistics of the delays are
-        left out if all messages were lost. The correlation is that between the delays of
-        consecutive messages (the lag-one autocorrelation). It is 0 if all delays are equal.
+        omitted if all messages were lost. The correlation is the lag-one autocorrelation of the
+        delays, or 0 if all delays are equal.
         """
         is_lost = np.array([math.isinf(ms) for _, ms in self.points])
         # a burst begins where a lost message follows a message that arrived
@@ -381,10 +373,10 @@ class MeasuredTrace(Result):
         }
 
     def blocks(self) -> list[str]:
-        """Returns statistics of the recorded delays as lines of text.
+        """Returns a text report of the trace, as printed by `trilat trace import`.
 
-        The command `trilat trace import` prints them. The lines contain the number of messages,
-        the losses, the delays, and how many messages were left out.
+        The lines state the number of messages, the losses, the delays, and how many messages
+        were dropped.
         """
         statistics = self.to_dict()
         samples = count_nouns(statistics["samples"], "sample")
@@ -421,10 +413,10 @@ class MeasuredTrace(Result):
         return lines
 
     def write_rows(self) -> str:
-        """Returns the trace as CSV text with the columns `t_s,delay_ms`.
+        """Formats the trace as CSV with the columns `t_s,delay_ms`.
 
-        If the text is saved in a file, a link of the model "trace" can use that file. The
-        method itself writes no file.
+        Saved to a file, the CSV can be used in a link with the delay model "trace". No file is
+        written here.
         """
         rows = ["t_s,delay_ms"]
         for t_s, ms in self.points:
@@ -436,7 +428,7 @@ class MeasuredTrace(Result):
 def import_trace(
     path: str | Path, form: str, *, way: str = "", column: str = "", every_s: float = 1.0
 ) -> MeasuredTrace:
-    """Imports measured delays from the output of `irtt`, `ping` or `fping`, or from a table.
+    """Imports measured delays from the output of `irtt`, `ping` or `fping`, or from a CSV file.
 
     >>> with open("table.csv", "w") as table:
     ...     print("t_s,rtt_ms", "0.0,20", "0.1,40", sep=chr(10), file=table)
@@ -444,20 +436,21 @@ def import_trace(
     [10.0, 20.0]
 
     Args:
-        path: The file. It may be compressed with gzip, and its text may be UTF-16.
-        form: Format of the file: "irtt" (of `irtt client -o`), "ping" or "csv". A "csv" file
-            has a header line with the names and units of its columns.
-        way: How the delay of the link is computed, one of `WAYS`. "send" and "receive" exist
-            only for irtt, and require that its two clocks agree. By default, round trips are
-            halved (irtt, ping, and a column "rtt"), and other delays are used as they are.
-        column: Name of the column of delays in a table. By default, the first column whose name
-            stands for a delay.
-        every_s: Interval between the messages of a `ping` that prints no times, in s. `ping`
-            prints times only with its option -D, and never on Windows.
+        path: Path of the file, which may be gzip-compressed or encoded in UTF-16.
+        form: Format of the file: "irtt" (output of `irtt client -o`), "ping" (also for `fping`)
+            or "csv". A CSV file must have a header with the names and units of its columns.
+        way: How the one-way delay is computed, one of `WAYS`. "send" and "receive" are
+            available only for irtt and require synchronised clocks. By default, round-trip
+            times (from irtt, ping or a column named "rtt") are halved, and other delays are
+            used unchanged.
+        column: Name of the delay column of a CSV file. By default, the first column whose name
+            denotes a delay.
+        every_s: Interval between probes, in s, if the output of `ping` contains no timestamps.
+            Timestamps require the option -D and are never printed on Windows.
 
     Raises:
-        UsageError: There is no such format, or `way` does not exist for this format.
-        ScenarioError: The file cannot be read, or does not have this format.
+        UsageError: The format is unknown, or does not support `way`.
+        ScenarioError: The file cannot be read or is not in this format.
     """
     if form not in _READERS:
         raise UsageError(

@@ -1,14 +1,12 @@
-"""Describes scenarios in lines of text, and lists the differences between scenarios.
+"""Describes scenarios as lines of text and lists the differences between them.
 
-A scenario is the description of an experiment with its arms, control laws and network links.
-The text also states facts that follow from a scenario, for example whether a control law
-satisfies its condition for stability, and how long an arm needs to come to rest.
+The description also states facts derived from the scenario, for example whether a control law
+satisfies its stability condition, and how long an arm needs to come to rest.
 
 Invariant:
-    - A difference that several arms or links have in common is listed once. If two arms have
-      control laws of different kinds, each law is listed as a whole. Links are always listed as
-      a whole.
-    - Names, titles and expectations only describe an experiment, and are not compared.
+    - A difference shared by several arms or links is listed once. If two arms use different
+      control laws, each law is listed in full. Links are always listed in full.
+    - Names, titles and expectations are descriptive and are not compared.
 """
 
 import math
@@ -68,13 +66,13 @@ def _describe_idle_shares(scenario: Scenario) -> list[str]:
 
 
 def describe_scenario(scenario: str | Path | Mapping[str, Any] | Scenario) -> list[str]:
-    """Describes a valid scenario in lines of text, as `trilat scenario check` prints them.
+    """Describes a scenario as lines of text, as printed by `trilat scenario check`.
 
     >>> len(tn.describe_scenario("paper")) > 5
     True
 
     Args:
-        scenario: Scenario, or any source that `load_scenario` accepts.
+        scenario: A scenario, or any source that `load_scenario` accepts.
 
     Raises:
         ScenarioError: The scenario is not valid.
@@ -236,13 +234,13 @@ def _group_chains(scenario: Scenario) -> list[tuple[Arm, list[str]]]:
 
 
 def list_arm_notes(scenario: Scenario) -> list[str]:
-    """Returns sentences about details of the arms that a user may not expect.
+    """Returns sentences about properties of the arms that may surprise a user.
 
     For example, a joint of the URDF file may be held fixed, or an arm may start beyond a
-    position limit, which is moved for this run. Empty if there is nothing to say.
+    position limit, which is then moved for this run. Empty if there are none.
 
     Args:
-        scenario: Description of the experiment.
+        scenario: The scenario.
     """
     notes = []
     for arm, owners in _group_chains(scenario):
@@ -436,13 +434,14 @@ _SOME_LINKS = "link "
 
 
 class ScenarioDifference(NamedTuple):
-    """Key with different values in several experiments, as a row of a table that compares them.
+    """A key whose value differs between scenarios, as one row of a comparison table.
 
     Attributes:
-        key: Dotted path of the key, without `sites.NAME` for a key of a site.
-        owners: Names of the sites that have the difference. Empty for a key of the whole
-            experiment.
-        values: Value in each experiment as a string. "none" if the experiment lacks the key.
+        key: Dotted path of the key, relative to `sites.NAME` for a key of a site.
+        owners: Names of the sites to which the difference applies. Empty for a key of the whole
+            scenario.
+        values: Value in each scenario as a string, or "none" if the scenario does not have the
+            key.
     """
 
     key: str
@@ -451,16 +450,16 @@ class ScenarioDifference(NamedTuple):
 
     @classmethod
     def list_between(cls, scenarios: Sequence[Scenario]) -> list["ScenarioDifference"]:
-        """Finds the settings in which several experiments differ.
+        """Finds the settings in which several scenarios differ.
 
-        Settings that only some of the experiments have are included.
+        Includes settings that only some of the scenarios have.
 
         Args:
-            scenarios: Descriptions of at least two experiments.
+            scenarios: At least two scenarios.
 
         Returns:
-            One entry for each difference, in the order of the keys. Empty if the experiments
-            are equal.
+            One entry per difference, in the order of the keys. Empty if the scenarios are
+            equal.
         """
         differences: list[ScenarioDifference] = []
         site_lists = [", ".join(scenario.names) for scenario in scenarios]
@@ -484,7 +483,7 @@ class ScenarioDifference(NamedTuple):
 
     @property
     def concerns_link(self) -> bool:
-        """True if the differing key belongs to a network link, such as "link m1->s"."""
+        """True if the key belongs to a network link, such as "link m1->s"."""
         return self.key == _EVERY_LINK or self.key.startswith(_SOME_LINKS)
 
     def __str__(self) -> str:
@@ -543,13 +542,13 @@ def _compare_links(scenarios: Sequence[Scenario]) -> list[ScenarioDifference]:
 
 
 def flatten_table(table: Mapping[str, Any], path: str = "") -> list[tuple[str, Any]]:
-    """Returns the values of a table and of all tables in it, under dotted keys.
+    """Flattens nested tables into pairs of dotted key and value.
 
-    For example, {"a": {"b": 1}} gives the pair ("a.b", 1).
+    For example, {"a": {"b": 1}} becomes [("a.b", 1)].
 
     Args:
-        table: Table with values and further tables.
-        path: Dotted key of the table itself. Empty for the outermost table.
+        table: A table, possibly nested.
+        path: Dotted key of `table` itself. Empty for the outermost table.
     """
     pairs: list[tuple[str, Any]] = []
     for key, value in table.items():
@@ -562,10 +561,10 @@ def flatten_table(table: Mapping[str, Any], path: str = "") -> list[tuple[str, A
 
 
 def describe_law(control: Mapping[str, Any]) -> str:
-    """Returns the name and gains of a control law as a short text, as in "p_d (K 20, d 4)".
+    """Returns the name and gains of a control law, as in "p_d (K 20, d 4)".
 
     Args:
-        control: Table of the law in a scenario.
+        control: The `control` table of a scenario.
     """
     # The gains of a user's law are its settings; the hash of its file is left out.
     if "code" in control:
@@ -597,10 +596,10 @@ def _join_leading(entries: Sequence[str], separator: str) -> str:
 
 
 def describe_value(value: Any) -> str:
-    """Returns a value of a scenario as a short text for the user.
+    """Formats a scenario value as a short string for users.
 
-    A list of equal numbers is written as one number. Hashes of files are shortened. A table or
-    list that is too long is cut after its first entries.
+    A list of equal numbers is written as a single number, file hashes are shortened, and long
+    tables or lists are truncated.
 
     Args:
         value: Any value that a scenario may contain.

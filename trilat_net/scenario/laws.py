@@ -1,11 +1,11 @@
-"""Finds the control laws that a scenario can choose, by name.
+"""Looks up control laws by the name that a scenario gives.
 
-A scenario, the description of an experiment, names the law of each arm. The law computes the
-torques of the arm from its own state and from the delayed states of the other arms.
+A control law computes the torques of an arm from the state of the arm and the delayed states of
+its peers.
 
 Invariant:
-    - A law is found by its file in the package `trilat_net.laws`. The class in this file has
-      the same name as the file. There is no other list of laws.
+    - A law is found through its file in the package `trilat_net.laws`, which contains a class
+      with the same name as the file. There is no other list of laws.
 """
 
 from typing import TYPE_CHECKING, Union

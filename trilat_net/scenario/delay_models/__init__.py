@@ -197,8 +197,7 @@ class LinkBase(Frozen, frozen=True, tag_field="model", omit_defaults=True):
         return None
 
     def to_core_model(self, from_ns: int = 0) -> LinkModel:
-        """Converts the link to the parameters from which the simulation draws delays and
-        losses.
+        """Converts the link to the parameters used to simulate delays and losses.
 
         Args:
             from_ns: Send time of the first message to which these settings apply, in ns after
