@@ -51,8 +51,7 @@ class LinkInertia(fields.Frozen, frozen=True, omit_defaults=True):
     inertia_kg_m2: TensorEntries | None = None
 
     def list_given_keys(self) -> list[str]:
-        """Returns the names of the inertial parameters that the scenario specifies for the
-        link.
+        """Returns the names of the inertial parameters that the scenario specifies.
 
         The remaining parameters are taken from the URDF file of the arm.
         """

@@ -1,11 +1,10 @@
-"""Lists the presets of links: settings of typical networks that a scenario can choose by name.
+"""Link presets: settings of typical networks that a scenario can select by name.
 
-A scenario, the description of an experiment, connects its arms by links. A preset such as "4g"
-stands for the delay model of a link and its keys.
+A preset such as "4g" stands for a delay model and its keys.
 
 Invariant:
-    - A preset is a table that an author could have written as well. The file
-      `scenarios/_presets.toml` contains the presets and their sources.
+    - A preset contains nothing that an author could not write in a scenario. The presets and
+      their sources are in the file `scenarios/_presets.toml`.
 """
 
 import tomllib
