@@ -1,14 +1,13 @@
-"""Changes single keys of a scenario by overrides such as `control.Kd=5`.
+"""Applies overrides such as `control.Kd=5` to a scenario.
 
-A scenario is a TOML file that describes an experiment. Overrides change the tables of such a
-file, or a resolved scenario, in which every key of every site (the control process of an arm)
-and of every network link is written out.
+Overrides can be applied to the tables of a scenario file, or to a resolved scenario, in which
+every key of every site and link is written out.
 
 Invariant:
-    - In a resolved scenario, a key without the name of a site or link (`control.Kd`,
-      `link.delay_ms`, `rate_hz`) applies to every site or link that can have the key.
-    - A key of a single site or link (`sites.s.control.Kd`) has priority, regardless of the
-      order.
+    - In a resolved scenario, a key that names no site or link (`control.Kd`, `link.delay_ms`,
+      `rate_hz`) applies to every site or link that can have the key.
+    - A key of a single site or link (`sites.s.control.Kd`) takes precedence, whatever the order
+      of the overrides.
     - A key of `control` that no built-in law has is an argument of a user's control law.
 """
 
@@ -40,7 +39,7 @@ Override = tuple[str, Any]
 
 
 class ScenarioOverrides(NamedTuple):
-    """Changes of single keys of a scenario, such as `control.Kd=5`, as a user orders them.
+    """Overrides of scenario keys, such as `control.Kd=5`, requested by a user.
 
     Attributes:
         pairs: Dotted key and new value of each override.
@@ -50,16 +49,14 @@ class ScenarioOverrides(NamedTuple):
 
     @classmethod
     def parse(cls, written: Mapping[str, Any] | Sequence[str]) -> "ScenarioOverrides":
-        """Converts overrides of a scenario from the form in which a user wrote them.
-
-        A user writes KEY=VALUE on the command line, or a mapping in Python.
+        """Parses overrides from the command line (KEY=VALUE) or from a Python mapping.
 
         Args:
-            written: Values by dotted key, or texts KEY=VALUE. The value of a text is written as
-                in TOML, or as a bare word.
+            written: A mapping from dotted key to value, or strings of the form KEY=VALUE, where
+                VALUE is a TOML value or a bare word.
 
         Raises:
-            ScenarioError: A text does not have the form KEY=VALUE.
+            ScenarioError: A string is not of the form KEY=VALUE.
         """
         if isinstance(written, Mapping):
             return cls(tuple(name_law_classes(written).items()))
@@ -75,17 +72,16 @@ class ScenarioOverrides(NamedTuple):
         return cls(tuple(pairs))
 
     def expand(self, scenario: Scenario) -> "ScenarioOverrides":
-        """Replaces an override for all sites or links by one override for each of them.
+        """Expands each override of a group into one override per site or link.
 
-        Groups are all sites (the processes of the arms) or all links (the connections between
-        them). For example, an override of `control.K` becomes one override for each site whose
-        control law has a gain K.
+        A group is either all sites or all links. For example, an override of `control.K`
+        becomes one override for each site whose control law has a gain K.
 
         Args:
             scenario: The complete scenario.
 
         Returns:
-            Overrides with the dotted keys of single sites and links.
+            Overrides with the dotted keys of individual sites and links.
 
         Raises:
             ScenarioError: The key does not exist, or no site or link of the scenario can have
@@ -114,18 +110,17 @@ class ScenarioOverrides(NamedTuple):
     def split_entries(
         self, tables: TomlTable
     ) -> tuple["ScenarioOverrides", "ScenarioOverrides"]:
-        """Separates overrides that can be applied to a scenario file at once from all others.
+        """Separates the overrides that can be applied to an incomplete scenario from the rest.
 
-        Some overrides replace one entry of a list, such as the stiffness of joint 2. The file
-        may lack this list, because its author wrote one number for all joints or left the
-        setting out. These overrides must wait until the scenario has been completed with all
-        lists.
+        An override of a single list entry, such as the stiffness of joint 2, cannot be applied
+        if the list is missing because its author wrote one number for all joints or omitted the
+        setting. Such overrides must wait until the scenario has been completed.
 
         Args:
-            tables: Content of the scenario file.
+            tables: Tables of the scenario file.
 
         Returns:
-            The overrides that can be applied now, and the overrides that must wait.
+            The overrides that can be applied now, and those that must wait.
         """
         applicable = []
         waiting = []
@@ -138,15 +133,15 @@ class ScenarioOverrides(NamedTuple):
         return ScenarioOverrides(tuple(applicable)), ScenarioOverrides(tuple(waiting))
 
     def apply_to(self, tables: TomlTable) -> None:
-        """Replaces single values in the tables of a scenario file.
+        """Applies the overrides to the tables of a scenario file.
 
-        A number in a key is the index of an entry of a list, counted from 0, as in
-        sites.s.environment.0.stiffness_n_m. A key that names a kind (the model or preset of a
-        link, a law, the URDF file of an arm) removes the other keys of its table, because they
-        belong to the previous kind.
+        A number in a key is a list index that starts at 0, as in
+        sites.s.environment.0.stiffness_n_m. Setting a key that selects a kind (the model or
+        preset of a link, a law, the URDF file of an arm) removes the other keys of its table,
+        which belong to the previous kind.
 
         Args:
-            tables: Tables of the scenario file. They are changed in place.
+            tables: Tables of the scenario file, modified in place.
 
         Raises:
             ScenarioError: The key of an override does not exist.
@@ -435,18 +430,18 @@ def find_written_path(error: ScenarioError, tables: TomlTable) -> str:
     """Returns the path of a wrong key as its author wrote it.
 
     The author may have set the key for all sites or links at once. For example, the path
-    "links.m2->m1.delay_ms" becomes "link.delay_ms" if only that key was written. Values of a
-    wrong type or range are wrong for every site or link, and so is a URDF file that cannot be
-    used. Other errors, such as a list of the wrong length, may concern only the site in their
-    path, so these paths are kept.
+    "links.m2->m1.delay_ms" becomes "link.delay_ms" if only that key was written. This applies
+    to values of a wrong type or range and to unusable URDF files, which affect every site or
+    link equally. Other errors, such as a list of the wrong length, may affect only one site, so
+    their path is kept.
 
     Args:
-        error: The error, with the path of the key of a single site or link. An index in square
-            brackets may follow.
+        error: An error whose path names a single site or link, possibly followed by an index in
+            square brackets.
         tables: Tables with the keys that the author wrote.
 
     Returns:
-        The path of the written key. The path of the error if no such key was written.
+        Path of the written key, or the path of the error if no such key was written.
     """
     path = error.path
     key, bracket, index = path.partition("[")
@@ -478,15 +473,15 @@ def find_written_path(error: ScenarioError, tables: TomlTable) -> str:
 
 
 def split_assignment(text: str) -> Override | None:
-    """Splits a text KEY=VALUE, as given to the option --set, into its key and its value.
+    """Splits a string KEY=VALUE, as given to the option --set, into key and value.
 
-    For example, "links.delay_ms=5" gives the key "links.delay_ms" and the value 5.
+    For example, "links.delay_ms=5" yields the key "links.delay_ms" and the value 5.
 
     Args:
-        text: The text. A value that is not valid TOML is treated as a string without quotes.
+        text: The string. A value that is not valid TOML is treated as an unquoted string.
 
     Returns:
-        The key and the value. None if the text does not have this form.
+        Key and value, or None if the string is not of this form.
     """
     key, equals, value = text.partition("=")
     if not equals or not key.strip():

@@ -1,11 +1,11 @@
-"""Reads the part of a scenario that names a user's simulation of an arm, called a plant.
+"""Reads the scenario table of a plant: a user's own simulation of an arm.
 
-A plant is a class that computes the motion of an arm and of other bodies, in place of the
-built-in simulation. The author of an experiment names the class:
+A plant is a class that computes the motion of an arm, and possibly of other bodies, in place of
+the built-in simulation. The scenario names the class:
 
     plant = "my_plant:Scene"            # or a table: { class = "my_plant:Scene", mass_kg = 2 }
 
-`plant_player` runs the plants of a scenario.
+See `plant_player` for running the plants of a scenario.
 """
 
 import re
@@ -27,17 +27,15 @@ _MAX_SIZE_M = 100.0
 
 
 class OwnPlant(Frozen, frozen=True, rename={"code": "class"}, omit_defaults=True):
-    """Table of a scenario that names a user's arm model (plant).
-
-    The model is a Python class, which computes the motion of the arm from its torques.
+    """Scenario table of a plant: a user's Python class that computes the motion of an arm.
 
     Attributes:
         code: Class of the plant, for example "my_plant:Scene".
-        source_sha256: SHA-256 hash of the file of the class.
-        bodies: Bodies that the plant moves in addition to the arm. For each name, the extents
-            along the body's own axes x, y and z of a box around it, in m. Their poses are
-            recorded and drawn.
-        settings: Arguments of the class, by name.
+        source_sha256: SHA-256 hash of the file that contains the class.
+        bodies: Mapping from name to size of the bodies that the plant moves in addition to the
+            arm. The size is that of a box around the body along its own axes x, y and z, in m.
+            Their poses are recorded and drawn.
+        settings: Mapping from name to value of the constructor arguments of the class.
     """
 
     method: ClassVar[str] = "step"
@@ -49,20 +47,19 @@ class OwnPlant(Frozen, frozen=True, rename={"code": "class"}, omit_defaults=True
 
     @staticmethod
     def complete_table(written: Any, path: str) -> Any:
-        """Completes the settings of a user's plant in a scenario.
+        """Completes the `plant` setting of a site.
 
-        A plant is a user's Python class that computes the motion of an arm, and of bodies such
-        as a box that it moves. The result contains the SHA-256 hash of the file with the class,
-        the arguments of the class, and the sizes of the bodies.
+        The result contains the SHA-256 hash of the file of the class, the constructor arguments
+        of the class, and the sizes of the bodies.
 
         Args:
-            written: Value of the key `plant` as the author of the scenario wrote it: a class
-                name, as in "my_plant:Scene", or a table.
+            written: Value of the key `plant` as written by its author: a class name such as
+                "my_plant:Scene", or a table.
             path: Path of the key, for error messages.
 
         Returns:
-            The completed table. A text that is not a class name, such as "external", and a
-            value of a wrong type are returned unchanged.
+            The completed table. A string that is not a class name, such as "external", or a
+            value of a wrong type is returned unchanged.
 
         Raises:
             ScenarioError: The class is missing, its file cannot be read, or the size of a body

@@ -1,7 +1,7 @@
-"""Reads the output of `ping`: when each probe was sent, and how long its round trip took.
+"""Parses the output of `ping`: when each probe was sent and how long its round trip took.
 
-A probe is one packet that `ping` sends to measure the round trip. The formats of iputils, BSD,
-macOS, busybox, fping and Windows are supported:
+A probe is one packet that `ping` sends. The formats of iputils, BSD, macOS, busybox, fping and
+Windows are supported:
 
     64 bytes from 192.0.2.5: icmp_seq=6 ttl=64 time=5.00 ms           iputils, BSD, macOS
     64 bytes from 192.0.2.5: seq=0 ttl=64 time=3.000 ms               busybox
@@ -9,13 +9,13 @@ macOS, busybox, fping and Windows are supported:
     192.0.2.5 : [0], 64 bytes, 5.00 ms (5.00 avg, 0% loss)            fping
 
 Invariant:
-    - A probe without an answer counts as lost, even before the first answer and after the last
-      one. The sent probes are derived from the sequence numbers, from lines about missing
-      answers, and from the number of packets in the summary at the end.
+    - A probe with no reply counts as lost, even before the first reply or after the last. The
+      list of probes sent is derived from the sequence numbers, from lines about missing
+      replies, and from the packet count in the final summary.
     - Only numbers and units are read, so the language of the program does not matter. A decimal
       comma is read as a decimal point.
-    - Output that contradicts its own summary is refused. If the output does not show how the
-      measurement began or ended, the result records this fact.
+    - Output that contradicts its own summary is rejected. If the output does not show how the
+      measurement began or ended, this is recorded in the result.
 """
 
 import math
@@ -107,17 +107,17 @@ class _Summary(NamedTuple):
 
 
 def read_ping(text: str, every_s: float) -> _PingProbes:
-    """Reads the round trips from the output of one run of `ping` or `fping`.
+    """Parses the output of a single run of `ping` or `fping`.
 
-    The program that produced the output is recognised by its lines.
+    The program that produced the output is detected automatically.
 
     Args:
-        text: Text that the program printed.
-        every_s: Interval between probes, in s. It is used if the lines do not contain times.
+        text: Output of the program.
+        every_s: Interval between probes, in s. Used if the output contains no timestamps.
 
     Raises:
         ValueError: The text is not the output of `ping`, contains several runs, or contradicts
-            its summary.
+            its own summary.
     """
     lines = [line.rstrip() for line in text.splitlines()]
     if any(_NUMBER.search(line) for line in lines):

@@ -1,17 +1,16 @@
 """Explains errors in the tables of a scenario to its author.
 
-A scenario is a TOML file that describes an experiment. The library msgspec compares its tables
-with types, and refuses the first value that does not fit. Its message is written for
-programmers: "Expected `float | object`, got `str` - at `$.sites[...].arm.l1_m`". This module
-converts the message to an error that names the key as it is written in the file, and states the
-permitted values.
+The tables are validated by the library msgspec, which rejects the first value of the wrong
+type. Its message is meant for programmers: "Expected `float | object`, got `str` - at
+`$.sites[...].arm.l1_m`". This module converts such a message to an error that names the key as
+written in the file, and states the permitted values.
 
-The annotation of a type may describe the permitted values in words: `Meta(extra={"must_be": "a
-time in s"})`.
+A type annotation may describe the permitted values in words: `Meta(extra={"must_be": "a time in
+s"})`.
 
 Invariant:
-    - `refuse` composes every error message about a table that msgspec has refused. The tables
-      of operators and environments are an exception, because their keys have their own texts
+    - `refuse` composes the error message for every table that msgspec rejects, except for
+      tables of operators and environments, whose keys have messages of their own
       (`operators.VALUE_TEXTS`).
 """
 
@@ -68,21 +67,21 @@ def refuse(
     path: str,
     elsewhere: Sequence[str] = (),
 ) -> ScenarioError:
-    """Converts an error of the library msgspec to an error for the author of the refused table.
+    """Converts a msgspec validation error to an error meant for the author of the table.
 
-    The new error names the wrong key by its path in the scenario, and states the permitted
+    The new error names the wrong key by its path in the scenario and states the permitted
     values.
 
     Args:
-        error: Error that msgspec raised when it compared the table with its type.
-        table: The refused table.
+        error: Error raised by msgspec for the table.
+        table: The rejected table.
         kind: Type of the table.
-        path: Dotted path of the table in the scenario. Empty for the whole scenario.
-        elsewhere: Dotted paths of keys in other tables, which the author may have meant by an
+        path: Dotted path of the table in the scenario. Empty for the scenario itself.
+        elsewhere: Dotted paths of keys in other tables that the author may have meant by an
             unknown key.
 
     Returns:
-        The error with the path of the wrong key. The caller raises it.
+        The new error, to be raised by the caller.
     """
     message, location = _split_message(str(error), table, kind)
     number_location = _find_table_for_number(table, kind, location)
@@ -105,19 +104,17 @@ def refuse(
 
 
 def check_table(table: Any, kind: type[T], path: str, elsewhere: Sequence[str] = ()) -> T:
-    """Converts one table of a scenario to its type, and refuses unknown keys and wrong values.
+    """Converts one table of a scenario to an instance of `kind`.
 
     Args:
-        table: The table as its author wrote it.
+        table: The table as written by its author.
         kind: Type of the table.
         path: Dotted path of the table.
-        elsewhere: Dotted paths of keys in other tables, which the author may have meant.
-
-    Returns:
-        The table as a typed value.
+        elsewhere: Dotted paths of keys in other tables that the author may have meant.
 
     Raises:
-        ScenarioError: The table is refused. The error contains the path of the key.
+        ScenarioError: The table contains an unknown key or an invalid value. The error contains
+            the path of the key.
     """
     try:
         return msgspec.convert(table, kind)
@@ -128,20 +125,20 @@ def check_table(table: Any, kind: type[T], path: str, elsewhere: Sequence[str] =
 def convert_drawn(
     table: TomlTable, kind: type[T], path: str, drawn: Mapping[str, Distribution], seed: int
 ) -> T:
-    """Converts a complete table of a scenario, with its random numbers drawn, to its type.
+    """Converts a complete table of a scenario, after random numbers were drawn, to its type.
 
-    A drawn number that is not valid is reported with its distribution and seed.
+    An invalid drawn number is reported together with its distribution and seed.
 
     Args:
         table: The table.
         kind: Type of the complete table.
-        path: Dotted path of the table. Empty for the whole scenario.
-        drawn: Distributions of the drawn numbers, by the dotted key of the number.
+        path: Dotted path of the table. Empty for the scenario itself.
+        drawn: Mapping from dotted key to the distribution of each drawn number.
         seed: Seed with which the numbers were drawn.
 
     Raises:
-        ScenarioError: A value has a wrong type or range. If the value was drawn at random, the
-            error mentions this, because the author did not write the number.
+        ScenarioError: A value has a wrong type or is out of range. If the value was drawn at
+            random, the error says so, since the author did not write it.
     """
     try:
         return msgspec.convert(table, kind)

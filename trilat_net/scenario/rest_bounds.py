@@ -1,16 +1,16 @@
-"""Computes in advance how long an arm takes to stop, and how fast its joints may become.
+"""Computes bounds on how long an arm takes to stop and how fast its joints can move.
 
-An arm must stop if, for example, the network fails. Its controller then damps each joint in
-proportion to its speed, within the limits of the torques (`core.resting`). From the model of
-the arm and these limits, this module computes bounds of the time and of the speeds. It also
-determines whether the motors are strong enough for the arm's gravity and Coriolis torques.
+When an arm must stop, for example because the network failed, its controller damps each joint
+in proportion to its speed, within the torque limits (`core.resting`). This module derives
+bounds on the stopping time and on the speeds from the model of the arm and these limits. It
+also determines whether the motors are strong enough for the arm's gravity and Coriolis torques.
 
-The formulas are derived in docs/theory/coming-to-rest.md, and the numbers of equations in
-comments refer to it.
+The formulas are derived in docs/theory/coming-to-rest.md; equation numbers in comments refer to
+that page.
 
 Invariant:
-    - The bounds of a scenario, the description of an experiment, are always the same. The poses
-      at which the model is evaluated are random, but the seed of the generator is fixed.
+    - The bounds are deterministic for a given scenario. The model is evaluated at random poses,
+      but the seed of the generator is fixed.
 """
 
 import math
@@ -84,16 +84,15 @@ class _ArmSamples(NamedTuple):
 
 
 def find_rest_bounds(scenario: Scenario, site: str) -> _RestBounds:
-    """Computes bounds of the time, energy and speeds with which an arm comes to rest.
+    """Bounds the time, energy and joint speeds of an arm that comes to rest.
 
-    Before a real arm moves, its user needs to know how long and how fast the arm may still move
-    after a stop.
+    The user of a real arm needs to know how long and how fast the arm can move after a stop.
 
     Args:
-        scenario: Description of the experiment. The site must have the stale rule "glide",
-            under which damping brings the arm to rest when the site stops.
-        site: Name of the site whose arm stops. At the beginning, its joints are as fast as its
-            limits allow.
+        scenario: The scenario. The stale rule of the site must be "glide", under which an arm
+            is brought to rest by damping when its site stops.
+        site: Name of the site whose arm stops. Initially, its joints move as fast as its limits
+            allow.
     """
     spec = scenario.sites[site]
     setup = scenario.setup(site)

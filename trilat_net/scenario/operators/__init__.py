@@ -76,8 +76,7 @@ class ActorBase(fields.Frozen, frozen=True, tag_field="kind"):
 
     @property
     def actor(self) -> TorqueSource:
-        """Numerical parameters from which the torque of the operator or environment is
-        computed.
+        """Numerical parameters from which the simulation computes the torque or force.
 
         Compiled code cannot use Python objects, so the parameters are stored as numbers.
         """
