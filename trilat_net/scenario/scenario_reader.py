@@ -198,7 +198,7 @@ class ExperimentText(NamedTuple):
         """Applies overrides to the source and converts it to a complete scenario.
 
         Args:
-            overrides: Strings of the form KEY=VALUE. None by default.
+            overrides: Strings of the form KEY=VALUE. Empty by default.
 
         Raises:
             ScenarioError: The result is not a valid scenario.
