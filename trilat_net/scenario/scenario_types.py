@@ -177,8 +177,7 @@ class Scenario(Frozen, frozen=True, dict=True):
         return tuple(law.resolve_shares(self.names, self.alpha) for law in laws)
 
     def law_situations(self) -> Iterator[tuple[str, LawSettings, LawSituation]]:
-        """Yields each site with its control law and the quantities that determine its
-        stability.
+        """Yields each site with its control law and the quantities that affect stability.
 
         These are the delays, the rates of the control loops, and the dominance factors. A law
         with a stability condition evaluates the condition from them.
@@ -448,10 +447,9 @@ class Scenario(Frozen, frozen=True, dict=True):
         return " ".join(options)
 
     def refuse_external_arms(self, exempt: Collection[str] = ()) -> None:
-        """Raises ScenarioError if the scenario has arms that the program does not simulate
-        itself.
+        """Raises ScenarioError if the program does not simulate all arms itself.
 
-        Such an arm is either a real robot or simulated by a user's class.
+        An external arm is either a real robot or simulated by a user's class.
 
         Args:
             exempt: Names of sites whose arms may be external because their motion is read from
@@ -590,8 +588,7 @@ class Scenario(Frozen, frozen=True, dict=True):
         return layout._replace(bodies=_POSE_NUMBERS * len(self.bodies_m(site)))
 
     def bodies_m(self, site: str) -> dict[str, tuple[float, float, float]]:
-        """Returns the sizes of the bodies that a user's plant moves in addition to the arm, in
-        m.
+        """Returns the sizes of the bodies that a plant moves in addition to the arm, in m.
 
         For example, the arm may push a box.
 

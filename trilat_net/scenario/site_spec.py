@@ -133,8 +133,7 @@ class Limits(Frozen, frozen=True):
 
     @property
     def motion(self) -> MotionLimits:
-        """Limits on angles, reference speed and torque rate, in the form read by the control
-        loop.
+        """Limits on angles, reference speed and torque rate, as read by the control loop.
 
         Limits that the author left out are infinite, so the loop needs no special case.
         """
@@ -221,8 +220,7 @@ class SiteSpec(Frozen, frozen=True):
         return any(isinstance(hand, ProgramHand) for hand in self.hands)
 
     def find_hand_impedances(self) -> tuple[ArmLoad, ...] | None:
-        """Returns the impedance of each operator and environment that reacts to the arm's
-        motion.
+        """Returns the impedances of all operators and environments that react to motion.
 
         Excludes operators whose torque depends on time alone.
 

@@ -1,12 +1,11 @@
-"""Completes the tables of the sites of a scenario: arms, control laws, limits, operators.
+"""Completes the site tables of a scenario: arms, control laws, limits, operators.
 
-A scenario is a TOML file that describes an experiment. A site is a process that runs one arm.
-Its author may state keys once for all sites, in tables such as `[arm]`, and again for a single
-site. The law of an arm is the name of a built-in law, or a user's Python class as in
-"module:Class".
+Keys may be specified for all sites at once, in tables such as `[arm]`, and overridden for
+individual sites. The law of an arm is either the name of a built-in law or a user's Python
+class, given as "module:Class".
 
-The names, types and ranges of all keys have been checked before, see `written_tables`. Only
-random numbers can still be out of range, since they are drawn here.
+Names, types and ranges of all keys have already been checked (see `written_tables`). Only
+random numbers, which are drawn here, can still be out of range.
 """
 
 import math
@@ -65,14 +64,15 @@ class _SharedByAll(NamedTuple):
 def complete_site_tables(
     tables: TomlTable, rate_hz: int, draws: Draws, files: NamedFiles
 ) -> TomlTable:
-    """Returns the table of every arm of a scenario with all its keys, by name.
+    """Returns a mapping from site name to the complete table of the site.
 
-    Keys that the author left out get their values for all arms, or their defaults.
+    Keys that the author left out are taken from the tables for all sites, or set to their
+    defaults.
 
     Args:
         tables: Tables of the scenario file.
-        rate_hz: Tick rate of the sites that state no other, in Hz.
-        draws: Draws the numbers that are given as distributions.
+        rate_hz: Default tick rate, in Hz.
+        draws: Draws the numbers that are specified as distributions.
         files: Files that the sites name.
 
     Raises:

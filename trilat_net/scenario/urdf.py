@@ -1,23 +1,22 @@
-"""Reads arms from URDF files: joints between a base and an end link, and the moved bodies.
+"""Reads arms from URDF files: the joints between a base and an end link, and the moved bodies.
 
-URDF is an XML format for robots. A robot is a tree of links (bodies) and joints; an arm is the
-path from one link, the base, to another link, the tip. Links that are fixed to a link of the
-arm, and branches such as fingers, become part of its body. The units are kg, m, rad, N m, and N
-along a prismatic joint, as in URDF. Each link has the coordinate frame of the joint that moves
-it.
+A robot is a tree of links (bodies) and joints; an arm is the path from one link, the base, to
+another, the tip. Links fixed to a link of the arm, and branches such as fingers, become part of
+the body of that link. Units are those of URDF: kg, m, rad, N m, and N along a prismatic joint.
+Each link uses the coordinate frame of the joint that moves it.
 
 Invariant:
     - An arm is physically possible: every moving body has mass, and its principal moments of
       inertia are positive and satisfy the triangle inequality.
-    - Everything that is attached to a moving link is part of its body. A link that does not
-      lead to the tip never makes an arm unusable. If its inertia is impossible, a note says how
-      the link was treated.
-    - If a link on the way to the tip has an impossible inertia, the arm is refused and the link
-      is named, unless the caller permits the balancing of inertias or states another inertia
-      for the link.
-    - The text is not trusted: no file that it names is opened, and no entity is expanded.
-    - The numbers of an arm have the same bits on every machine. Therefore
-      `core.elementary.sincos` computes sines and cosines, and sums have a fixed order.
+    - Everything attached to a moving link is part of its body. A link that does not lead to the
+      tip never makes an arm unusable. If its inertia is impossible, a note says how the link
+      was treated.
+    - If a link on the way to the tip has an impossible inertia, the arm is rejected and the
+      error names the link, unless the caller allows inertias to be balanced or supplies another
+      inertia for the link.
+    - The file content is not trusted: no file named in it is opened, and no entity is expanded.
+    - The numbers of an arm have the same bits on every machine. Sines and cosines are therefore
+      computed with `core.elementary.sincos`, and sums have a fixed order.
 """
 
 import math
@@ -73,13 +72,13 @@ _KINDS = (*_MOVING_KINDS, "fixed", "floating", "planar")
 
 
 class UrdfPayload(NamedTuple):
-    """Body that is fixed to the tip of an arm, such as a tool that the URDF file lacks.
+    """Body fixed to the tip of an arm, such as a tool that is not in the URDF file.
 
     Attributes:
         mass_kg: Mass, in kg.
-        com_m: Centre of mass in the frame of the tip, in m.
-        inertia_kg_m2: Ixx, Ixy, Iyy, Ixz, Iyz, Izz about the centre of mass, in the axes of the
-            tip, in kg m^2.
+        com_m: Centre of mass in the tip frame, in m.
+        inertia_kg_m2: Ixx, Ixy, Iyy, Ixz, Iyz, Izz about the centre of mass, along the axes of
+            the tip frame, in kg m^2.
     """
 
     mass_kg: float
@@ -88,24 +87,22 @@ class UrdfPayload(NamedTuple):
 
 
 class UrdfJoint(NamedTuple):
-    """Moving joint of an arm that was read from a URDF file, with the body that it moves.
-
-    The body includes everything that is fixed to it.
+    """Moving joint of an arm in a URDF file, with the body that it moves.
 
     Attributes:
         name: Name of the joint.
-        link: Name of the link that the joint moves.
+        link: Name of the link moved by the joint.
         kind: "revolute" (also for a continuous joint) or "prismatic".
-        axis: Unit vector of the axis in the joint's frame.
-        rotation: Orientation of the joint's frame at q = 0, three rows, in the frame of the
-            previous moving link. For the first joint, in the frame of the base.
-        origin_m: Origin of the joint's frame, in the same frame, in m.
-        inertia: Inertial parameters of the body in the joint's frame, including everything that
-            is fixed to the link.
-        lower: Smallest position, in rad or m. -inf if the file states no limit.
-        upper: Largest position, in rad or m. inf if the file states no limit.
-        effort_limit: Largest torque or force, in N m or N. inf if the file states no limit.
-        velocity_limit: Largest speed, in rad/s or m/s. inf if the file states no limit.
+        axis: Unit vector of the joint axis in the joint frame.
+        rotation: Orientation of the joint frame at q = 0, as three rows, relative to the frame
+            of the previous moving link (the base frame for the first joint).
+        origin_m: Origin of the joint frame in that same frame, in m.
+        inertia: Inertial parameters of the body in the joint frame, including everything fixed
+            to the link.
+        lower: Smallest position, in rad or m; -inf if the file has no limit.
+        upper: Largest position, in rad or m; inf if the file has no limit.
+        effort_limit: Largest torque or force, in N m or N; inf if the file has no limit.
+        velocity_limit: Largest speed, in rad/s or m/s; inf if the file has no limit.
         viscous: Viscous friction, in N m s/rad or N s/m.
         coulomb: Coulomb friction, in N m or N.
     """
@@ -126,17 +123,16 @@ class UrdfJoint(NamedTuple):
 
 
 class UrdfChain(NamedTuple):
-    """Arm that was read from a URDF file: its moving joints from a base link to a tip link.
-
-    URDF is the usual XML format for the links and joints of a robot.
+    """Arm read from a URDF file: the moving joints from a base link to a tip link.
 
     Attributes:
-        base: Name of the link that does not move.
+        base: Name of the fixed link.
         tip: Name of the link at the end of the arm.
-        joints: 1 to `MAX_JOINTS` joints, starting at the base.
-        tip_rotation: Orientation of the tip in the frame of the last moving link, three rows.
-        tip_origin_m: Origin of the tip in the same frame, in m.
-        notes: Sentences about details that the author of the file may not have intended.
+        joints: 1 to `MAX_JOINTS` joints, from the base to the tip.
+        tip_rotation: Orientation of the tip in the frame of the last moving link, as three
+            rows.
+        tip_origin_m: Origin of the tip in that same frame, in m.
+        notes: Notes on details that the author of the file may not have intended, as sentences.
     """
 
     base: str
@@ -168,7 +164,7 @@ class _Edge(NamedTuple):
 
     @property
     def moves(self) -> bool:
-        """True if the joint can move a link of an arm. A fixed joint cannot."""
+        """True if the joint can move a link of an arm, that is, if it is not a fixed joint."""
         return self.kind in _MOVING_KINDS
 
 
@@ -227,20 +223,18 @@ def read_urdf(
     *,
     balance: bool = False,
 ) -> UrdfChain:
-    """Reads the arm between two links of a robot from a URDF file.
+    """Parses the arm between two links of a robot from a URDF file.
 
-    URDF is the usual XML format for the links and joints of a robot. A link on a fixed joint is
-    part of the moving link that carries it. The same holds for a branch with joints of its own,
-    such as fingers: these joints are held at zero, and a note says so.
+    A link on a fixed joint becomes part of the moving link that carries it. So does a branch
+    with joints of its own, such as fingers: these joints are held at zero, and a note says so.
 
     Args:
-        text: Text of the URDF file.
-        base: Name of the link that does not move. By default, the root of the robot.
-        tip: Name of the link at the end of the arm. By default, the only moving link that
-            carries no other link.
-        payload: Body, such as a tool, that is fixed to the tip. None if there is none.
-        links: Masses and inertias that replace those in the file, by the name of the link.
-        balance: If True, an impossible inertia is replaced by the nearest possible one.
+        text: Content of the URDF file.
+        base: Name of the fixed link. By default, the root of the robot.
+        tip: Name of the link at the end of the arm. By default, the only moving leaf link.
+        payload: Body fixed to the tip, such as a tool.
+        links: Mapping from link name to the mass and inertia that override those in the file.
+        balance: If True, an impossible inertia is replaced with the nearest possible one.
 
     Raises:
         ScenarioError: The file cannot be used. The error names the line, link or joint. If a

@@ -1,16 +1,15 @@
-"""Refuses scenarios that cannot work, and converts all others to types.
+"""Validates complete scenarios and converts them to typed objects.
 
-A scenario is the description of an experiment. The types of its tables limit each single key.
-The functions of this module check conditions that involve several keys, for example that a
-joint starts within its stops. `build_scenario` does both.
+The types of the tables restrict individual keys. This module checks conditions that involve
+several keys, for example that a joint starts within its stops. `build_scenario` does both.
 
-`check_outside_arms` is for callers that need more than a valid scenario: a live session with
-real robots.
+`check_outside_arms` performs the additional checks required for a live session with real
+robots.
 
 Invariant:
     - An error contains the path of the key in the scenario file.
     - Some control laws have requirements that not every scenario satisfies, such as a known arm
-      or exactly two sites. If a requirement is not satisfied, the scenario is refused with the
+      or exactly two sites. If a requirement is not satisfied, the scenario is rejected with the
       reason before anything runs.
 """
 
@@ -101,14 +100,14 @@ def _refuse_assumed_limit(scenario: Scenario, name: str, key: str) -> None:
 
 
 def check_outside_arms(scenario: Scenario) -> None:
-    """Refuses real robots that lack limits, or whose reference could jump.
+    """Raises ScenarioError if a real robot lacks limits or its reference could jump.
 
-    The reference is the position that an arm follows. It could jump when messages of another
-    arm stop arriving or arrive again, except under the rule "glide". The check is made only
-    before a session, because the scenarios in logs of earlier versions may lack these keys.
+    Except under the stale rule "glide", the reference could jump when samples of a peer stop
+    arriving or arrive again. The check is performed only before a session, since the scenarios
+    in logs of earlier versions may lack these keys.
 
     Args:
-        scenario: Description of the experiment.
+        scenario: The scenario.
 
     Raises:
         ScenarioError: A key is missing or wrong. The error contains the path of the first such
@@ -219,16 +218,17 @@ def _check_plant(path: str, site: SiteSpec) -> None:
 
 
 def build_scenario(resolved: TomlTable) -> Scenario:
-    """Converts complete tables of a scenario to an object, and checks them against each other.
+    """Converts the complete tables of a scenario to a `Scenario` and validates it.
 
-    The order of the checks decides which error is reported if a scenario contains several.
+    If a scenario contains several errors, the order of the checks determines which one is
+    reported.
 
     Args:
         resolved: Tables from `resolve.resolve_scenario`.
 
     Raises:
-        ScenarioError: A value has a wrong type or range, or values contradict each other. The
-            error contains the path of the key.
+        ScenarioError: A value has a wrong type or is out of range, or values contradict each
+            other. The error contains the path of the key.
     """
     scenario = convert_drawn(
         table=resolved,
@@ -575,17 +575,16 @@ def _check_task_pose(scenario: Scenario, name: str) -> None:
 
 
 def find_row_problem(row: Array, site: int) -> str | None:
-    """Returns why a row of the dominance matrix is not valid, Eq. (7), or None if it is.
+    """Checks one row of the dominance matrix, Eq. (7).
 
-    The row contains the weights with which one arm follows the others. They must lie between 0
-    and 1 and sum to 1, and the arm must not follow itself.
+    The factors must lie between 0 and 1 and sum to 1, and the arm must not follow itself.
 
     Args:
         row: Dominance factors of one site, shape (N,).
         site: Index of that site.
 
     Returns:
-        A clause for an error message. None if the row is valid.
+        The problem as a clause for an error message, or None if the row is valid.
     """
     if not np.isfinite(row).all():
         return "shares must be finite numbers"
@@ -648,14 +647,14 @@ def _check_hands(site: SiteSpec, path: str) -> None:
 
 
 def check_links_memory(scenario: Scenario, site: str) -> None:
-    """Refuses network links on which too many messages would wait for the memory.
+    """Raises ScenarioError if messages waiting on the links would need too much memory.
 
     A message waits at the receiver until its simulated delay has passed. The memory grows with
-    the delay, the rate of the control loop and the number of arms. `MAX_LINKS_BYTES` is the
-    limit.
+    the delay, the rate of the control loop and the number of arms, and is limited to
+    `MAX_LINKS_BYTES`.
 
     Args:
-        scenario: Description of the experiment, with its links and tick rates.
+        scenario: The scenario, with its links and tick rates.
         site: Name of the site that receives the samples.
 
     Raises:
@@ -763,17 +762,16 @@ def _can_lose_master(scenario: Scenario, name: str) -> bool:
 
 
 def check_change(change: Change, path: str) -> None:
-    """Checks that a link has valid settings after a change during a run.
+    """Raises ScenarioError if a link would have invalid settings after a change.
 
-    A link is the one-way network connection between two sites, the processes of the arms. Other
-    changes are accepted, because they have been checked before.
+    Changes other than those of a link have already been checked and are accepted.
 
     Args:
-        change: The change, of a link or of the weights with which a site follows the others.
+        change: Change of a link or of a site's dominance factors.
         path: Path of the change in the scenario, for error messages.
 
     Raises:
-        ScenarioError: A setting of the link is not valid, or the change of a link states a
+        ScenarioError: A setting of the link is not valid, or the change of a link specifies a
             transition time. The error contains the path of the key.
     """
     if not change.link:

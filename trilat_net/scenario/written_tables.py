@@ -1,17 +1,17 @@
-"""Defines the tables that the author of a scenario may write, and refuses all other tables.
+"""Types of the tables that the author of a scenario may write.
 
-A scenario is a TOML file that describes an experiment. Its author writes less than the program
-needs: most keys may be left out, tables such as `[arm]` apply to all sites, one number may
-stand for a vector, and a random distribution may stand for a number. `WrittenScenario` is the
-type of such a file, and `scenario_types.Scenario` the type of the complete description.
+An author writes less than the program needs: most keys may be left out, tables such as `[arm]`
+apply to all sites, one number may stand for a vector, and a random distribution may stand for a
+number. `WrittenScenario` is the type of such a file, and `scenario_types.Scenario` is the type
+of the complete scenario.
 
-The keys of some tables depend on one of their values, such as the law of `[control]`. These
-tables are checked separately, as soon as that value is known: by `check_control`, `check_link`
-and `operators.resolve_operators`.
+The keys of some tables depend on one of their values, such as the law in `[control]`. These
+tables are checked separately, once that value is known, by `check_control`, `check_link` and
+`operators.resolve_operators`.
 
 Invariant:
-    - The keys, types and ranges of a group such as `arm` are stated once, in its complete type.
-      The type of the written table follows from it, see `written_kind`.
+    - The keys, types and ranges of a group such as `arm` are declared once, in its complete
+      type. The type of the written table is derived from it (see `written_kind`).
 """
 
 import re
@@ -85,10 +85,10 @@ key does not name them as the owners of the key.
 
 
 class WrittenSite(Frozen, frozen=True, kw_only=True):
-    """Table of one arm as an author may write it.
+    """Table of one site as written by an author.
 
-    The complete form is `site_spec.SiteSpec`. The keys of `control`, `view` and of the
-    tables in the lists depend on the kind that the table names.
+    `site_spec.SiteSpec` is the complete form. The keys of `control`, `view` and the tables in
+    the lists depend on the kind named in the table.
     """
 
     role: Literal["master", "slave"] | UnsetType = UNSET
@@ -107,10 +107,9 @@ class WrittenSite(Frozen, frozen=True, kw_only=True):
 
 
 class WrittenChange(Frozen, frozen=True, kw_only=True, omit_defaults=True):
-    """Planned change of a network link, or of weights, as an author may write it.
+    """Planned change of a network link or of dominance factors, as written by an author.
 
-    The weights (dominance factors) state how much an arm follows the others. The keys of `to`
-    depend on what is changed, see `change.Change`.
+    The keys of `to` depend on what is changed (see `change.Change`).
     """
 
     at_s: Annotated[float, Meta(extra={"must_be": "a time in s"})]
@@ -121,18 +120,18 @@ class WrittenChange(Frozen, frozen=True, kw_only=True, omit_defaults=True):
 
 
 class WrittenScenario(Frozen, frozen=True, kw_only=True):
-    """Tables of a scenario file as its author may write them, with many keys left out.
+    """A scenario file as written by an author, with many keys left out.
 
     `scenario_types.Scenario` is the complete form.
 
     Attributes:
-        rate_hz: Tick rate of all sites that state no other, in Hz.
-        arm: Keys of the arms of all sites. A site may state other values.
-        limits: Limits of all sites.
-        on_stale: Stale rule of all sites.
-        task: Shared coordinates of all sites.
-        control: Control law of all sites, with its gains.
-        link: Settings of all links.
+        rate_hz: Default tick rate, in Hz.
+        arm: Default arm of all sites.
+        limits: Default limits of all sites.
+        on_stale: Default stale rule of all sites.
+        task: Default shared coordinates of all sites.
+        control: Default control law of all sites, with its gains.
+        link: Default settings of all links.
     """
 
     name: ScenarioName
@@ -161,18 +160,19 @@ class WrittenScenario(Frozen, frozen=True, kw_only=True):
 
     @classmethod
     def check(cls, tables: TomlTable) -> "WrittenScenario":
-        """Refuses a scenario file with an unknown key, or a value of a wrong type or range.
+        """Converts the tables of a scenario file to a `WrittenScenario`.
 
         Conditions that involve several tables are checked later.
 
         Args:
-            tables: Tables of the file as its author wrote them.
+            tables: Tables of the file as written by its author.
 
         Returns:
-            The tables as typed values, with the defaults of the whole scenario.
+            The typed tables, with the defaults of scenario-level keys filled in.
 
         Raises:
-            ScenarioError: A key is unknown or missing, or a value has a wrong type or range.
+            ScenarioError: A key is unknown or missing, or a value has a wrong type or is out of
+                range.
         """
         check_finite(tables, "")
         try:
@@ -215,10 +215,10 @@ def _check_site_names(names: Collection[str]) -> None:
 
 
 def check_control(table: TomlTable, law: str, path: str) -> None:
-    """Refuses a control law's table with a key that the law does not have, or a wrong gain.
+    """Raises ScenarioError if a `control` table has an unknown key or an invalid gain.
 
     Args:
-        table: The table as its author wrote it.
+        table: The table as written by its author.
         law: Name of a built-in law, or "own".
         path: Dotted path of the table.
     """
@@ -227,10 +227,10 @@ def check_control(table: TomlTable, law: str, path: str) -> None:
 
 
 def check_link(table: TomlTable, model: str, path: str) -> None:
-    """Refuses a network link's table with a key that its delay model does not have.
+    """Raises ScenarioError if a link table has a key that its delay model does not have.
 
     Args:
-        table: The table as its author wrote it.
+        table: The table as written by its author.
         model: Name of the delay model.
         path: Dotted path of the table.
     """

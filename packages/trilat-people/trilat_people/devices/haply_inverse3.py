@@ -1,11 +1,11 @@
-"""Connects to the haptic device Inverse3 of Haply, through the service of its maker.
+"""Driver for the Haply Inverse3 haptic device.
 
-The service is a program on the same machine. It exchanges JSON messages with this program over
-a WebSocket. This program sends a force, and the service replies with one state of the device. A
-new state therefore arrives only after the next force was sent, even if the force is zero.
+Communicates with the manufacturer's service, a program on the same machine, by JSON messages
+over a WebSocket. The service replies to each force with one state of the device, so a new state
+arrives only after the next force has been sent, even if the force is zero.
 
-If a message of the service cannot be parsed, the state is returned with a position that is not
-finite. The class `DeviceHand`, which moves the arm, ignores such a state.
+If a message from the service cannot be parsed, the state is returned with a non-finite
+position, which `DeviceHand` ignores.
 """
 
 import math
@@ -46,10 +46,10 @@ _CONNECT_OPTIONS: dict[str, Any] = {
 
 
 class HaplyInverse3:
-    """The haptic device Inverse3 of Haply, as an input device that applies forces.
+    """Haply Inverse3: an input device with force feedback.
 
-    The device and its wireless grip are reached through version 3 of the maker's service, a
-    program that must run on this machine or another.
+    Connects to the device and its wireless grip through version 3 of the manufacturer's
+    service, which must be running on this or another machine.
 
     >>> tn.session("play").lead("m1", tn.HaplyInverse3())  # doctest: +SKIP
 
@@ -95,9 +95,7 @@ class HaplyInverse3:
         self._open.close()
 
     def read(self) -> DeviceState:
-        """Waits for the next state of the haptic device: position, velocity and buttons.
-
-        A service of its manufacturer sends the states.
+        """Waits for the next state of the device: position, velocity and buttons.
 
         Raises:
             ConnectionError: The service has no device, or has closed the connection.
@@ -147,11 +145,11 @@ class HaplyInverse3:
     def render(self, force_n: Vector) -> None:
         """Sends a force to the device, which applies it to the person.
 
-        The message also requests the next state. Nothing is sent before the first state, which
-        contains the identity of the device.
+        The message also requests the next state. Nothing is sent before the first state has
+        arrived, since it contains the identity of the device.
 
         Args:
-            force_n: Coordinates x, y and z of the force, in N.
+            force_n: Force along x, y and z, in N.
         """
         if self._socket is None or not self._id:
             return
