@@ -46,7 +46,7 @@ class CompletionTime(NamedTuple):
             (`timed_out`) or because they failed earlier.
         timed_out: Number of trials that reached the time limit.
         number: Number of units (participants or pairs).
-        median: Median over units of each unit's median time, in s. `None` if it was not
+        median: Median over units of each unit's median time, in s. `None` if the median was not
             reached.
         interval: Confidence interval of the median at a level of at least 95 %, from order
             statistics, in s. The upper end is `None` if it was not reached. The entire interval

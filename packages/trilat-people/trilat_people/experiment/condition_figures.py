@@ -1,14 +1,13 @@
-"""Draws figures that compare a measure between the conditions of an experiment with people.
+"""Figures that compare a measure between the conditions of an experiment with people.
 
 `draw_conditions` shows a measure by condition, and `draw_learning` shows it over the trials of
 a block. If some trials were not completed in time, their completion time is only known to
-exceed the limit. A mean does not exist in this case, and `draw_times` shows medians instead.
+exceed the limit, so there is no mean, and `draw_times` shows medians instead.
 
 Invariant:
-    - For each participant, a point is drawn for each condition with data, and a thin line joins
-      the points.
-    - Means with their intervals are drawn on top.
-    - Equal rows give equal bytes.
+    - Each participant is drawn as one point per condition with data, joined by a thin line.
+    - Means and their intervals are drawn on top.
+    - Equal rows give byte-identical figures.
 """
 
 import math
@@ -48,15 +47,15 @@ _LIMIT: Look = {"color": style.FAINT, "linewidth": 1.0, "linestyle": "--"}
 
 
 def draw_conditions(rows: Sequence[Row], measure: str, *, unit: str = "participant") -> Figure:
-    """Draws one measure of an experiment, such as the completion time, under each condition.
+    """Plots one measure of an experiment, such as the completion time, by condition.
 
-    The figure shows the mean of each participant (or pair of participants), and the mean over
-    them with its 95 % interval.
+    Shows the mean of each participant (or pair of participants), and the overall mean with its
+    95 % confidence interval.
 
     Args:
-        rows: A row per trial, as for `statistics`.
+        rows: One row per trial, as for `statistics`.
         measure: Name of the measure in the rows.
-        unit: "participant" or "pair", for which means are computed first.
+        unit: Unit over which trials are averaged first, "participant" or "pair".
     """
     all_means = average_trials(rows, measure, unit)
     means = {condition: by_unit for condition, by_unit in all_means.items() if by_unit}
@@ -82,15 +81,15 @@ def draw_conditions(rows: Sequence[Row], measure: str, *, unit: str = "participa
 
 
 def draw_times(rows: Sequence[Row], limit_s: float, *, unit: str = "participant") -> Figure:
-    """Draws the completion times under each condition, for trials with a time limit.
+    """Plots the completion times under each condition, for trials with a time limit.
 
-    The points are the medians of each participant or pair. An open marker on the line of the
+    Points are the medians of each participant or pair. An open marker on the line of the time
     limit represents a median beyond the limit.
 
     Args:
-        rows: A row per trial, as for `completion_times`.
+        rows: One row per trial, as for `completion_times`.
         limit_s: Time limit of a trial, in s.
-        unit: "participant" or "pair", for which medians are computed first.
+        unit: Unit over which medians are taken first, "participant" or "pair".
     """
     medians = find_unit_medians(rows, unit)
     interval_style = {**_MEAN, "marker": "_"}
@@ -219,16 +218,16 @@ def draw_learning(
     unit: str = "participant",
     limit_s: float | None = None,
 ) -> Figure:
-    """Draws how a measure changes from trial to trial of a block, with a line per condition.
+    """Plots how a measure changes from trial to trial of a block, with one line per condition.
 
     Args:
-        rows: A row per trial, as for `statistics`, with the number of each `trial` in its
-            block.
+        rows: One row per trial, as for `statistics`, including the number `trial` of the trial
+            in its block.
         measure: Name of the measure in the rows.
-        unit: "participant" or "pair", for which means are computed first.
-        limit_s: Time limit of a trial, in s, if some trials were not completed in time. The
-            figure then shows medians, and open markers on the line of the limit for medians
-            beyond it. `None` if all trials were completed.
+        unit: Unit over which trials are averaged first, "participant" or "pair".
+        limit_s: Time limit of a trial, in s, if some trials were not completed in time; medians
+            are then plotted, with open markers on the line of the limit for medians beyond it.
+            `None` if all trials were completed.
     """
     if limit_s is not None:
         return _draw_learning_times(rows, limit_s, unit)

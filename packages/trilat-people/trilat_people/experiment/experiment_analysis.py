@@ -1,13 +1,13 @@
-"""Analyses an experiment with people: means, comparisons of the conditions, and figures.
+"""Analyses an experiment with people: means, comparisons between conditions, and figures.
 
-`analyse_experiment` reads the results that were stored during the experiment, and writes
-tables, figures and a report into the folder of the experiment. `compute_experiment_power` is
-called before an experiment, to plan the number of participants.
+`analyse_experiment` reads the stored results and writes tables, figures and a report into the
+folder of the experiment. `compute_experiment_power` is used before an experiment to plan the
+number of participants.
 
 Invariant:
     - The analysis depends only on the stored results.
-    - Practice and catch trials are not evaluated.
-    - A trial that was not completed is evaluated. Its completion time is censored: it counts as
+    - Practice trials and catch trials are excluded.
+    - A trial that was not completed is included. Its completion time is censored: it counts as
       longer than that of any completed trial (see `completion_times`).
     - Every number in a figure or a sentence is also in a table.
 """
@@ -125,43 +125,44 @@ def _format_fact(value: Any, name: str = "") -> str:
 
 
 class ExperimentAnalysis(Result):
-    """The statistics of an experiment: comparisons of its conditions, and facts of the study.
+    """Statistics of an experiment: comparisons between its conditions, and facts about the
+    study.
 
-    Creating this object computes everything except the figures, which `write` draws. A unit is
-    a participant or a pair, whichever is sampled independently. Every measure that trials have
-    is summarised, even if all of its values are equal. If values of a measure are missing,
-    their number is stated.
+    Everything is computed on construction, except for the figures, which are drawn by `write`.
+    A unit is a participant or a pair, whichever is sampled independently. Every measure of the
+    trials is summarised, even if all of its values are equal. The number of missing values is
+    reported.
 
     Args:
-        experiment: The experiment in its folder.
-        exclude: Participants or pairs whose data are left out, with the reasons.
+        experiment: The experiment to analyse.
+        exclude: Mapping from each participant or pair to exclude to the reason.
 
     Attributes:
-        unit: "participant" or "pair", which is sampled independently.
-        rows: Evaluated trials, as a table. If there is a training, only trials after it are
+        unit: The independently sampled unit, "participant" or "pair".
+        rows: Table of evaluated trials. If there is a training, only trials after it are
             included.
-        learning_rows: Evaluated trials in all phases of a training.
-        throughput_rows: Throughput (speed and accuracy in one number) of each unit and
+        learning_rows: Table of evaluated trials in all phases of a training.
+        throughput_rows: Throughput (a combined measure of speed and accuracy) by unit and
             condition.
-        gain_rows: Improvement by a training, of each unit and condition.
-        threshold_rows: Threshold of perception by a staircase, of each unit and condition.
-        means: For each measure, the mean under each condition. `completion_s` is included only
-            if all trials were completed.
-        comparisons: For each measure, the comparison of each pair of conditions.
+        gain_rows: Improvement through training, by unit and condition.
+        threshold_rows: Perception threshold from a staircase, by unit and condition.
+        means: Mapping from measure to its mean under each condition. `completion_s` is included
+            only if all trials were completed.
+        comparisons: Mapping from measure to the comparisons of all pairs of conditions.
         times: Completion time under each condition, for a task with a time limit.
         time_comparisons: Comparison of the completion times of each pair of conditions, if some
             trials were not completed.
-        missing_answers: Missing answers of each questionnaire and condition.
-        absent: For each measure that this experiment could have but that has no value in any
-            trial, the reason.
-        models: Mixed models of the forces of users within pairs.
-        study: Facts of the study that a paper states: participants, conditions with the
-            measured delays, law, gains, seed, and the analyses that were computed.
-        paths: Files that were written.
+        missing_answers: Missing answers by questionnaire and condition.
+        absent: Mapping from each applicable measure that has no value in any trial to the
+            reason.
+        models: Mixed models of the users' forces, with users nested in pairs.
+        study: Facts to report in a paper: participants, conditions with the measured delays,
+            law, gains, seed, and the analyses performed.
+        paths: Paths of the files written.
 
     Raises:
-        UsageError: No evaluated trial is finished, or an excluded participant or pair does not
-            exist.
+        UsageError: No trial to evaluate has finished, or an excluded participant or pair does
+            not exist.
     """
 
     def __init__(self, experiment: Experiment, exclude: Mapping[str, str] = {}) -> None:
@@ -368,7 +369,7 @@ class ExperimentAnalysis(Result):
             )
 
     def of(self, measure: str) -> Sequence[Row]:
-        """Returns the rows of the result table that contains a given measure.
+        """Returns the rows of the result table that contains a measure.
 
         Depending on the measure, a row is a trial, a participant or pair, or a completed
         questionnaire.
@@ -377,8 +378,8 @@ class ExperimentAnalysis(Result):
             measure: Name of the measure, such as "completion_s".
 
         Returns:
-            The rows, as mappings from column names to values. Empty if no questionnaire has the
-            measure.
+            The rows, each a mapping from column name to value. Empty if no questionnaire has
+            the measure.
         """
         rows_by_kind = {
             "throughput": self.throughput_rows,
@@ -582,12 +583,10 @@ class ExperimentAnalysis(Result):
         return [analysis for analysis, computed in is_computed.items() if computed]
 
     def write(self, folder: Path) -> "ExperimentAnalysis":
-        """Writes the tables, figures and the report of an experiment into a folder.
-
-        Afterwards, `paths` lists the written files.
+        """Writes the tables, figures and report of the analysis, and lists them in `paths`.
 
         Args:
-            folder: Folder of the files.
+            folder: Folder to write to.
 
         Returns:
             This analysis.
@@ -658,13 +657,10 @@ class ExperimentAnalysis(Result):
         return figures
 
     def compose_page(self, figures: Sequence[str]) -> str:
-        """Composes the Markdown page that reports the results of the experiment.
+        """Returns the Markdown page that reports the results of the experiment.
 
         Args:
-            figures: Names of the PNG files beside the page, without the suffix.
-
-        Returns:
-            The text of the page.
+            figures: Names of the PNG files in the folder of the page, without the suffix.
         """
         protocol = self._experiment.plan.protocol
         paragraphs = [f"# {protocol.title or protocol.name}"]
@@ -679,14 +675,13 @@ class ExperimentAnalysis(Result):
         return "\n\n".join(paragraphs) + "\n"
 
     def fit_models(self) -> Iterator[MixedModel]:
-        """Fits mixed models to the mean and the peak force of users who act in pairs.
+        """Fits mixed models to the mean and peak force of users who act in pairs.
 
-        A mixed model accounts for the fact that the two users of a pair are not independent.
+        A mixed model accounts for the dependence between the two users of a pair.
 
         Yields:
-            One model for each of the two measures, as soon as it is fitted. There are no models
-            if participants act alone, if there are too few pairs, or if the package statsmodels
-            is not installed.
+            One model per measure, as soon as it is fitted. Yields nothing if participants act
+            alone, if there are too few pairs, or if the package statsmodels is not installed.
         """
         pairs = {row[self.unit] for row in self.rows}
         has_pairs = self.unit == "pair" and len(pairs) >= 2
@@ -712,18 +707,18 @@ class ExperimentAnalysis(Result):
         return rows
 
     def to_rows(self) -> list[dict[str, Any]]:
-        """Returns a table of the comparisons, one row per measure and pair of conditions.
+        """Returns the comparisons as a table, with one row per measure and pair of conditions.
 
-        The file comparisons.csv and the data frame of this result have these rows.
+        These are the rows of comparisons.csv and of the data frame of this result.
         """
         return [test._asdict() for test in chain.from_iterable(self.comparisons.values())]
 
     def to_dict(self) -> dict[str, Any]:
-        """Returns all results of the experiment as plain values.
+        """Returns all results as plain values, as printed by `trilat experiment analyse
+        --json`.
 
-        These are the means of the conditions, their comparisons, completion times, missing
-        answers, fitted models and the facts of the study. `trilat experiment analyse --json`
-        prints them.
+        Includes the means of the conditions, their comparisons, completion times, missing
+        answers, fitted models and the facts about the study.
         """
         models = {model.measure: model._asdict() for model in self.models}
         for model in models.values():
@@ -743,12 +738,12 @@ class ExperimentAnalysis(Result):
         }
 
     def blocks(self) -> Iterator[Block]:
-        """Yields the parts of the text that `trilat experiment analyse` prints.
+        """Yields the parts of the report that `trilat experiment analyse` prints.
 
-        The parts are a summary of completed trials, the means and comparisons of the measures,
-        the fitted models, the number of missing questionnaire answers, the reasons why a
-        measure has no value, and the facts of the study. With a single participant or pair
-        there are no comparisons, and one table has all measures.
+        These are a summary of completed trials, the means and comparisons of the measures, the
+        fitted models, the number of missing questionnaire answers, the reasons why a measure
+        has no value, and the facts about the study. With a single participant or pair, there
+        are no comparisons, and all measures are in one table.
         """
         yield from self._write_time_blocks()
 
@@ -934,9 +929,9 @@ def analyse_experiment(
     *,
     exclude: Mapping[str, str] = {},
 ) -> ExperimentAnalysis:
-    """Computes the statistics of an experiment and writes them into its folder.
+    """Analyses an experiment and writes the results into its folder.
 
-    The command is `trilat experiment analyse`.
+    Equivalent to the command `trilat experiment analyse`.
 
     >>> analysis = tn.analyse_experiment("runs/experiment-reaching-001")  # doctest: +SKIP
     >>> near, *_ = analysis.means["completion_s"]  # doctest: +SKIP
@@ -945,12 +940,12 @@ def analyse_experiment(
 
     Args:
         folder: Folder of the experiment.
-        out: Folder for tables and figures. Default: the folder `analysis` in the experiment's
-            folder.
-        exclude: Participants or pairs whose data are left out, with the reasons.
+        out: Folder for tables and figures. By default, the subfolder `analysis` of the
+            experiment.
+        exclude: Mapping from each participant or pair to exclude to the reason.
 
     Raises:
-        UsageError: There is no experiment, no trial is finished, or an excluded participant or
+        UsageError: There is no experiment, no trial has finished, or an excluded participant or
             pair does not exist.
     """
     experiment = open_experiment(folder)
@@ -961,23 +956,22 @@ def analyse_experiment(
 
 
 class PowerOfExperiment(Result):
-    """Number of participants that an experiment needs to detect an effect of a given size.
-
-    The power is the probability that the test finds an effect that exists.
+    """Number of participants needed to detect an effect of a given size.
 
     Args:
-        d_z: Size of the effect.
+        d_z: Effect size.
         participants: Planned number of participants, or `None`.
         seed: Seed of the simulated experiments.
 
     Attributes:
-        d_z: Size of the effect: mean over standard deviation of the differences within
-            participants.
-        least: Smallest number of participants for each desired power.
-        participants: Planned number of participants. `None` if no number is planned.
-        power: Power with the planned number, computed with the noncentral t distribution.
-        simulated: Power with the planned number from simulated experiments, with its 95 %
-            interval.
+        d_z: Effect size: mean of the within-participant differences divided by their standard
+            deviation.
+        least: Mapping from desired power to the smallest number of participants.
+        participants: Planned number of participants, or `None`.
+        power: Power with the planned number of participants, computed from the noncentral t
+            distribution.
+        simulated: Power with the planned number of participants, from simulated experiments,
+            with its 95 % interval.
     """
 
     def __init__(self, d_z: float, participants: int | None, seed: int) -> None:
@@ -1000,10 +994,10 @@ class PowerOfExperiment(Result):
             )
 
     def to_dict(self) -> dict[str, Any]:
-        """Returns plain values for `trilat experiment power --json`.
+        """Returns the result as plain values for `trilat experiment power --json`.
 
-        These are the effect size, the participants needed for each statistical power, and the
-        power that the planned number of participants gives, both computed and simulated.
+        Contains the effect size, the number of participants needed for each power, and the
+        computed and simulated power for the planned number of participants.
         """
         simulated = None if self.simulated is None else self.simulated._asdict()
         least = []
@@ -1018,11 +1012,11 @@ class PowerOfExperiment(Result):
         }
 
     def blocks(self) -> Iterator[Block]:
-        """Yields the parts of the text that `trilat experiment power` prints.
+        """Yields the parts of the report that `trilat experiment power` prints.
 
-        A table shows how many participants are needed for each statistical power, which is the
-        probability of finding a true effect. If a number of participants is planned, a sentence
-        follows with the power that this number gives.
+        A table lists the number of participants needed for each power, the probability of
+        detecting a true effect. If a number of participants is planned, a sentence states the
+        resulting power.
         """
         yield (
             "paired comparison of two conditions, two-sided, alpha 0.05, "
@@ -1044,17 +1038,18 @@ class PowerOfExperiment(Result):
 def compute_experiment_power(
     effect: float, participants: int | None = None, *, seed: int = 1
 ) -> PowerOfExperiment:
-    """Computes the number of participants that are needed to detect an effect.
+    """Computes the number of participants needed to detect an effect.
 
-    The command is `trilat experiment power`.
+    Equivalent to the command `trilat experiment power`.
 
     >>> tn.compute_experiment_power(0.5).least[0.8]
     34
 
     Args:
-        effect: Mean over standard deviation of the differences within participants, Cohen's
-            d_z.
-        participants: Planned number of participants, whose power is computed and simulated.
+        effect: Effect size (Cohen's d_z): mean of the within-participant differences divided by
+            their standard deviation.
+        participants: Planned number of participants, for which the power is computed and
+            simulated.
         seed: Seed of the simulated experiments.
 
     Raises:
