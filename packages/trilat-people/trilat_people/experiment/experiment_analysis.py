@@ -125,8 +125,7 @@ def _format_fact(value: Any, name: str = "") -> str:
 
 
 class ExperimentAnalysis(Result):
-    """Statistics of an experiment: comparisons between its conditions, and facts about the
-    study.
+    """Statistics of an experiment: comparisons between conditions, and facts to report.
 
     Everything is computed on construction, except for the figures, which are drawn by `write`.
     A unit is a participant or a pair, whichever is sampled independently. Every measure of the
@@ -714,8 +713,7 @@ class ExperimentAnalysis(Result):
         return [test._asdict() for test in chain.from_iterable(self.comparisons.values())]
 
     def to_dict(self) -> dict[str, Any]:
-        """Returns all results as plain values, as printed by `trilat experiment analyse
-        --json`.
+        """Returns all results as plain values for `trilat experiment analyse --json`.
 
         Includes the means of the conditions, their comparisons, completion times, missing
         answers, fitted models and the facts about the study.

@@ -435,8 +435,7 @@ class Experiment(Result):
         return self.folder / TRIALS_FILE
 
     def to_dict(self) -> dict[str, Any]:
-        """Returns the progress as plain values, as printed by `trilat experiment status
-        --json`.
+        """Returns the progress as plain values for `trilat experiment status --json`.
 
         "trials" is the number of planned trials, and "done" is the number of finished trials.
         """

@@ -91,8 +91,7 @@ class _Training(Frozen, frozen=True):
     rest_s: Annotated[float, Meta(ge=0.0, le=1e6)] = 600.0
 
     def describe(self) -> str:
-        """Describes the design of the training in one sentence, for the methods section of a
-        paper.
+        """Describes the design of the training in one sentence, for use in a paper.
 
         In a training, an expert initially leads the slave, and authority gradually passes to
         the learner. The sentence states the first and last value of the expert's share, as in
@@ -177,8 +176,7 @@ class ExperimentProtocol(Frozen, frozen=True):
     def list_phases(
         self, condition: str, random: np.random.Generator
     ) -> list[tuple[str, float | None]]:
-        """Lists the phase and the authority of each trial of a block, excluding practice
-        trials.
+        """Lists the phase and authority of each trial of a block, excluding practice trials.
 
         A block contains all trials of a participant under one condition. With a training, the
         phases are "before", "training", "after" and "retention". With a staircase, trials come
@@ -477,8 +475,7 @@ class ExperimentPlan(Result):
         }
 
     def list_steps(self) -> Iterator[Step]:
-        """Yields everything that participants have to do, one group of participants after
-        another.
+        """Yields everything that participants have to do, group by group.
 
         A group does one block of trials per condition. Its steps are:
 
@@ -522,7 +519,8 @@ class ExperimentPlan(Result):
                 (first trial) or 2 (second trial).
 
         Returns:
-            True for each right choice in the block, in the order of the trials.
+            One entry per choice in the block, in the order of the trials: True if the choice is
+                right.
         """
         # Both numbers start at 1, so the difference is the index of the first trial.
         block_start = planned.number - planned.trial
