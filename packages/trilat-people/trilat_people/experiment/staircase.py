@@ -179,8 +179,7 @@ class Staircase(Frozen, frozen=True):
         return comparison if perceived_difference > 0.0 else standard_trial
 
     def describe(self) -> str:
-        """Describes how the perception threshold was measured in one sentence, for use in a
-        paper.
+        """Describes in one sentence, for use in a paper, how the threshold was measured.
 
         The sentence states the key, its standard value, the rule for the differences, and the
         proportion of right answers at the threshold.

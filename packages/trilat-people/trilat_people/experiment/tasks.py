@@ -80,8 +80,7 @@ class _TrialTask(Frozen, frozen=True, tag_field="kind"):
         return False
 
     def make_goal(self, start_m: Array, number: int, seed: int) -> "TrialGoal":
-        """Creates the goal of one trial, which computes the target and decides when the trial
-        ends.
+        """Creates the goal of one trial: its target, and the rule for when it ends.
 
         Args:
             start_m: Start position of the slave's end effector, in m, shape (2,) or (3,).
@@ -539,8 +538,9 @@ class ContactTrial(_TrialTask, frozen=True, tag="contact"):
 
     @property
     def longest_s(self) -> float:
-        """Time limit of a trial, in s. A trial whose force has not been held by then has
-        failed.
+        """Time limit of a trial, in s.
+
+        A trial has failed if the force has not been held by then.
         """
         return self.timeout_s
 
