@@ -290,11 +290,10 @@ class ExperimentSessions:
         has_begun = False
 
         def begins() -> bool:
-            """Returns True once all participants have confirmed on their pages that they are
-            ready.
+            """Returns True once all participants have confirmed that they are ready.
 
-            The session waits for these confirmations before its first control period. The pages
-            then show the trial.
+            They confirm this on their pages. The session waits for the confirmations before its
+            first control period, and the pages then show the trial.
             """
             nonlocal has_begun
             if not has_begun and request.replies.keys() >= set(self.stage.users):
@@ -412,8 +411,7 @@ def run_with_people(
             def run_session(
                 watch: TrialWatch, folder: Path, begins: Callable[[], bool]
             ) -> SessionResult:
-                """Runs the session of one trial and shows it on the web pages of the
-                experiment.
+                """Runs the session of one trial and shows it on the pages of the experiment.
 
                 Uses the page server `page`, the network connection `idle` that the pages
                 observe between sessions, and the signal handler `interrupt` of the experiment.
@@ -442,9 +440,7 @@ def run_with_people(
                 return result
 
             def ends() -> bool:
-                """Returns True once a stop was requested by Ctrl-C or from an experimenter's
-                page.
-                """
+                """Returns True once Ctrl-C or an experimenter's page has requested a stop."""
                 return interrupt.is_requested() or page.end_requested.is_set()
 
             sessions = ExperimentSessions(

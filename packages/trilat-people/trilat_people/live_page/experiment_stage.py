@@ -343,8 +343,7 @@ class Stage:
         return self._watch.poll(view, absent_sites)
 
     def accept(self, site: str, page: int, message: StageMessage) -> bool:
-        """Processes a message from a participant's web page, such as answers to a
-        questionnaire.
+        """Processes a message from a participant's page, such as questionnaire answers.
 
         Args:
             site: Name of the user's site. Empty for an experimenter.
@@ -352,8 +351,8 @@ class Stage:
             message: The message.
 
         Returns:
-            True if the message was accepted. False if it was not requested from that page and
-            has no effect.
+            True if the message was accepted, False if it was not requested from that page and
+            is ignored.
         """
         is_holder = self._holders.get(site) == page
         if isinstance(message, AbortTrial):
@@ -405,8 +404,8 @@ class Stage:
             t_s: Time of the pose shown on the page, in s, or `None` if the page shows no arms.
 
         Returns:
-            The present phase, the requested step, the task, the users and further facts that
-            the role may see, as plain values for JSON.
+            The current phase, the requested step, the task, the users and whatever else the
+            role may see, as JSON-compatible values.
         """
         step = self._step
         request = self._request

@@ -495,7 +495,7 @@ class PageServer:
             self._ready.set()
 
     def report_refusals(self) -> None:
-        """Prints the number of refused messages and requests from pages, one line per reason."""
+        """Prints how many messages and requests from pages were refused, one line per reason."""
         for reason, count in sorted((+self.refused).items()):
             self._say(f"the page refused {count_nouns(count, 'message')} or requests: {reason}")
 
@@ -1236,8 +1236,8 @@ def show_on_page(
         bus: Network connection that reaches the session.
 
     Yields:
-        The state of the session, and a function to update the display. This function does
-        nothing, because the server updates the page by itself.
+        The state of the session, and a function to update the display. The function does
+        nothing, since the server updates the page itself.
     """
     with PageServer(bus, clock, session, options, say=say) as page:
         yield page.view, lambda: None
