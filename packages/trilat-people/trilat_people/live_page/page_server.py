@@ -495,7 +495,7 @@ class PageServer:
             self._ready.set()
 
     def report_refusals(self) -> None:
-        """Prints how many messages and requests from pages were refused, one line per reason."""
+        """Prints the number of refused messages and requests, one line per reason."""
         for reason, count in sorted((+self.refused).items()):
             self._say(f"the page refused {count_nouns(count, 'message')} or requests: {reason}")
 

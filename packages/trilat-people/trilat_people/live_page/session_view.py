@@ -166,8 +166,7 @@ class SiteView:
         self.first_tick = 0
 
     def find_alarm(self, session: str, name: str) -> LifeAlarm | None:
-        """Returns an alarm if the arm of the site needs attention, because of a stop or a
-        fault.
+        """Returns an alarm if the arm of the site needs attention (a stop or a fault).
 
         Only a site with the stale rule `glide`, under which an arm comes to rest while a peer
         is silent, has alarms. The alarm is derived from the newest record of the site: from its
@@ -406,7 +405,7 @@ class SessionView:
 
     @property
     def complete_ticks(self) -> dict[str, int]:
-        """Mapping from site to the last tick up to which every record has arrived or been lost."""
+        """Mapping from site to the last tick whose records have all arrived or been lost."""
         return {name: site.complete for name, site in self.sites.items()}
 
     def find_peer_ticks(
