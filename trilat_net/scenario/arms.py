@@ -48,31 +48,32 @@ from .urdf import UrdfChain, UrdfJoint, UrdfPayload, read_urdf
 TASK_AXES: tuple[str, ...] = ("x", "y", "z", "rx", "ry", "rz")
 """Names of the axes of a task: three translations and three rotations."""
 STOP_REACH_RAD = 0.05
-"""Depth in a stop at which the stop pushes with the effort limit of the joint, in rad or m."""
+"""Depth of penetration at which a stop pushes with the joint's effort limit, in rad or m."""
 START_MARGIN_RAD = 0.15
 START_MARGIN_M = 0.02
-"""Largest distance of a start pose beyond a stop or a position limit.
+"""Largest permitted distance of a start pose beyond a stop or a position limit.
 
-The margin is 8.6 degrees, or 2 cm for a sliding joint. It is needed because encoders are set to
-zero by hand, and arms are parked on stops that lie beyond those in their URDF files.
+The margin is 8.6 degrees, or 2 cm for a prismatic joint. It is needed because encoders are
+zeroed by hand, and arms are parked on stops that lie beyond those in their URDF files.
 """
 STOP_EFFORT_NM = 100.0
-"""Effort limit from which the stiffness of a stop is computed if the file states none."""
+"""Effort limit for computing the stiffness of a stop if the file has none."""
 STOP_DAMPING_S = 0.01
 """Ratio of the damping of a stop to its stiffness, in s."""
 PLANAR_UNITS = ("kg m^2", "kg m^2", "kg m^2", "kg m", "kg m")
-"""Units of the five parameters of Eq. (24)."""
+"""Units of the five parameters in Eq. (24)."""
 BODY_UNITS = {
     "m": "kg",
     **dict.fromkeys(("mc_x", "mc_y", "mc_z"), "kg m"),
     **dict.fromkeys(("Ixx", "Ixy", "Iyy", "Ixz", "Iyz", "Izz"), "kg m^2"),
 }
-"""Units of the ten inertial parameters of a link of a chain, by name.
+"""Mapping from name to unit of the ten inertial parameters of a link in a chain.
 
-m is the mass, mc the mass times the centre of mass, and I the inertia about the joint's frame.
+m is the mass, mc is the mass times the centre of mass, and I is the inertia about the origin of
+the joint frame.
 """
 _SLIDING_UNITS = {"rad": "m", "rad/s": "m/s", "N m": "N"}
-"""Units of a sliding joint, by the unit of the same quantity of a rotating joint."""
+"""Mapping from the unit of a quantity at a revolute joint to that at a prismatic joint."""
 _IDENTITY = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
 
 
@@ -193,9 +194,9 @@ def start_margin(joint: ChainJoint) -> float:
 
 
 BASE_KEYS = ("base_xyz_m", "base_rpy_rad")
-"""Keys of an arm that place its base in space."""
+"""Keys of an arm that specify the pose of its base."""
 CHAIN_KEYS = field_names(Arm)[field_names(Arm).index("base") :]
-"""Keys of an arm that only a chain has."""
+"""Keys of an arm that apply only to a chain."""
 
 
 class Task(fields.Frozen, frozen=True, omit_defaults=True):
@@ -607,22 +608,22 @@ class ArmModel(NamedTuple):
 
 
 def _is_positive_definite(theta: Array) -> bool:
-    """Returns True if the inertia matrix of the planar arm is positive definite in any pose.
+    """Returns True if the inertia matrix of the planar arm is positive definite in every pose.
 
-    Otherwise the parameters describe no real arm. With the angle q2 of the second joint, the
-    inertia matrix is
+    Otherwise, the parameters do not describe a real arm. With the angle q2 of the second joint,
+    the inertia matrix is
 
         M = | theta_1 + 2 theta_2 cos(q2)    theta_3 + theta_2 cos(q2) |
             | theta_3 + theta_2 cos(q2)      theta_3                   |
 
         det M = theta_1 theta_3 - theta_3^2 - theta_2^2 cos(q2)^2
 
-    The determinant is smallest for the stretched arm, q2 = 0, so only this pose is checked. The
-    check has a margin for rounding.
+    The determinant is smallest for the stretched arm, q2 = 0, so only this pose is checked,
+    with a margin for rounding errors.
 
     Args:
-        theta: Dynamic parameters of the arm, shape (5,), see `ArmLinks.theta`. The first
-            three are inertias, kg m^2.
+        theta: Dynamic parameters of the arm, shape (5,) (see `ArmLinks.theta`). The first three
+            are inertias, in kg m^2.
     """
     theta_1 = theta[0]
     theta_2 = theta[1]
@@ -676,11 +677,11 @@ def build_arm(arm: Arm, task: Task, urdf_texts: Mapping[str, str], chains: bool)
 
 
 def _list_planar_bodies(arm: Arm) -> Array:
-    """Returns the planar arm's inertial parameters as those of a chain, shape (20,).
+    """Converts the planar arm's inertial parameters to those of a chain, shape (20,).
 
-    A link has the mass m, its centre of mass at (c, 0, 0), and the moment of inertia I about
-    the z axis through the centre of mass. About its joint, the first moment along x is m c, and
-    Iyy = Izz = m c^2 + I.
+    A link has mass m, centre of mass (c, 0, 0), and moment of inertia I about the z axis
+    through the centre of mass. About its joint, the first moment along x is m c, and Iyy = Izz
+    = m c^2 + I.
     """
     links = (
         (arm.m1_kg, arm.lc1_m, arm.I1_kg_m2),
@@ -694,10 +695,10 @@ def _list_planar_bodies(arm: Arm) -> Array:
 
 
 def _build_planar_chain(arm: Arm, task: Task) -> ChainSetup:
-    """Returns the planar arm of two links as a general chain of joints.
+    """Converts the planar two-link arm to a general chain of joints.
 
-    The planar arm can then be simulated together with arms from URDF files. Its joints rotate
-    about z, and gravity acts along -y.
+    This allows the planar arm to be simulated together with arms from URDF files. Its joints
+    rotate about z, and gravity acts along -y.
     """
     shoulder = ChainJoint(
         prismatic=False, axis=(0.0, 0.0, 1.0), rotation=_IDENTITY, origin_m=(0.0, 0.0, 0.0)
@@ -708,9 +709,9 @@ def _build_planar_chain(arm: Arm, task: Task) -> ChainSetup:
 
 
 _KEYS_OF_SUBJECTS = {"base": "base", "tip": "tip", "payload": "payload_inertia_kg_m2"}
-"""Key of the arm for each subject of an error message of `read_urdf`.
+"""Mapping from the subject of a `read_urdf` error to the corresponding key of the arm.
 
-Errors with another subject concern the file.
+Errors about any other subject are errors of the file itself.
 """
 
 
@@ -724,9 +725,9 @@ def _read_cached(
     *,
     balance: bool,
 ) -> UrdfChain:
-    """Reads the chain of joints in a URDF file, see `read_urdf`.
+    """Parses the chain of joints in a URDF file (see `read_urdf`).
 
-    The result is cached, so the same file is not read again.
+    The result is cached, so the same file is parsed only once.
     """
     return read_urdf(
         text=text,
@@ -741,15 +742,15 @@ def _read_cached(
 def _place_base(
     arm: Arm, joints: tuple[ChainJoint, ...], gravity: Three
 ) -> tuple[tuple[ChainJoint, ...], Three]:
-    """Expresses the joints of an arm, and gravity, in a frame that is common to all arms.
+    """Transforms the joints of an arm, and gravity, to the frame shared by all arms.
 
     The rotation of the base is R_z(yaw) R_y(pitch) R_x(roll). Only the first joint changes,
-    because the other joints are expressed in the frame of the joint before them.
+    since each of the others is expressed in the frame of the preceding joint.
 
     Args:
         arm: Table of the arm.
-        joints: Joints in the frame of the base.
-        gravity: Gravitational acceleration in the frame of the base.
+        joints: Joints in the base frame.
+        gravity: Gravitational acceleration in the base frame.
     """
     if not (any(arm.base_xyz_m) or any(arm.base_rpy_rad)):
         return joints, gravity
@@ -767,7 +768,7 @@ def _place_base(
 
 
 def _build_chain_model(arm: Arm, task: Task, urdf_chain: UrdfChain) -> ArmModel:
-    """Builds the model of an arm from the joints that were read from its URDF file.
+    """Builds the model of an arm from the joints in its URDF file.
 
     Raises:
         ScenarioError: The number of drive inertias differs from the number of joints.
@@ -806,7 +807,7 @@ def _build_chain_model(arm: Arm, task: Task, urdf_chain: UrdfChain) -> ArmModel:
 
 
 def _build_joint(joint: UrdfJoint, armature_kg_m2: float, *, has_stops: bool) -> ChainJoint:
-    """Converts a joint of a URDF file to the format that the compiled simulation reads.
+    """Converts a joint from a URDF file to the format read by the compiled simulation.
 
     The ends of the joint's range become stops: a spring that pushes with the effort limit of
     the joint at the depth `STOP_REACH_RAD`, and a damper with `STOP_DAMPING_S` times the
@@ -815,7 +816,7 @@ def _build_joint(joint: UrdfJoint, armature_kg_m2: float, *, has_stops: bool) ->
     Args:
         joint: Joint from the file.
         armature_kg_m2: Inertia of the drive.
-        has_stops: Whether the joint limits of the file are stops.
+        has_stops: True if the joint limits of the file are stops.
     """
     chain_joint = ChainJoint(
         prismatic=joint.kind == "prismatic",
@@ -839,22 +840,22 @@ def _build_joint(joint: UrdfJoint, armature_kg_m2: float, *, has_stops: bool) ->
 
 
 BRAKE_S = 0.03
-"""Smallest time constant with which damping brings a joint to rest, in s."""
+"""Smallest time constant for damping a joint to rest, in s."""
 BRAKE_TICKS = 4
-"""Smallest time constant that the damping may give to any motion of the arm, in ticks."""
+"""Smallest time constant of any motion of the arm under damping, in ticks."""
 UNKNOWN_BRAKE_S = 0.1
-"""Time constant for an arm whose inertia is not known, in s."""
+"""Time constant used for an arm with unknown inertia, in s."""
 BRAKE_TORQUE_SHARE = 0.5
-"""Fraction of the largest torque that is used to decelerate the reference."""
+"""Fraction of the torque limit used to decelerate the reference."""
 
 
 def _bound_planar_parameters(
     arm: ArmModel, limit_nm: Vector, g_m_s2: float
 ) -> tuple[Array, Array]:
-    """Returns lower and upper bounds of the planar arm's five parameters, shape (5,) each.
+    """Returns lower and upper bounds on the planar arm's five parameters, shape (5,) each.
 
-    They follow from the torque of the motors, which can hold the arm, see `bound_estimates`.
-    Eq. (24) defines the parameters.
+    They follow from the torque needed to hold the arm (see `bound_estimates`). The parameters
+    are those of Eq. (24).
     """
     T_1, T_2 = np.broadcast_to(limit_nm, 2)
     outer = min(T_1, T_2) / g_m_s2
@@ -868,9 +869,9 @@ def _bound_planar_parameters(
 def _bound_chain_parameters(
     arm: ArmModel, chain: ChainSetup, limit_nm: float, g_m_s2: float
 ) -> tuple[Array, Array]:
-    """Returns lower and upper bounds of the ten parameters of each link, shape (10 n,) each.
+    """Returns lower and upper bounds on the ten parameters of each link, shape (10 n,) each.
 
-    They follow from the torque of the motors, which can hold the arm, see `bound_estimates`.
+    They follow from the torque needed to hold the arm (see `bound_estimates`).
     """
     joints = arm.counts.joints
     reach_m = sum(float(np.linalg.norm(joint.origin_m)) for joint in chain.joints)

@@ -27,7 +27,7 @@ _ORDER_SENTENCES = {
     "arm_back": "measurements came again from the arm of {site} at {at}",
     "overrun": "{site} missed {ticks} {noun} before {at}",
 }
-"""Sentence that describes each command to people."""
+"""Mapping from command to the sentence that describes it."""
 
 
 class Change(RecordedChange, frozen=True, omit_defaults=True):

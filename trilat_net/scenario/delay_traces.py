@@ -44,13 +44,13 @@ from ..results import Result
 from .ping_output import read_ping
 
 MAX_TRACE_POINTS = 200_000
-"""Largest number of points of a trace: 200 s of a log at 1 kHz."""
+"""Maximum number of points of a trace, equivalent to 200 s of a log at 1 kHz."""
 
 _LOST = "lost"
 LONGEST_MS = MAX_DELAY_US / 1e3
 """Longest delay that a link may have, in ms."""
 TracePoint = tuple[float, float]
-"""Send time of a message in s, and its delay in ms. The delay of a lost message is infinite."""
+"""Send time of a message in s, and its delay in ms (infinite for a lost message)."""
 
 
 _OTHER_KINDS = {
@@ -60,7 +60,7 @@ _OTHER_KINDS = {
     b"%PDF": "a PDF document",
     b"SQLite": "an SQLite database",
 }
-"""Kinds of files that are not text, by their first bytes."""
+"""Kinds of files that are not text, identified by their leading bytes."""
 
 
 _ZIPPED_KINDS = {
@@ -69,20 +69,19 @@ _ZIPPED_KINDS = {
     b"Index/Tables": "a spreadsheet (.numbers)",
     b"word/document": "a text document (.docx)",
 }
-"""Kinds of documents in ZIP archives, by a text that the archive contains uncompressed."""
+"""Kinds of documents in ZIP archives, identified by an uncompressed string in the archive."""
 
 
 def _decode_text(raw: bytes, *, any_code_page: bool = False) -> str:
-    """Decodes the bytes of a text file, and refuses files that are not text.
+    """Decodes the bytes of a text file, and raises ValueError if the file is not text.
 
-    The encoding is UTF-8, or UTF-16 as Windows PowerShell writes it. The first bytes of the
-    file, such as a byte order mark, show which of the two it is.
+    The encoding is UTF-8, or UTF-16 as written by Windows PowerShell. It is detected from the
+    first bytes of the file, such as a byte order mark.
 
     Args:
         raw: Content of the file.
-        any_code_page: True to decode a text in another encoding as Latin-1, because programs on
-            Windows print in the code page of the user's country. Letters beyond ASCII may then
-            be wrong.
+        any_code_page: True to decode any other encoding as Latin-1, since Windows programs
+            print in the code page of the user's country. Non-ASCII letters may then be wrong.
 
     Returns:
         The text, without a byte order mark.
@@ -116,20 +115,19 @@ def _decode_text(raw: bytes, *, any_code_page: bool = False) -> str:
 
 
 def _describe_kind(kind: str) -> str:
-    """Explains to the user that a file is not text, and how to get a text file from it.
+    """Explains to the user that a file is not text, and how to obtain a text file from it.
 
     Args:
-        kind: The kind of file, with its article, as in "a PDF document".
+        kind: Kind of file, including the article, as in "a PDF document".
     """
     advice = "save the sheet as CSV" if "spreadsheet" in kind else "a text file is needed"
     return f"is {kind}, not text: {advice}"
 
 
 def _read_csv(path: Path) -> list[TracePoint]:
-    """Reads a delay trace, a table of sending times and delays, from a CSV file.
+    """Reads a delay trace from a CSV file with the columns `t_s,delay_ms`.
 
-    The columns are `t_s,delay_ms`. A header line is optional. Empty lines, and lines that start
-    with "#", are ignored.
+    The header is optional. Empty lines and lines that start with "#" are ignored.
 
     Raises:
         ValueError: A line does not contain a time and a delay.
@@ -280,20 +278,20 @@ def parse_trace(text: str) -> Points:
 
 
 WAYS = ("half", "send", "receive", "whole")
-"""How the delay of a link is computed from a measured delay.
+"""How the one-way delay of a link is computed from a measurement.
 
-"half": Half of the round trip. "send", "receive": Delay in one direction, which only `irtt`
-measures. "whole": The measured number itself.
+"half": half of the round trip. "send", "receive": the one-way delay, which only `irtt`
+measures. "whole": the measured value itself.
 """
 _MAX_BYTES = 2**30
-"""Largest number of bytes that are read from a file."""
+"""Maximum number of bytes read from a file."""
 _COLUMN = re.compile(r"(?P<name>.+?)(?:[_ ](?P<suffix>s|ms|us|ns)|\((?P<unit>s|ms|us|ns)\))?$")
-"""Matches the head of a column with its unit, for example "rtt_ms" or "delay(ms)"."""
+"""Matches a column heading with its unit, for example "rtt_ms" or "delay(ms)"."""
 _GZIP_MAGIC = b"\x1f\x8b"
 """First two bytes of a gzip file."""
 _UNIT_S = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 _NO_ANSWER_TEXTS = ("lost", "-1", "", "nan", "inf")
-"""Texts that stand in place of the delay of a lost message in tables."""
+"""Strings used in tables in place of the delay of a lost message."""
 _TIME_NAMES = ("t", "time", "timestamp", "pub_time")
 _DELAY_NAMES = ("delay", "rtt", "latency")
 
@@ -481,10 +479,10 @@ def import_trace(
 
 
 class _Measurement(NamedTuple):
-    """Messages whose round trips or delays a measuring program has written to a file.
+    """Messages whose round trips or delays were recorded by a measurement program.
 
     Attributes:
-        samples: Send time of each message in s, and its delay in ms.
+        samples: Send time in s and delay in ms of each message.
         begin_known: False if messages before the first one may be missing from the file.
         end_known: False if messages after the last one may be missing from the file.
     """
@@ -495,10 +493,10 @@ class _Measurement(NamedTuple):
 
 
 def _build_trace(measurement: _Measurement) -> MeasuredTrace:
-    """Converts a measurement of a network to a delay trace, which a simulated link can repeat.
+    """Converts a network measurement to a delay trace that a simulated link can replay.
 
-    The messages are sorted by their sending times, which then count from the first one. Of
-    several messages with the same time in microseconds, only the first is kept.
+    Messages are sorted by send time, relative to the first one. If several messages have the
+    same time in microseconds, only the first is kept.
 
     Raises:
         ValueError: There are no messages, or a delay is negative.
@@ -544,16 +542,15 @@ def _build_trace(measurement: _Measurement) -> MeasuredTrace:
 
 
 def _read_irtt(text: str, way: str, *_: object) -> _Measurement:
-    """Returns the messages in the JSON text of `irtt client -o`.
+    """Parses the JSON output of `irtt client -o`.
 
-    The times in this text are nanoseconds. The entry `lost` of a message is a word, of which
-    only "false" means that the answer arrived. The entry `stats` contains the number of sent
-    packets. If this number is larger than the number of messages, the last messages are
-    missing.
+    Times are in nanoseconds. The entry `lost` of a message is a string, and only "false" means
+    that the reply arrived. The entry `stats` contains the number of packets sent; if this
+    exceeds the number of messages, the last messages are missing.
 
     Args:
-        text: The JSON text.
-        way: How the delay is computed, one of `WAYS` or empty.
+        text: The JSON output.
+        way: How the delay is computed: one of `WAYS`, or empty.
     """
     delay_key = "rtt" if way in ("", "half", "whole") else way
     factor = 0.5 if way in ("", "half") else 1.0
@@ -571,14 +568,14 @@ def _read_irtt(text: str, way: str, *_: object) -> _Measurement:
 
 
 def _read_ping(text: str, way: str, _: str, every_s: float) -> _Measurement:
-    """Reads the round trips of messages from the output of the programs `ping` or `fping`.
+    """Parses round trips from the output of `ping` or `fping`.
 
-    `ping_output` explains the formats of this output.
+    See `ping_output` for the formats.
 
     Args:
         text: The output.
-        way: "whole" for the round trip. Otherwise half of it is the delay.
-        every_s: Interval between the messages if the output contains no times, in s.
+        way: "whole" to use the round trip as the delay; otherwise, half of it is used.
+        every_s: Interval between messages, in s, if the output contains no timestamps.
     """
     factor = 1.0 if way == "whole" else 0.5
     probes = read_ping(text, every_s)
@@ -590,17 +587,16 @@ def _read_ping(text: str, way: str, _: str, every_s: float) -> _Measurement:
 
 
 def _read_table(text: str, way: str, column: str, _: float) -> _Measurement:
-    """Returns the messages of a table whose header line names columns with units.
+    """Parses a table whose header contains column names with units.
 
-    Examples of header lines are "pub_time(ms) delay(ms)" and "t_s,delay_ms". The columns are
-    separated by semicolons, tabs, commas or spaces.
+    Examples of headers are "pub_time(ms) delay(ms)" and "t_s,delay_ms". Columns are separated
+    by semicolons, tabs, commas or spaces.
 
     Args:
         text: The table.
-        way: "half" if the column contains round trips, "whole" if it contains the delays. If
-            empty, the name of the column decides.
-        column: Name of the column of delays. If empty, the first column whose name stands for a
-            delay.
+        way: "half" if the column contains round trips, or "whole" if it contains delays. If
+            empty, determined from the name of the column.
+        column: Name of the delay column. If empty, the first column whose name denotes a delay.
 
     Raises:
         ValueError: A column is missing, or a line does not contain numbers.
@@ -640,21 +636,21 @@ def _read_table(text: str, way: str, column: str, _: float) -> _Measurement:
 
 
 def _split_cells(line: str, separator: str | None) -> list[str]:
-    """Splits a line of a table into cells, at white space if there is no separator."""
+    """Splits a line of a table into cells, at whitespace if there is no separator."""
     return [cell.strip() for cell in line.split(separator)]
 
 
 def _find_column(cells: list[str], names: tuple[str, ...], wanted: str) -> tuple[int, float]:
-    """Finds which column of a table contains a quantity, by the names in the header line.
+    """Finds the column of a table that contains a quantity.
 
     Args:
-        cells: Cells of the header line.
-        names: Names that the quantity may have.
-        wanted: Cell of the header above the column. If empty, the first column with one of the
-            names is used.
+        cells: Cells of the header.
+        names: Permitted names of the quantity.
+        wanted: Header of the column to use. If empty, the first column with a permitted name is
+            used.
 
     Returns:
-        The index of the column, and its unit in s.
+        Index of the column, and its unit in s.
 
     Raises:
         ValueError: There is no such column, or it has no unit.
@@ -678,7 +674,7 @@ _READERS: dict[str, Callable[[str, str, str, float], _Measurement]] = {
     "ping": _read_ping,
     "csv": _read_table,
 }
-"""Function that reads each format.
+"""Mapping from format to the function that reads it.
 
-Its arguments are the text, the way, the column and the interval in s, see `import_trace`.
+The arguments are the text, the way, the column and the interval in s (see `import_trace`).
 """

@@ -44,10 +44,9 @@ IRREVERSIBLE_SHARES = (
 
 
 def _describe_idle_shares(scenario: Scenario) -> list[str]:
-    """Returns lines about arms for which the weights in the scenario have no effect.
+    """Returns lines about arms whose dominance factors have no effect.
 
-    The weights (dominance factors) state how much an arm follows each of the others. In some
-    control laws, other settings determine how the arms share authority.
+    In some control laws, authority is shared according to other settings.
     """
     ramped_sites = {change.dominance for change in scenario.timeline}
     owners: dict[str, list[str]] = {}
@@ -105,7 +104,7 @@ def describe_scenario(scenario: str | Path | Mapping[str, Any] | Scenario) -> li
 
 
 def _describe_real_arms(scenario: Scenario) -> list[str]:
-    """Returns a line for each real arm with its limits and start pose, which users check."""
+    """Returns one line per real arm with its limits and start pose, for users to check."""
     lines = []
     for name in scenario.outside:
         spec = scenario.sites[name]
@@ -133,10 +132,9 @@ def _format_per_joint(values: Any, units: Sequence[str]) -> str:
 
 
 def _join_equal(texts: Sequence[str], units: Sequence[str]) -> str:
-    """Joins the texts of all joints to one, and writes equal texts or units only once.
+    """Joins the per-joint strings into one, writing equal values or units only once.
 
-    For example, the texts "1", "1" with the unit "rad" give "1 rad", and "1", "2" give "1, 2
-    rad".
+    For example, "1", "1" with the unit "rad" becomes "1 rad", and "1", "2" becomes "1, 2 rad".
     """
     if len(set(units)) > 1:
         return ", ".join(f"{text} {unit}" for text, unit in zip(texts, units, strict=True))
@@ -144,9 +142,9 @@ def _join_equal(texts: Sequence[str], units: Sequence[str]) -> str:
 
 
 def _describe_links(scenario: Scenario) -> list[str]:
-    """Returns a line of text for each network link, or a single line if all links are equal.
+    """Returns one line per network link, or a single line if all links are equal.
 
-    Further lines state the delay with which the users see the other arms (views).
+    Additional lines describe the delay with which users see the other arms (views).
     """
     descriptions = {name: link.describe() for name, link in scenario.links.items()}
     if len(set(descriptions.values())) > 1:
@@ -160,10 +158,7 @@ def _describe_links(scenario: Scenario) -> list[str]:
 
 
 def _describe_shares(scenario: Scenario) -> list[str]:
-    """Returns lines about consequences of the weights with which arms follow each other.
-
-    The weights form the matrix of dominance factors.
-    """
+    """Returns lines about consequences of the dominance factors."""
     beta = scenario.beta
     weights = "none: alpha is reducible, some site's weight is zero"
     if beta is not None:
@@ -181,7 +176,7 @@ def _describe_shares(scenario: Scenario) -> list[str]:
 
 
 def _describe_arms(scenario: Scenario) -> list[str]:
-    """Returns lines about each different arm with a URDF file: its joints, limits and notes."""
+    """Returns lines about each distinct arm with a URDF file: its joints, limits and notes."""
     lines: list[str] = []
     for arm, owners in _group_chains(scenario):
         chain = arm.read_chain(scenario.urdf)
@@ -200,7 +195,7 @@ def _describe_arms(scenario: Scenario) -> list[str]:
 
 
 def _describe_joint(joint: UrdfJoint, drive: ChainJoint) -> str:
-    """Returns a line about a joint: its link, its limits and the inertia of its drive."""
+    """Returns one line about a joint: its link, its limits and the inertia of its drive."""
     unit = "m" if drive.prismatic else "rad"
     effort_unit = "N" if drive.prismatic else "N m"
     inertia_unit = "kg" if drive.prismatic else "kg m^2"
@@ -217,10 +212,7 @@ def _describe_joint(joint: UrdfJoint, drive: ChainJoint) -> str:
 
 
 def _group_chains(scenario: Scenario) -> list[tuple[Arm, list[str]]]:
-    """Returns each different arm that is read from a URDF file, with the names of its users.
-
-    The users are sites, the processes of the arms. URDF is an XML format for robots.
-    """
+    """Returns each distinct arm read from a URDF file, with the names of the sites that use it."""
     groups: list[tuple[Arm, list[str]]] = []
     for name, spec in scenario.sites.items():
         if not spec.arm.urdf:
@@ -262,7 +254,7 @@ def _list_start_notes(scenario: Scenario) -> list[str]:
 def _list_stop_notes(scenario: Scenario, name: str) -> list[str]:
     """Returns sentences about joints of an arm that start beyond a stop of the URDF file.
 
-    A real arm at rest may stand a little beyond the nominal position of a stop.
+    A real arm at rest can stand slightly beyond the nominal position of a stop.
     """
     spec = scenario.sites[name]
     units = scenario.arms[name].joint_units("rad")
@@ -281,7 +273,7 @@ def _list_stop_notes(scenario: Scenario, name: str) -> list[str]:
 def _list_limit_notes(scenario: Scenario, name: str) -> list[str]:
     """Returns sentences about joints of an arm that start beyond a position limit.
 
-    The limit is moved for the run, so that the arm does not stop at once.
+    The limit is moved for the run, so that the arm does not stop immediately.
     """
     spec = scenario.sites[name]
     model = scenario.arms[name]
@@ -306,7 +298,7 @@ def _list_limit_notes(scenario: Scenario, name: str) -> list[str]:
 
 
 def _describe_tasks(scenario: Scenario) -> list[str]:
-    """Returns lines about the arms that follow each other's end effectors, not joints."""
+    """Returns lines about the arms that follow each other's end effectors instead of joints."""
     lines = []
     for name, model in scenario.arms.items():
         if not model.shares_pose:
@@ -327,10 +319,10 @@ def _describe_tasks(scenario: Scenario) -> list[str]:
 
 
 def _describe_silences(scenario: Scenario) -> list[str]:
-    """Returns lines about how often arms will have to wait for late messages from others.
+    """Returns lines about how often arms will have to wait for late messages.
 
-    Only arms under the rule "glide" wait. They come to rest in the meantime. The number is
-    computed with the delays and losses that the network links will draw in the run.
+    Only arms with the stale rule "glide" wait, coming to rest in the meantime. The number is
+    computed from the delays and losses that the links will draw in the run.
     """
     lines = []
     for name, spec in scenario.sites.items():
@@ -362,14 +354,14 @@ def _describe_silences(scenario: Scenario) -> list[str]:
 
 
 def _count_silences(used: IntArray, receiver_hz: int, silence_ns: int) -> int:
-    """Counts how often an arm receives nothing new from another arm for longer than a limit.
+    """Counts how often a site uses no new sample of a peer for longer than a limit.
 
-    The time before the first message does not count.
+    The time before the first sample is ignored.
 
     Args:
-        used: Number of the sample in use in every tick. -1 before the first sample.
+        used: Index of the sample in use at every tick; -1 before the first sample.
         receiver_hz: Tick rate of the site, in Hz.
-        silence_ns: Longest time without a new sample that is not counted as a silence, in ns.
+        silence_ns: Longest time without a new sample that does not count as a silence, in ns.
     """
     new_sample_ticks = np.flatnonzero(np.diff(used, prepend=-1) > 0)
     if not len(new_sample_ticks):
@@ -382,9 +374,9 @@ def _count_silences(used: IntArray, receiver_hz: int, silence_ns: int) -> int:
 
 
 def _describe_stops(scenario: Scenario) -> list[str]:
-    """Returns lines about how arms come to rest while another arm is silent (rule "glide").
+    """Returns lines about how arms come to rest while a peer is silent (stale rule "glide").
 
-    Arms with the same text share a line.
+    Arms with the same description share one line.
     """
     owners: dict[str, list[str]] = {}
     for name, spec in scenario.sites.items():
@@ -396,9 +388,9 @@ def _describe_stops(scenario: Scenario) -> list[str]:
 
 
 def _describe_stop(scenario: Scenario, name: str) -> list[str]:
-    """Returns descriptions of an arm's motion after a stop, as ends of sentences.
+    """Describes the motion of an arm after a stop, as sentence endings.
 
-    They say when the arm comes to rest, and whether its motors are strong enough.
+    They state when the arm comes to rest, and whether its motors are strong enough.
     """
     spec = scenario.sites[name]
     if not spec.arm.known:
@@ -421,16 +413,16 @@ def _describe_stop(scenario: Scenario, name: str) -> list[str]:
 
 
 _NOT_COMPARED = ("name", "title", "about", "assumed", "expect", "drawn", "sites", "links")
-"""Keys that describe an experiment, or that are compared separately."""
+"""Keys that only describe a scenario, or that are compared separately."""
 _MAX_VALUE_LENGTH = 80
-"""Largest length of the text of a value."""
+"""Maximum length of the string form of a value."""
 _HASH_DIGITS = 8
-"""Number of digits of a SHA-256 hash that the text of a value shows."""
+"""Number of digits of a SHA-256 hash shown in the string form of a value."""
 
 
 _EVERY_LINK = "every link"
 _SOME_LINKS = "link "
-"""Start of the key of a difference between links. The names of the links follow it."""
+"""Prefix of the key of a difference between links, followed by the names of the links."""
 
 
 class ScenarioDifference(NamedTuple):
@@ -487,20 +479,20 @@ class ScenarioDifference(NamedTuple):
         return self.key == _EVERY_LINK or self.key.startswith(_SOME_LINKS)
 
     def __str__(self) -> str:
-        """Returns the key that differs, with the names of the arms for which it does."""
+        """Returns the key that differs, with the names of the arms to which this applies."""
         return f"{self.key} of {', '.join(self.owners)}" if self.owners else self.key
 
 
 def _omit_keys(table: Mapping[str, Any], keys: Sequence[str]) -> dict[str, Any]:
-    """Returns a copy of a table without certain keys."""
+    """Returns a copy of a table without the given keys."""
     return {key: value for key, value in table.items() if key not in keys}
 
 
 def _compare_tables(tables: Sequence[Mapping[str, Any]]) -> list[ScenarioDifference]:
-    """Returns the differences between several tables of scenarios, key by key.
+    """Returns the differences between several scenario tables, key by key.
 
-    If they contain control laws of different kinds, the laws are compared as a whole, because
-    their gains have different meanings.
+    Control laws of different kinds are compared as a whole, since their gains have different
+    meanings.
     """
     laws = {table.get("control", {}).get("law") for table in tables}
     if len(laws) > 1:
@@ -519,9 +511,9 @@ def _compare_tables(tables: Sequence[Mapping[str, Any]]) -> list[ScenarioDiffere
 
 
 def _compare_links(scenarios: Sequence[Scenario]) -> list[ScenarioDifference]:
-    """Returns the differences between the network links of several experiments.
+    """Returns the differences between the network links of several scenarios.
 
-    Links with the same difference share an entry.
+    Links with the same difference share one entry.
     """
     names_by_values: dict[tuple[str, ...], list[str]] = {}
     common_names = list(scenarios[0].links)
@@ -580,11 +572,11 @@ def describe_law(control: Mapping[str, Any]) -> str:
 def _join_leading(entries: Sequence[str], separator: str) -> str:
     """Joins as many leading entries as fit into `_MAX_VALUE_LENGTH` characters.
 
-    If entries are left out, "..." takes their place. The first entry is always included.
+    The first entry is always included. Omitted entries are replaced with "...".
 
     Args:
-        entries: Texts of the entries.
-        separator: Text between two entries.
+        entries: Strings to join.
+        separator: Separator between two entries.
     """
     text = ""
     for entry in entries:

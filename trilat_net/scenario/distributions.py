@@ -25,21 +25,21 @@ from ..records import MAX_JOINTS
 from .key_checks import is_distribution, is_number
 
 _MAX_LIST_LENGTH = 64
-"""Longest list that may contain distributions. Longer lists are recorded tables."""
+"""Maximum length of a list that may contain distributions. Longer lists are recorded tables."""
 
 
 DISTRIBUTION_FORM = "must be { normal = [mean, deviation] } or { uniform = [low, high] }"
-"""Permitted contents of a distribution's table, as the end of a sentence about its key."""
+"""Description of a valid distribution table, as the end of a sentence about its key."""
 
 
 class _DistributionKeys(Frozen, frozen=True, omit_defaults=True, kw_only=True):
-    """Keys of a table that states a random distribution in place of a number.
+    """Keys of a table that specifies a random distribution in place of a number.
 
     The distribution is either normal or uniform, for example `{ uniform = [1, 2] }`.
 
     Attributes:
-        normal: Mean and standard deviation of a normal distribution. None for other kinds.
-        uniform: Lower and upper limit of a uniform distribution. None for other kinds.
+        normal: Mean and standard deviation of a normal distribution, otherwise None.
+        uniform: Lower and upper limit of a uniform distribution, otherwise None.
     """
 
     normal: tuple[Real, NotNegative] | None = None
@@ -163,10 +163,10 @@ class Draws:
         return {key: self._draw_entry(value, f"{path}.{key}") for key, value in table.items()}
 
     def _draw_entry(self, value: Any, path: str) -> Any:
-        """Returns a value of a table, with a drawn number in place of a distribution.
+        """Returns a table value, with any distribution replaced with a drawn number.
 
-        A number that was drawn from a distribution before is drawn again, because the seed may
-        have changed. Other values are returned unchanged.
+        Previously drawn numbers are drawn again, since the seed may have changed. Other values
+        are returned unchanged.
         """
         if isinstance(value, list) and len(value) <= _MAX_LIST_LENGTH:
             entries = []
@@ -217,10 +217,10 @@ class Draws:
 
 
 def _read_distribution(table: TomlTable, path: str) -> Distribution:
-    """Reads a random distribution from a table of a scenario, without drawing a number from it.
+    """Parses a random distribution from a scenario table, without drawing from it.
 
     Raises:
-        ScenarioError: The table does not state a distribution.
+        ScenarioError: The table is not a valid distribution.
     """
     try:
         stated = msgspec.convert(table, StatedDistribution)

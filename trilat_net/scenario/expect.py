@@ -35,9 +35,9 @@ ALL_SITES_QUANTITIES = ("error_peak_rad", "speed_peak_rad_s", "torque_peak_nm")
 class _RunPart(
     msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True, omit_defaults=True
 ):
-    """Keys for a part of a run (window) that are the same for every arm, see `ExpectWindow`.
+    """Keys of a window that are the same for every arm (see `ExpectWindow`).
 
-    The other keys name a joint, so they depend on the number of joints.
+    The remaining keys name a joint, so they depend on the number of joints.
     """
 
     from_s: WindowTime
@@ -132,14 +132,13 @@ _JOINT_QUANTITY = re.compile(r"(?:q|push)(\d+)_")
 def _number_window_joints(
     written: list[TomlTable], joint_names: Mapping[str, tuple[str, ...]]
 ) -> list[TomlTable]:
-    """Replaces the names of joints in expectations by their numbers.
+    """Replaces joint names in the keys of windows with joint numbers.
 
-    Expectations for a part of a run (a window) have keys such as q_elbow_rad. This key becomes
-    q3_rad if the elbow is the third joint.
+    For example, q_elbow_rad becomes q3_rad if the elbow is the third joint.
 
     Args:
-        written: Windows as their author wrote them.
-        joint_names: Names of the joints of each site's arm, in their order.
+        written: Windows as written by their author.
+        joint_names: Mapping from site name to the ordered names of the arm's joints.
 
     Returns:
         The windows with the new keys.
@@ -157,7 +156,7 @@ def _number_window_joints(
 
 
 def _number_joints(table: TomlTable, names: tuple[str, ...], path: str) -> TomlTable:
-    """Returns a table in which names of joints in the keys are replaced by their numbers.
+    """Replaces joint names in the keys of one window with joint numbers.
 
     For example, "q_elbow_rad" becomes "q3_rad" if the elbow is the third joint of the arm.
 
@@ -179,10 +178,10 @@ def _number_joints(table: TomlTable, names: tuple[str, ...], path: str) -> TomlT
 
 
 def _split_joint_key(key: str) -> tuple[str, str, str]:
-    """Splits a key that names a joint into its prefix, the name and its suffix.
+    """Splits a key that contains a joint name into prefix, name and suffix.
 
     For example, "q_elbow_rad" is split into "q", "elbow" and "_rad". All parts are empty if the
-    key does not name a joint.
+    key contains no joint name.
     """
     for prefix, suffix in (("q", "_rad"), ("push", "_mean_nm")):
         if key.startswith(f"{prefix}_") and key.endswith(suffix):
@@ -194,16 +193,16 @@ def _split_joint_key(key: str) -> tuple[str, str, str]:
 def _find_window_problem(
     window: ExpectWindow, joint_counts: Mapping[str, int]
 ) -> KeyProblem | None:
-    """Returns the reason why no run could satisfy a window of expectations.
+    """Looks for a reason why no run could satisfy a window of expectations.
 
-    For example, the smallest permitted value may be larger than the largest one.
+    For example, a smallest permitted value may exceed the largest one.
 
     Args:
-        window: Part of a run with the permitted values of some quantities.
-        joint_counts: Number of joints of each site's arm, by the name of the site.
+        window: Part of a run with the permitted ranges of some quantities.
+        joint_counts: Mapping from site name to the number of joints of its arm.
 
     Returns:
-        The key and the reason. None if the window is possible.
+        The key and the reason, or None if the window can be satisfied.
     """
     sites = f"the sites are {', '.join(joint_counts)}"
     if window.to_s <= window.from_s:
@@ -233,7 +232,7 @@ def _find_window_problem(
 
 
 END_WINDOW_S = 1.0
-"""Duration of the last part of a run, to which the keys `end_...` apply, in s."""
+"""Duration of the final part of a run, to which the keys `end_...` apply, in s."""
 
 
 class Expect(

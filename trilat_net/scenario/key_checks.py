@@ -75,21 +75,20 @@ def find_extra(hint: Any, name: str) -> str | None:
 
 @cache
 def _vector_keys(kind: StructType, extra: str) -> Mapping[str, str]:
-    """Finds the keys of a table that are vectors, and the count that determines each length.
+    """Finds the vector keys of a table, and the count that determines the length of each.
 
-    The fields of a structure type are the keys of a table in a scenario. The length of a vector
-    depends on the arm, for example on its number of joints. The annotation of its field states
-    the count: a field `Kd: Annotated[tuple[float, ...], Meta(extra={"per": "joints"})]` has one
-    number per joint, and its entry in the result is `"Kd": "joints"`.
+    The length of a vector depends on the arm, for example on its number of joints. It is
+    declared in the annotation of the field: `Kd: Annotated[tuple[float, ...],
+    Meta(extra={"per": "joints"})]` has one entry per joint, and appears in the result as `"Kd":
+    "joints"`.
 
     Args:
-        kind: The structure type of the table.
-        extra: Kind of vectors to find, as a key of `Meta.extra`. "per" for vectors that a
-            single number may stand for. "point" for points in space, which must be written in
-            full.
+        kind: Structure type of the table.
+        extra: Kind of vectors to find, as a key of `Meta.extra`: "per" for vectors that a
+            scalar may stand for, or "point" for points in space, which must be written in full.
 
     Returns:
-        For each vector, by its key, the name of the field of `VectorCounts` with its length.
+        Mapping from vector key to the field of `VectorCounts` that contains its length.
     """
     count_names = {}
     for key, hint in get_type_hints(kind, include_extras=True).items():

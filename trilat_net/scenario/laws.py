@@ -16,12 +16,12 @@ from ..own_code import ImportedLaw
 BUILT_IN: dict[str, type[ControlLaw]] = {
     str(law.Settings.__struct_config__.tag): law for law in ControlLaw.find_built_in()
 }
-"""Classes of the built-in laws, by name."""
+"""Mapping from name to class of the built-in laws."""
 LAWS: dict[str, type[LawSettings]] = {
     **{name: law.Settings for name, law in BUILT_IN.items()},
     str(ImportedLaw.__struct_config__.tag): ImportedLaw,
 }
-"""Type of the gains of each law, by name. All laws of users have the same type and name."""
+"""Mapping from law name to the type of its gains. All users' laws share one type and name."""
 if TYPE_CHECKING:
     ChosenLaw = LawSettings
 else:

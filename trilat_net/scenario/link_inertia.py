@@ -120,7 +120,7 @@ def balance_tensor(tensor: Matrix) -> Matrix:
 def _diagonalise(tensor: Matrix) -> tuple[list[float], list[list[float]]]:
     """Returns the principal moments of a symmetric tensor, and the principal axes as columns.
 
-    The method is Jacobi's, in plain Python arithmetic. The routines of LAPACK differ between
+    Uses Jacobi's method in plain Python arithmetic, since results of LAPACK differ between
     machines in the last bits.
     """
     a = [list(row) for row in tensor]
@@ -142,7 +142,7 @@ def _diagonalise(tensor: Matrix) -> tuple[list[float], list[list[float]]]:
 
 
 def _rotate_rows(matrix: list[list[float]], p: int, q: int, cosine: float, sine: float) -> None:
-    """Rotates two rows of a matrix into each other by an angle, in place (Jacobi)."""
+    """Applies a Jacobi rotation to two rows of a matrix, in place."""
     for column in range(3):
         upper = matrix[p][column]
         lower = matrix[q][column]
@@ -153,7 +153,7 @@ def _rotate_rows(matrix: list[list[float]], p: int, q: int, cosine: float, sine:
 def _rotate_columns(
     matrix: list[list[float]], p: int, q: int, cosine: float, sine: float
 ) -> None:
-    """Rotates two columns of a matrix into each other by an angle, in place (Jacobi)."""
+    """Applies a Jacobi rotation to two columns of a matrix, in place."""
     for row in matrix:
         left = row[p]
         right = row[q]

@@ -86,24 +86,25 @@ def complete_link(
 
 
 def _join_link(written: TomlTable, common: TomlTable, path: str) -> TomlTable:
-    """Returns the settings of a link, completed with the settings that the link inherits.
+    """Completes the settings of a link with those that it inherits.
 
-    The source of settings that the author left out depends on what the author wrote:
+    The source of the missing settings depends on what the author wrote:
 
     - If the link names a preset, they are taken from the preset.
-    - If it names only a delay model, no other settings are inherited, because each model has
-      its own settings.
-    - Otherwise they are taken from the common settings of all links.
+    - If it names only a delay model, nothing is inherited, since each model has its own
+      settings.
+    - Otherwise, they are taken from the common settings of all links.
 
-    Files with recorded delays are not read here.
+    Delay traces are not read here.
 
     Args:
-        written: Settings of the link as the author wrote them.
-        common: Common settings of all links, completed.
+        written: Settings of the link as written by the author.
+        common: Complete common settings of all links.
         path: Path of the settings in the scenario, for error messages.
 
     Raises:
-        ScenarioError: There is no such preset, model or key, or the preset has another model.
+        ScenarioError: The preset, model or key does not exist, or the preset has a different
+            model.
     """
     defaults = {} if "model" in written else common
     if "preset" in written:

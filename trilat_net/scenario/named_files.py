@@ -115,13 +115,13 @@ class NamedFiles(NamedTuple):
 
 
 def _read_urdf(name: str, folder: Path | None, path: str) -> str:
-    """Reads the text of a URDF file, the XML description of a robot.
+    """Reads a URDF file.
 
-    At most one character more than allowed is read, so that a huge file cannot fill the memory.
-    The parser then refuses the text as too long.
+    Reads at most one character more than allowed, so a huge file cannot fill the memory. The
+    parser then rejects the text as too long.
 
     Args:
-        name: Name of the file, as the arm names it.
+        name: Name of the file, as given in the arm table.
         folder: Folder of the scenario. If None, no file may be named.
         path: Path of the key that names the file, for error messages.
 
@@ -141,9 +141,9 @@ def _read_urdf(name: str, folder: Path | None, path: str) -> str:
 
 
 def _find_file(name: str, folder: Path) -> Path:
-    """Returns the path of a file that a scenario names, in the package or in the user's folder.
+    """Returns the path of a file named in a scenario, in the package or in the user's folder.
 
-    A file that the package ships has priority, but only for a name without a folder. The
+    A file shipped with the package takes precedence, but only for a name with no folder. The
     returned path need not exist.
     """
     shipped = Path(str(SHIPPED_FOLDER / name))

@@ -39,7 +39,7 @@ MAX_DELAY_MS = MAX_DELAY_US / 1000
 """Longest delay of a link, in ms."""
 
 MAX_OUTAGES = 1000
-"""Largest number of outages of a link, because each sample is compared with all of them."""
+"""Largest number of outages of a link; each sample is compared with all of them."""
 
 Milliseconds = Annotated[float, Meta(ge=0.0, le=MAX_DELAY_MS)]
 Probability = Annotated[float, Meta(ge=0.0, le=1.0)]
@@ -47,7 +47,7 @@ OutageTime = Annotated[float, Meta(ge=0.0, le=1e9)]
 
 
 class _DelayMoments(NamedTuple):
-    """Mean and standard deviation of the random delay of a link, both in ms."""
+    """Mean and standard deviation of the random delay of a link, in ms."""
 
     mean_ms: float
     deviation_ms: float
@@ -67,20 +67,20 @@ _DETERMINISTIC_KINDS = (
     DelayKind.TRACE,
     DelayKind.MEASURED,
 )
-"""Delays that are not drawn at random."""
+"""Delay kinds that are not random."""
 
 
 class _LossChain(NamedTuple):
-    """Markov chain that decides which messages a simulated network loses, in bursts.
+    """Markov chain that determines which messages a simulated network loses in bursts.
 
-    The network is either in a good or in a bad state (Gilbert's model). Its state may change
-    from message to message, and each state has its own probability of losing a message.
+    The network is in either a good or a bad state (Gilbert's model). The state can change from
+    one message to the next, and each state has its own loss probability.
 
     Attributes:
         loss_good: Probability that a sample is lost in the good state.
         loss_bad: Probability that a sample is lost in the bad state.
-        enter: Probability per sample to change from the good to the bad state.
-        leave: Probability per sample to change from the bad to the good state.
+        enter: Probability per sample of a transition from the good to the bad state.
+        leave: Probability per sample of a transition from the bad to the good state.
     """
 
     loss_good: float
@@ -136,9 +136,9 @@ class LinkBase(Frozen, frozen=True, tag_field="model", omit_defaults=True):
         return None
 
     def _delay(self) -> LinkModel:
-        """Returns the delay of the link in the format that the compiled simulation reads.
+        """Returns the delay of the link in the format read by the compiled simulation.
 
-        Losses are not included; `to_core_model` adds them.
+        Excludes losses, which are added by `to_core_model`.
         """
         raise NotImplementedError
 
@@ -147,20 +147,19 @@ class LinkBase(Frozen, frozen=True, tag_field="model", omit_defaults=True):
         raise NotImplementedError
 
     def _reach_ms(self) -> float:
-        """Returns the longest delay of a message on the link, ms.
+        """Returns the longest delay of a message on the link, in ms.
 
-        A distribution without an upper limit is cut at three standard deviations above its
-        mean.
+        An unbounded distribution is cut off three standard deviations above its mean.
         """
         mean_ms, deviation_ms = self._moments()
         return mean_ms + 3.0 * deviation_ms
 
     def _find_delay_problem(self) -> KeyProblem | None:
-        """Returns a contradiction between several keys of the delay, or None."""
+        """Returns a contradiction between keys of the delay, or None."""
         return None
 
     def _describe_delay(self) -> str:
-        """Returns a short text for users about the delay, with mean and standard deviation."""
+        """Returns a short description of the delay, with its mean and standard deviation."""
         mean_ms, deviation_ms = self._moments()
         return f"{self.__struct_config__.tag} {mean_ms:.4g} +- {deviation_ms:.3g} ms"
 
@@ -233,16 +232,16 @@ class LinkBase(Frozen, frozen=True, tag_field="model", omit_defaults=True):
         return ticks / receiver_hz
 
     def _loss_chain(self) -> _LossChain:
-        """Computes the Markov chain that produces the stated losses.
+        """Computes the Markov chain that produces the configured losses.
 
-        In the bad state, a sample is lost with the probability h = `loss_bad`; in the good
-        state, never. A run of lost samples continues with the probability (1 - leave) h. Its
-        mean length is therefore
+        A sample is lost with probability h = `loss_bad` in the bad state, and never in the good
+        state. A run of lost samples continues with probability (1 - leave) h. Its mean length
+        is therefore
 
             B = 1 / (1 - (1 - leave) h), so that leave = 1 - (1 - 1 / B) / h.
 
-        The fraction of samples in the bad state is loss / h = enter / (enter + leave), from
-        which the probability `enter` follows.
+        The fraction of samples in the bad state is loss / h = enter / (enter + leave), which
+        determines `enter`.
         """
         if self.loss_burst == 0.0 or self.loss == 0.0:
             return _LossChain(loss_good=self.loss, loss_bad=0.0, enter=0.0, leave=1.0)
@@ -280,10 +279,10 @@ class LinkBase(Frozen, frozen=True, tag_field="model", omit_defaults=True):
         return None
 
     def _find_burst_problem(self) -> KeyProblem | None:
-        """Returns a problem if the stated losses in bursts are impossible.
+        """Returns a problem if the configured burst losses are impossible, or None.
 
-        The losses are modelled by a Markov chain, which alternates between good times and
-        bursts. The result is None if such a chain can produce the stated losses.
+        They are impossible if no Markov chain that alternates between good and bad periods can
+        produce them.
         """
         if self.loss_burst < 1.0:
             return KeyProblem(
@@ -399,7 +398,7 @@ class OwnDelay(LinkBase, frozen=True, kw_only=True):
         return np.resize(numbers, (rows, 2)).view(np.int64)
 
     def _delay(self) -> LinkModel:
-        """Returns the delay in the format that the compiled simulation reads.
+        """Returns the delay in the format read by the compiled simulation.
 
         The parameter `location` is the longest delay, in microseconds.
         """
@@ -420,7 +419,7 @@ class OwnDelay(LinkBase, frozen=True, kw_only=True):
 
 
 DELAY_MODELS = {str(kind.__struct_config__.tag): kind for kind in LinkBase.find_kinds(__name__)}
-"""Classes of all delay models, by the name of the model."""
+"""Mapping from name to class of all delay models."""
 if TYPE_CHECKING:
     Link = LinkBase
 else:

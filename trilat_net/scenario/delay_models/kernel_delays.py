@@ -23,7 +23,7 @@ from . import MAX_DELAY_MS, LinkBase, Milliseconds, Probability, ms_to_us
 
 PositiveMilliseconds = Annotated[float, Meta(gt=0.0, le=MAX_DELAY_MS)]
 Deviation = Annotated[float, Meta(ge=0.001, le=MAX_DELAY_MS)]
-"""Standard deviation. It is at least a microsecond, because delays are whole microseconds."""
+"""Standard deviation, at least 1 microsecond since delays are integers in microseconds."""
 Correlation = Annotated[float, Meta(ge=0.0, lt=1.0)]
 
 
@@ -33,7 +33,7 @@ def _normal_density(x: float) -> float:
 
 
 def _normal_probability(x: float) -> float:
-    """Returns the probability that a standard normal random number is below `x`."""
+    """Returns the probability that a standard normal random variable is below `x`."""
     return 0.5 * math.erfc(-x / math.sqrt(2.0))
 
 
@@ -71,13 +71,13 @@ class UniformDelay(LinkBase, frozen=True, kw_only=True, tag="uniform"):
         )
 
     def _describe_delay(self) -> str:
-        """Returns the limits of the delay, for example "uniform 0 to 400 ms"."""
+        """Returns the range of the delay, for example "uniform 0 to 400 ms"."""
         least_ms = self.delay_ms - self.half_width_ms
         most_ms = self.delay_ms + self.half_width_ms
         return f"uniform {least_ms:.4g} to {most_ms:.4g} ms"
 
     def _moments(self) -> tuple[float, float]:
-        """Returns the mean and the standard deviation, half_width / sqrt(3), in ms."""
+        """Returns the mean and the standard deviation half_width / sqrt(3), in ms."""
         return self.delay_ms, self.half_width_ms / math.sqrt(3.0)
 
     def _reach_ms(self) -> float:
@@ -85,7 +85,7 @@ class UniformDelay(LinkBase, frozen=True, kw_only=True, tag="uniform"):
         return self.delay_ms + self.half_width_ms
 
     def _find_delay_problem(self) -> KeyProblem | None:
-        """Returns a problem if the half width exceeds the mean, as delays would be negative."""
+        """Returns a problem if the half width exceeds the mean, giving negative delays."""
         if self.half_width_ms > self.delay_ms:
             return KeyProblem("half_width_ms", f"must be at most delay_ms = {self.delay_ms:g}")
         return None
@@ -113,10 +113,10 @@ class NormalDelay(LinkBase, frozen=True, kw_only=True, tag="normal"):
     def _moments(self) -> tuple[float, float]:
         """Returns the mean and the standard deviation of the delay, in ms.
 
-        They are those of the normal distribution truncated at zero. Let m and s be the mean and
-        the standard deviation before the truncation, a = -m / s, phi the standard normal
-        density, Phi its integral, and H = phi(a) / Phi(-a) the hazard. Then the mean is m + s
-        H, and the standard deviation is s sqrt(1 + a H - H^2).
+        The normal distribution is truncated at zero. Let m and s be its mean and standard
+        deviation before truncation, a = -m / s, phi the standard normal density, Phi its
+        integral, and H = phi(a) / Phi(-a) the hazard. The mean is then m + s H, and the
+        standard deviation is s sqrt(1 + a H - H^2).
         """
         a = -self.delay_ms / self.deviation_ms
         hazard = _normal_density(a) / _normal_probability(-a)
@@ -136,13 +136,13 @@ class MeanDeviationDelay(LinkBase, frozen=True, kw_only=True):
     deviation_ms: Deviation
 
     def _moments(self) -> tuple[float, float]:
-        """Returns the mean and the standard deviation that the author stated, in ms."""
+        """Returns the configured mean and standard deviation, in ms."""
         return self.delay_ms, self.deviation_ms
 
     def _find_delay_problem(self) -> KeyProblem | None:
-        """Returns a problem if the ratio of deviation and mean is extreme.
+        """Returns a problem if the ratio of standard deviation to mean is extreme.
 
-        The deviation must be between 1/1000 of the mean and 10 times the mean.
+        The standard deviation must be between 1/1000 of the mean and 10 times the mean.
         """
         delay_ms, deviation_ms = self._moments()
         if 1e-3 * delay_ms <= deviation_ms <= 10.0 * delay_ms:
@@ -162,8 +162,8 @@ class GammaDelay(MeanDeviationDelay, frozen=True, kw_only=True, tag="gamma"):
     def _delay(self) -> LinkModel:
         """Returns the parameters from which the compiled simulation draws the delays.
 
-        For the mean m and the standard deviation s, the shape of the gamma distribution is m^2
-        / s^2, and its scale is s^2 / m.
+        For mean m and standard deviation s, the gamma distribution has shape m^2 / s^2 and
+        scale s^2 / m.
         """
         shape = (self.delay_ms / self.deviation_ms) ** 2
         return LinkModel(kind=DelayKind.GAMMA, extra=shape, scale=1e3 * self.delay_ms / shape)
@@ -179,8 +179,8 @@ class LogNormalDelay(MeanDeviationDelay, frozen=True, kw_only=True, tag="lognorm
     def _delay(self) -> LinkModel:
         """Returns the parameters from which the compiled simulation draws the delays.
 
-        For the mean m and the standard deviation s, the logarithm of the delay is normal with
-        the variance sigma^2 = ln(1 + s^2 / m^2) and the mean mu = ln m - sigma^2 / 2.
+        For mean m and standard deviation s, the logarithm of the delay is normal with variance
+        sigma^2 = ln(1 + s^2 / m^2) and mean mu = ln m - sigma^2 / 2.
         """
         variance = math.log1p((self.deviation_ms / self.delay_ms) ** 2)
         location = math.log(1e3 * self.delay_ms) - 0.5 * variance
@@ -220,8 +220,8 @@ class HyperExponentialDelay(LinkBase, frozen=True, kw_only=True, tag="hyperexpon
         """Returns the mean and the standard deviation of the delay, in ms.
 
         The delay is a fixed part plus a mixture of two exponential distributions. The second
-        moment of a mixture is the mixture of the second moments. Exponential distributions with
-        the means a and b have the second moments 2 a^2 and 2 b^2.
+        moment of a mixture is the mixture of the second moments, which are 2 a^2 and 2 b^2 for
+        exponential distributions with means a and b.
         """
         fast = self.fast_ms
         slow = self.slow_ms
@@ -249,9 +249,9 @@ class CorrelatedDelay(NormalDelay, frozen=True, kw_only=True, tag="ar1"):
         return NormalDelay._delay(self)._replace(kind=DelayKind.AR1, weight=self.correlation)
 
     def _moments(self) -> tuple[float, float]:
-        """Returns the mean and standard deviation of the delay max(0, x) for a normal x, ms.
+        """Returns the mean and standard deviation of the delay max(0, x) for normal x, in ms.
 
-        The variance is written as a sum in which large terms do not cancel each other.
+        The variance is written as a sum that avoids cancellation of large terms.
         """
         m = self.delay_ms
         s = self.deviation_ms
@@ -278,15 +278,15 @@ class NoDelay(LinkBase, frozen=True, kw_only=True, tag="none"):
         return 0.0
 
     def _delay(self) -> LinkModel:
-        """Returns the settings of a link without delay, for the compiled simulation."""
+        """Returns the settings of a link with no delay, for the compiled simulation."""
         return LinkModel()
 
     def _moments(self) -> tuple[float, float]:
-        """Returns zero for the mean and for the standard deviation of the delay, in ms."""
+        """Returns a mean and a standard deviation of zero, in ms."""
         return 0.0, 0.0
 
     def _describe_delay(self) -> str:
-        """Returns the text that users read about a link without delay."""
+        """Returns the description of a link with no delay."""
         return "no delay"
 
 
@@ -306,11 +306,11 @@ class ConstantDelay(LinkBase, frozen=True, kw_only=True, tag="constant"):
         return self.delay_ms
 
     def _delay(self) -> LinkModel:
-        """Returns the delay in whole microseconds, for the compiled simulation."""
+        """Returns the delay as an integer in microseconds, for the compiled simulation."""
         return LinkModel(kind=DelayKind.CONSTANT, location=float(ms_to_us(self.delay_ms)))
 
     def _moments(self) -> tuple[float, float]:
-        """Returns the constant delay as the mean, and zero as the standard deviation, in ms."""
+        """Returns the constant delay as the mean, with a standard deviation of zero, in ms."""
         return self.delay_ms, 0.0
 
     def _describe_delay(self) -> str:
@@ -346,7 +346,7 @@ class SineDelay(LinkBase, frozen=True, kw_only=True, tag="sine"):
         )
 
     def _moments(self) -> tuple[float, float]:
-        """Returns the mean and the standard deviation over whole periods, in ms."""
+        """Returns the mean and the standard deviation over complete periods, in ms."""
         return self.delay_ms, self.amplitude_ms / math.sqrt(2.0)
 
     def _reach_ms(self) -> float:
@@ -354,7 +354,7 @@ class SineDelay(LinkBase, frozen=True, kw_only=True, tag="sine"):
         return self.delay_ms + self.amplitude_ms
 
     def _find_delay_problem(self) -> KeyProblem | None:
-        """Returns a problem if the amplitude exceeds the mean, as delays would be negative."""
+        """Returns a problem if the amplitude exceeds the mean, giving negative delays."""
         if self.amplitude_ms > self.delay_ms:
             return KeyProblem("amplitude_ms", f"must be at most delay_ms = {self.delay_ms:g}")
         return None
@@ -384,15 +384,15 @@ class TraceDelay(LinkBase, frozen=True, kw_only=True, tag="trace"):
     def _delay(self) -> LinkModel:
         """Returns the settings of a recorded delay, for the compiled simulation.
 
-        The recorded points themselves are in a separate array, see `points`.
+        Excludes the recorded points, which are in a separate array (see `points`).
         """
         return LinkModel.follow_trace(self.at_end)
 
     def _moments(self) -> tuple[float, float]:
         """Returns the mean and the standard deviation of the recorded delays, in ms.
 
-        The delay of each point of the table is weighted by the time until the next point, and
-        lost messages are left out. Both results are NaN if all messages were lost.
+        Each delay is weighted by the time until the next point, and lost messages are excluded.
+        Both results are NaN if all messages were lost.
         """
         t_us, delay_us = self.points.T
         # The last point lasts as long as the point before it.
@@ -408,11 +408,11 @@ class TraceDelay(LinkBase, frozen=True, kw_only=True, tag="trace"):
         return mean_us / 1e3, math.sqrt(variance) / 1e3
 
     def _reach_ms(self) -> float:
-        """Returns the longest delay in the recorded table, in ms."""
+        """Returns the longest delay in the trace, in ms."""
         return float(self.points[:, 1].max()) / 1e3
 
     def _find_delay_problem(self) -> KeyProblem | None:
-        """Returns a problem if the text of the recorded delays cannot be read as a table."""
+        """Returns a problem if the trace cannot be parsed."""
         try:
             parse_trace(self.trace)
         except ValueError as error:
@@ -432,7 +432,7 @@ class NoInjectedDelay(LinkBase, frozen=True, kw_only=True, tag="measured"):
         return LinkModel(kind=DelayKind.MEASURED)
 
     def _moments(self) -> tuple[float, float]:
-        """Returns NaN twice, because the delay of the real network is not known in advance."""
+        """Returns NaN twice, since the delay of the real network is not known in advance."""
         return math.nan, math.nan
 
     def _describe_delay(self) -> str:

@@ -55,7 +55,7 @@ class LowOrbit(OwnDelay, frozen=True, kw_only=True, tag="low_orbit"):
         )
 
     def _moments(self) -> tuple[float, float]:
-        """Returns the mean and the standard deviation of the delay, in ms, over many intervals.
+        """Returns the mean and the standard deviation of the delay over many intervals, in ms.
 
         An interval is the time, about 15 s, for which a terminal keeps its satellite. The
         variances of the two independent random parts add up.
@@ -66,7 +66,7 @@ class LowOrbit(OwnDelay, frozen=True, kw_only=True, tag="low_orbit"):
     def _reach_ms(self) -> float:
         """Returns the longest delay that can be drawn, in ms.
 
-        The random parts are multiples of -log(x) with x of at least 2^-53, and -log(2^-53) =
+        The random parts are multiples of -log(x), where x is at least 2^-53 and -log(2^-53) =
         36.8.
         """
         return self.floor_ms + 36.8 * (self.path_ms + self.jitter_ms)

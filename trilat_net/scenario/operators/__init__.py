@@ -64,14 +64,14 @@ class ActorBase(fields.Frozen, frozen=True, tag_field="kind"):
     """
 
     group: ClassVar[str] = "hands"
-    """List of a site to which the actor belongs: "hands" or "environment"."""
+    """Site list to which the actor belongs: "hands" or "environment"."""
     oscillates: ClassVar[bool] = False
-    """True if the torque is an oscillation in time, with which an arm never rests."""
+    """True if the torque oscillates in time, so that the arm never comes to rest."""
     value_texts: ClassVar[Mapping[str, str]] = {}
-    """Permitted values of each key that `VALUE_TEXTS` does not describe, for error messages."""
+    """Permitted values of keys missing from `VALUE_TEXTS`, for error messages."""
 
     def _source(self) -> TorqueSource:
-        """Returns the operator or environment in the format of the compiled simulation."""
+        """Returns the operator or environment in the format read by the compiled simulation."""
         raise NotImplementedError
 
     @property
@@ -191,9 +191,9 @@ class OwnActor(SampledActor, frozen=True, kw_only=True):
         raise NotImplementedError
 
     def _source(self) -> TorqueSource:
-        """Returns the operator or environment in the format of the compiled simulation.
+        """Returns the operator or environment in the format read by the compiled simulation.
 
-        The simulation calls its compiled method `act`.
+        The simulation calls its compiled `act` method.
         """
         kind = TorqueKind.OWN_TIP if self.at_tip else TorqueKind.OWN_JOINTS
         return TorqueSource(kind, self.start_s, self.end_s, sampled=self.sampled, model=self)
@@ -225,20 +225,20 @@ VALUE_TEXTS = {
     "acceleration_limit_m_s2": "an acceleration above 0 m/s^2",
     "acceleration_limit_rad_s2": "an acceleration above 0 rad/s^2",
 }
-"""Permitted values of each key, for error messages. `COUNT_TEXTS` fills the placeholders."""
+"""Permitted values of each key, for error messages, with placeholders for `COUNT_TEXTS`."""
 COUNT_TEXTS = {
     "joints": ("both joints or two", "all joints or one for each"),
     "axes": ("two numbers, x and y", "three numbers, x, y and z"),
     "all_axes": ("both axes or two", "all axes or three"),
     "each": ("joint 1, on joint 2", "each joint"),
 }
-"""Texts for the placeholders in `VALUE_TEXTS`: for the planar arm, and for any other arm."""
+"""Replacements for the placeholders in `VALUE_TEXTS`: for the planar arm, and for others."""
 
 
 _KINDS = {str(kind.__struct_config__.tag): kind for kind in ActorBase.find_kinds(__name__)}
 OPERATORS = {tag: kind for tag, kind in _KINDS.items() if kind.group == "hands"}
 ENVIRONMENTS = {tag: kind for tag, kind in _KINDS.items() if kind.group == "environment"}
-"""Classes of the operators and of the environments, by the name of the kind."""
+"""Mapping from kind to class, for operators and for environments."""
 if TYPE_CHECKING:
     Operator = ActorBase
     Environment = ActorBase
@@ -289,7 +289,7 @@ def resolve_operators(
 def _find_kind(
     entry: fields.TomlTable, kinds: Mapping[str, type[ActorBase]], path: str
 ) -> type[ActorBase]:
-    """Returns the class for the kind of operator or environment that a table names.
+    """Returns the class for the kind of operator or environment named in a table.
 
     Raises:
         ScenarioError: The key is missing or wrong, or the kind belongs to the other list.
@@ -309,12 +309,12 @@ def _find_kind(
 
 
 class _RefusedKey(NamedTuple):
-    """Key of an operator's or environment's table whose value is missing or not valid.
+    """Key of an operator or environment table whose value is missing or invalid.
 
     Attributes:
         key: The key.
-        indices: Indices of the wrong entry in a list, such as "[3][1]". Empty if the whole
-            value is wrong.
+        indices: Indices of the invalid list entry, such as "[3][1]". Empty if the value as a
+            whole is invalid.
         is_missing: True if the key is missing.
     """
 
@@ -330,14 +330,14 @@ def _check_values(
     path: str,
     counts: VectorCounts,
 ) -> None:
-    """Refuses the table of an operator or environment with a value of a wrong type or length.
+    """Raises ScenarioError if a value of an operator or environment table is invalid.
 
-    The error says what its author may write instead.
+    The error states what its author may write instead.
 
     Args:
         table: Complete table.
         kind: Class of the table.
-        entry: Table as its author wrote it.
+        entry: Table as written by its author.
         path: Path of the table, for error messages.
         counts: Lengths of the arm's vectors.
     """
@@ -361,14 +361,14 @@ def _check_values(
 
 
 def _describe_values(refused: _RefusedKey, kind: type[ActorBase], counts: VectorCounts) -> str:
-    """Returns the permitted values of a refused key, as text for the author of the scenario.
+    """Describes the permitted values of a rejected key to the author of the scenario.
 
     An example is "one torque for both joints or two, ON the arm, N m".
 
     Args:
         refused: The key.
         kind: Class of the table.
-        counts: Lengths of the arm's vectors, which determine words such as "both joints".
+        counts: Lengths of the arm's vectors, which affect wording such as "both joints".
     """
     text = kind.value_texts.get(refused.key) or VALUE_TEXTS[refused.key]
     if refused.key == "points" and refused.indices:
@@ -384,9 +384,9 @@ def _describe_values(refused: _RefusedKey, kind: type[ActorBase], counts: Vector
 def _find_refused_key(
     table: fields.TomlTable, kind: type[ActorBase], counts: VectorCounts
 ) -> _RefusedKey | None:
-    """Returns the first key of an operator's table whose value is missing or not valid.
+    """Returns the first key of a complete operator table with a missing or invalid value.
 
-    The table must be complete. The result is None if the table is valid.
+    Returns None if the table is valid.
     """
     try:
         msgspec.convert(table, kind)

@@ -35,16 +35,16 @@ FARTHEST = 100.0
 STRONGEST = 10.0
 """Largest force that a program may request, as a multiple of the operator's force limit.
 
-A force above the limit is reduced to the limit. A force above this multiple is refused as a
+A force above the limit is clipped to the limit. A force above this multiple is rejected as a
 mistake.
 """
 DIRECTIONS = {
     "right": (1.0, 0.0, 0.0), "left": (-1.0, 0.0, 0.0), "ahead": (0.0, 1.0, 0.0),
     "back": (0.0, -1.0, 0.0), "up": (0.0, 0.0, 1.0), "down": (0.0, 0.0, -1.0),
 }  # fmt: skip
-"""Directions as seen by the person who holds a device: x to the right, y ahead, z up."""
+"""Directions as seen by the person who holds a device: x right, y ahead, z up."""
 FRAMES = {2: ("right", "up"), 3: ("ahead", "left", "up")}
-"""Default directions of an arm's axes, by the number of axes."""
+"""Mapping from the number of an arm's axes to their default directions."""
 _AXES_TEXTS = {
     "stiffness_n_m": "one number for {all_axes}, at least 0, N/m",
     "damping_n_s_m": "one number for {all_axes}, at least 0, N s/m",
@@ -69,7 +69,7 @@ class Pulse(ActorBase, frozen=True, tag="pulse"):
     peak_nm: fields.Joints
 
     def _source(self) -> TorqueSource:
-        """Returns the pulse of torque in the format of the compiled simulation."""
+        """Returns the torque pulse in the format read by the compiled simulation."""
         return TorqueSource(TorqueKind.PULSE, self.start_s, self.end_s, a=self.peak_nm)
 
 
@@ -139,7 +139,7 @@ class MovingSpring(ActorBase, frozen=True, kw_only=True):
         )
 
     def _source(self) -> TorqueSource:
-        """Returns the spring and its moving target in the format of the compiled simulation."""
+        """Returns the spring and its moving target in the format read by the simulation."""
         end_target, start_target, stiffness, damping = msgspec.structs.astuple(self)[:4]
         return TorqueSource(
             TorqueKind.TASK_HAND if self.at_tip else TorqueKind.HAND,
@@ -223,7 +223,7 @@ class RecordedTorque(ActorBase, frozen=True, tag="recorded"):
         return None
 
     def _source(self) -> TorqueSource:
-        """Returns the recorded torques in the format of the compiled simulation."""
+        """Returns the recorded torques in the format read by the compiled simulation."""
         return TorqueSource(TorqueKind.RECORDED, table=np.array(self.points, dtype=np.float64))
 
 
@@ -248,7 +248,7 @@ class Chirp(TimedActor, frozen=True, tag="chirp"):
     sweep_s: fields.Positive
 
     def _source(self) -> TorqueSource:
-        """Returns the sine of changing frequency in the format of the compiled simulation."""
+        """Returns the frequency sweep in the format read by the compiled simulation."""
         return TorqueSource(
             TorqueKind.CHIRP,
             start_s=self.start_s,
@@ -295,9 +295,9 @@ class Multisine(TimedActor, frozen=True, tag="multisine"):
         return super().find_problem()
 
     def _source(self) -> TorqueSource:
-        """Returns the sines in the format that the compiled simulation reads.
+        """Returns the sines in the format read by the compiled simulation.
 
-        Each sine is a row of its frequency in Hz and its phase in turns.
+        Each sine is a row with its frequency in Hz and its phase in turns.
         """
         count = len(self.frequencies_hz)
         turns = [phase / (2.0 * math.pi) for phase in self.phases_rad]
@@ -478,9 +478,9 @@ class LiveHand(ActorBase, frozen=True, tag="live", omit_defaults=True):
         )
 
     def _source(self) -> TorqueSource:
-        """Returns the spring and limits of a person who moves the arm, for the simulation.
+        """Returns the spring and limits of a live operator, for the compiled simulation.
 
-        The point to which the arm is pulled is not included, because it changes during the run.
+        The target to which the arm is pulled is not included, since it changes during the run.
         """
         stiffness = self.stiffness_n_m
         damping = self.damping_n_s_m
@@ -494,10 +494,9 @@ class LiveHand(ActorBase, frozen=True, tag="live", omit_defaults=True):
 
 
 def _check_frame(frame: list[Any], axes: int, path: str) -> None:
-    """Refuses directions for the axes of a device that are not a valid choice.
+    """Raises ScenarioError if the axis directions of a device are not a valid choice.
 
-    The author of a scenario states how the axes of a haptic device correspond to those of the
-    arm. Unknown, missing, superfluous or parallel axes are refused.
+    Unknown, missing, superfluous or parallel directions are rejected.
 
     Args:
         frame: Names of the directions, one per axis.
@@ -533,7 +532,7 @@ LIVE_KEYS = {
     ),
     "force": ("force_limit_n",),
 }
-"""Keys of a live operator, by the mode."""
+"""Mapping from mode to the keys of a live operator."""
 
 
 class ViscousEnvironment(SampledActor, frozen=True, tag="viscous"):
@@ -550,7 +549,7 @@ class ViscousEnvironment(SampledActor, frozen=True, tag="viscous"):
     damping_nm_s_rad: fields.NotNegativeJoints
 
     def _source(self) -> TorqueSource:
-        """Returns the damping of the joints in the format of the compiled simulation."""
+        """Returns the joint damping in the format read by the compiled simulation."""
         return TorqueSource(
             TorqueKind.VISCOUS,
             self.start_s,
@@ -584,7 +583,7 @@ class Wall(SampledActor, frozen=True, tag="wall"):
     damping_n_s_m: fields.NotNegative = 0.0
 
     def _source(self) -> TorqueSource:
-        """Returns the wall as the compiled simulation reads it, with a normal of length 1."""
+        """Returns the wall, with a unit normal, in the format read by the compiled simulation."""
         x, y, z = (*self.normal, 0.0)[:3]
         # `math.hypot` of three numbers, unlike that of two, is rounded differently on different
         # machines.

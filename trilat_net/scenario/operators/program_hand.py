@@ -54,7 +54,7 @@ POLICY = "policy"
 """Name under which a trained program takes hold of an arm in the log."""
 
 FAILED_HAND = "failed at tick"
-"""Words in the events of a log for a program that failed while it moved an arm."""
+"""Phrase used in log events for a program that failed while moving an arm."""
 
 
 class ProgramHand(
@@ -392,6 +392,6 @@ class HandPlayer:
         self.hand.release(k)
 
     def _describe_change(self, k: int, change: str) -> str:
-        """Returns a sentence about the program, such as that it takes hold of the arm."""
+        """Returns a sentence about the program, for example that it takes hold of the arm."""
         t_s = tick_ns(k, self._rate_hz) / NS_PER_S
         return f"{self._site}: {self._code} {change} at t = {t_s:.3f} s"
