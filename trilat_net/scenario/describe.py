@@ -212,7 +212,7 @@ def _describe_joint(joint: UrdfJoint, drive: ChainJoint) -> str:
 
 
 def _group_chains(scenario: Scenario) -> list[tuple[Arm, list[str]]]:
-    """Returns each distinct arm read from a URDF file, with the names of the sites that use it."""
+    """Returns each distinct arm read from a URDF file, with the sites that use it."""
     groups: list[tuple[Arm, list[str]]] = []
     for name, spec in scenario.sites.items():
         if not spec.arm.urdf:

@@ -27,15 +27,15 @@ from .site_spec import SITE_GROUPS
 from .written_tables import TRACE_KEYS
 
 _KIND_KEYS = {"control": ("law",), "link": ("model", "preset")}
-"""Groups in which other keys depend on a kind, and the keys that name this kind."""
+"""Groups whose other keys depend on a kind, and the keys that select this kind."""
 _USER_LAW = "own"
-"""Kind of all control laws that users wrote."""
+"""Kind shared by all user-defined control laws."""
 
 _WRONG_VALUE = "expected "
-"""Beginning of the text about a value of a wrong type or range."""
+"""Prefix of messages about a value of a wrong type or range."""
 
 Override = tuple[str, Any]
-"""Dotted key and its new value."""
+"""Dotted key and new value."""
 
 
 class ScenarioOverrides(NamedTuple):
@@ -179,9 +179,9 @@ class ScenarioOverrides(NamedTuple):
 
 
 def _flatten_groups(pairs: Sequence[Override]) -> list[Override]:
-    """Replaces each override of a whole group of keys by overrides of the single keys.
+    """Replaces each override of a group of keys with overrides of the individual keys.
 
-    For example, `limits={q_max_rad=3}` becomes `limits.q_max_rad=3`, so that other keys of the
+    For example, `limits={q_max_rad=3}` becomes `limits.q_max_rad=3`, so the other keys of the
     group keep their values.
     """
     flat_pairs: list[Override] = []
@@ -195,9 +195,9 @@ def _flatten_groups(pairs: Sequence[Override]) -> list[Override]:
 
 
 def _expand_single(scenario: Scenario, key: str, overridden: Mapping[str, Any]) -> str:
-    """Returns the complete path of an overridden key that belongs to a single arm or link.
+    """Returns the complete path of an overridden key of a single site or link.
 
-    A key of a user's control law is an argument of its class, and gets the path of this
+    A key of a user's control law is an argument of its class, and is given the path of this
     argument.
     """
     group, _, rest = key.partition(".")
@@ -209,7 +209,7 @@ def _expand_single(scenario: Scenario, key: str, overridden: Mapping[str, Any]) 
 
 
 def _user_law_key(path: str, name: str) -> str:
-    """Returns the complete path of an overridden key that belongs to a user's control law.
+    """Returns the complete path of an overridden key of a user's control law.
 
     Keys that the scenario itself does not define are arguments of the user's class.
     """
@@ -220,7 +220,7 @@ def _user_law_key(path: str, name: str) -> str:
 def _expand_group(
     scenario: Scenario, group: str, name: str, overridden: Mapping[str, Any]
 ) -> list[str]:
-    """Returns the paths of a key of a group, one for each law or link that can have the key.
+    """Returns the paths of a group key, one for each law or link that can have the key.
 
     Whether a law or link can have the key depends on its kind after the overrides.
 
@@ -228,7 +228,7 @@ def _expand_group(
         scenario: The scenario.
         group: "control" or "link".
         name: Key in the group.
-        overridden: All overrides, by key.
+        overridden: Mapping from key to value of all overrides.
 
     Raises:
         ScenarioError: No law or link can have the key.
@@ -273,13 +273,13 @@ def _expand_group(
 def _list_group_kinds(
     scenario: Scenario, group: str, overridden: Mapping[str, Any]
 ) -> tuple[dict[str, str], dict[str, tuple[str, ...]]]:
-    """Returns the control laws (or delay models) of all arms (or links) after the overrides.
+    """Returns the laws (or delay models) in use after the overrides, and the keys of each.
 
-    For each of these kinds, it also returns the keys that the kind has. An override of all arms
-    applies only where the law has the key.
+    An override for all sites applies only where the law has the key.
 
     Returns:
-        Kinds by the path of the law or link, and keys by the built-in kind.
+        Mapping from the path of each law or link to its kind, and mapping from built-in kind to
+        its keys.
     """
     if group == "control":
         laws = {}
@@ -296,11 +296,11 @@ def _list_group_kinds(
 
 
 def _split_entry(key: str) -> tuple[str, str]:
-    """Splits the key of an entry of a list into the name and the index, as in "q0_rad.1".
+    """Splits the key of a list entry into name and index, as in "q0_rad.1".
 
     Returns:
-        Key of the list, and number of the entry as a string. For other keys, the key itself and
-        an empty text.
+        Key of the list, and index of the entry as a string. For other keys, the key itself and
+        an empty string.
     """
     vector, _, entry = key.rpartition(".")
     if vector and entry.isdecimal():
@@ -309,9 +309,9 @@ def _split_entry(key: str) -> tuple[str, str]:
 
 
 def _find_value(tables: TomlTable, key: str) -> Any:
-    """Returns the value of a scenario at a dotted key, in which a number is an index of a list.
+    """Returns the value at a dotted key of a scenario, where a number is a list index.
 
-    The result is None if the scenario has no such value.
+    Returns None if there is no such value.
     """
     value: Any = tables
     for name in key.split("."):
@@ -325,7 +325,7 @@ def _find_value(tables: TomlTable, key: str) -> Any:
 
 
 def _find_law(scenario: Scenario, site: str, overridden: Mapping[str, Any]) -> Any:
-    """Returns the name of an arm's control law after the overrides."""
+    """Returns the name of a site's control law after the overrides."""
     for path in (f"sites.{site}.control.law", "control.law"):
         if path in overridden:
             return overridden[path]
@@ -335,7 +335,7 @@ def _find_law(scenario: Scenario, site: str, overridden: Mapping[str, Any]) -> A
 def _find_model(scenario: Scenario, link: str, overridden: Mapping[str, Any]) -> Any:
     """Returns the name of a link's delay model after the overrides.
 
-    An unknown model or preset is refused later, when the tables are resolved.
+    An unknown model or preset is rejected later, when the tables are resolved.
     """
     for path in (f"links.{link}", "link"):
         if f"{path}.model" in overridden:
@@ -347,7 +347,7 @@ def _find_model(scenario: Scenario, link: str, overridden: Mapping[str, Any]) ->
 
 
 def _list_kind_keys(parents: Sequence[str]) -> list[str]:
-    """Returns the keys that choose a kind in the table at a path, such as `law` or `model`.
+    """Returns the keys that select a kind in the table at a path, such as `law` or `model`.
 
     If an override changes such a key, the other keys of the table belong to the previous kind
     and are removed.
@@ -361,13 +361,13 @@ def _list_kind_keys(parents: Sequence[str]) -> list[str]:
 
 
 def _check_site_exists(tables: TomlTable, parents: Sequence[str], key: str) -> None:
-    """Refuses an override of a key of an arm that the scenario does not have.
+    """Raises ScenarioError if an override names a site that the scenario does not have.
 
-    Otherwise a misspelt name would add a new arm.
+    Otherwise, a misspelt name would add a new site.
 
     Args:
         tables: Tables of the scenario.
-        parents: Keys of the path, without the last one.
+        parents: Keys of the path, excluding the last.
         key: The complete key, for the error message.
     """
     sites = tables.get("sites")
@@ -380,13 +380,12 @@ def _check_site_exists(tables: TomlTable, parents: Sequence[str], key: str) -> N
 
 
 def _reach_table(tables: TomlTable, parents: Sequence[str], last: str) -> TomlTable | list[Any]:
-    """Returns the table or list that contains an overridden key, and adds it if it is missing.
+    """Returns the table or list that contains an overridden key, creating it if necessary.
 
     Args:
         tables: Tables of the scenario.
         parents: Keys of the path.
-        last: Key in the table or list. If this key is a number, a list is added, otherwise a
-            table.
+        last: Key in the table or list. If it is a number, a list is created, otherwise a table.
 
     Raises:
         ScenarioError: A value stands in place of a table, or a list has no such entry.
@@ -408,11 +407,11 @@ def _reach_table(tables: TomlTable, parents: Sequence[str], last: str) -> TomlTa
 
 
 def _list_index(entries: list[Any], name: str, path: str) -> int:
-    """Returns the index that a part of an overridden key states, after a check of the range.
+    """Parses a list index in an overridden key, and checks its range.
 
     Args:
         entries: The list.
-        name: Index as a string.
+        name: The index as a string.
         path: Path of the entry, for the error message.
 
     Raises:

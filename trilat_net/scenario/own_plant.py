@@ -21,7 +21,7 @@ from .key_checks import is_number
 
 _BODY_NAME = re.compile(r"[a-z][a-z0-9_]{0,29}")
 _MAX_BODIES = 32
-"""Largest number of bodies that a plant moves in addition to its arm."""
+"""Maximum number of bodies that a plant moves in addition to its arm."""
 _MAX_SIZE_M = 100.0
 """Largest extent of a body, in m."""
 
@@ -92,9 +92,9 @@ class OwnPlant(Frozen, frozen=True, rename={"code": "class"}, omit_defaults=True
 
 
 def _check_bodies(written: Any, path: str) -> Any:
-    """Checks the names and sizes of the bodies that a user's arm model moves, such as a box.
+    """Validates the names and sizes of the bodies that a plant moves in addition to the arm.
 
-    The table is returned unchanged if it is valid.
+    Returns the table unchanged if it is valid.
 
     Raises:
         ScenarioError: There are too many bodies, or a name or extent is not valid.
@@ -120,7 +120,7 @@ def _check_bodies(written: Any, path: str) -> Any:
 
 
 def _is_box_size(size: Any) -> bool:
-    """Returns True for a list of three lengths in m that a body of the scene may have."""
+    """Returns True for a list of three lengths in m that are valid for a body."""
     if not isinstance(size, list | tuple) or len(size) != 3:
         return False
     return all(is_number(length) and 0.0 < length <= _MAX_SIZE_M for length in size)

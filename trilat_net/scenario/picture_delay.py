@@ -98,12 +98,12 @@ class PictureDelay:
         }
 
     def _find_end(self, tick: int, rate_hz: int) -> int:
-        """Returns the number of samples that another arm sent before a tick of the site.
+        """Returns the number of samples that a peer sent before a tick of the site.
 
-        A sample that is sent at the time of the tick itself is not shown yet.
+        A sample sent at the time of the tick itself is not shown yet.
 
         Args:
             tick: Tick of the site.
-            rate_hz: Tick rate of the other arm, in Hz.
+            rate_hz: Tick rate of the peer, in Hz.
         """
         return -(-tick * rate_hz // self._receiver_hz)

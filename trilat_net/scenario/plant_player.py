@@ -58,10 +58,10 @@ class PlantContext(NamedTuple):
 
 
 class _PlantProgram(Protocol):
-    """Interface of a user's plant: a program that computes the motion of an arm.
+    """Interface of a user's plant, which computes the motion of an arm.
 
-    The user's class is called with a `PlantContext` as its first argument, and with its
-    settings by name.
+    The user's class is called with a `PlantContext` as its first argument, followed by its
+    settings as keyword arguments.
     """
 
     def step(self, tau: Array, h_s: float) -> Sequence[Sequence[float]]:
@@ -187,9 +187,9 @@ class PlantPlayer:
         self.state = PlantState(q, qd, tau_x, bodies)
 
     def _step(self, tau: Sequence[float]) -> list[list[float]]:
-        """Calls the user's arm model for one control period, and returns the motion after it.
+        """Calls the plant for one control period and returns the motion after it.
 
-        The result is q, qd and, if the model measures it, the external torque tau_x.
+        Returns q, qd and, if the plant measures it, the external torque tau_x.
         """
         q, qd, *others = self._program.step(np.array(tau), 1.0 / self.rate_hz)
         vectors = [q, qd, *others[:1]]
@@ -199,8 +199,7 @@ class PlantPlayer:
         """Returns the poses of all bodies as one list, with seven numbers per body.
 
         Raises:
-            ValueError: The plant returned another number of poses, or numbers that are not
-                finite.
+            ValueError: The plant returned the wrong number of poses, or non-finite numbers.
         """
         if not self._body_count:
             return []
@@ -216,10 +215,10 @@ class PlantPlayer:
         return numbers
 
     def _call(self, tick: int, function: Callable[[], T]) -> T:
-        """Calls a function of the user's arm model, and reports an exception with its place.
+        """Calls a function of the plant, and reports where any exception was raised.
 
         Args:
-            tick: Tick, for the error message.
+            tick: Number of the tick, for the error message.
             function: The call.
 
         Raises:
@@ -233,5 +232,5 @@ class PlantPlayer:
             raise self._make_error(tick, describe_exception(error)) from error
 
     def _make_error(self, tick: int, problem: str) -> PlantFailed:
-        """Returns the error that the user's arm model failed in a certain control period."""
+        """Returns the error for a plant that failed in the given control period."""
         return PlantFailed(problem, site=self._site, code=self._code, tick=tick)

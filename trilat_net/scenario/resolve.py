@@ -123,20 +123,18 @@ def resolve_dominance_row(written: Any, names: list[str], site: str, path: str) 
 def _complete_timeline(
     written: Sequence[WrittenChange], links: TomlTable, site_names: list[str]
 ) -> list[TomlTable]:
-    """Returns the planned changes of an experiment, each complete in itself.
+    """Returns the planned changes of a scenario, each complete in itself.
 
-    A change affects a network link, or the weights with which an arm follows the others. An
-    author may state only those settings of a link that change. In the result, each change
-    states all settings. The other settings keep their values from earlier changes.
+    An author may state only those link settings that change. In the result, each change
+    contains all settings, with unchanged settings carried over from earlier changes.
 
     Args:
-        written: Changes as their author wrote them.
-        links: Complete links at the start of the run, by name.
+        written: Changes as written by their author.
+        links: Mapping from name to complete link at the start of the run.
         site_names: Names of all sites of the scenario.
 
     Raises:
-        ScenarioError: A change is not valid, or the changes are not in the order of their
-            times.
+        ScenarioError: A change is not valid, or the changes are not in ascending order of time.
     """
     current_links = dict(links)
     changes = []

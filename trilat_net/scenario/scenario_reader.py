@@ -126,9 +126,9 @@ def load_scenario(
 def _join_overrides(
     overrides: Mapping[str, Any] | Sequence[str], duration_s: float | None, seed: int | None
 ) -> Mapping[str, Any] | Sequence[str]:
-    """Returns overrides together with a duration and a seed, unless these are None.
+    """Adds a duration and a seed to the overrides, unless they are None.
 
-    The result has the type of `overrides`: a mapping, or a list of texts.
+    The result has the type of `overrides`: a mapping, or a list of strings.
     """
     options = {"duration_s": duration_s, "seed": seed}
     chosen_options = {key: value for key, value in options.items() if value is not None}
@@ -141,9 +141,9 @@ def _join_overrides(
 def _change_scenario(
     scenario: Scenario, overrides: Mapping[str, Any] | Sequence[str]
 ) -> Scenario:
-    """Returns the same scenario with some values replaced (overrides).
+    """Returns a copy of a scenario with overrides applied.
 
-    A key such as `control` applies to all arms. A user who names a class in an override thereby
+    A key such as `control` applies to all sites. By naming a class in an override, a user
     permits its code to run.
 
     Raises:
@@ -231,14 +231,14 @@ class ExperimentText(NamedTuple):
 
 
 def _read_source(source: str | Path) -> tuple[str, Path]:
-    """Reads the TOML text of a scenario from the package or from a file.
+    """Reads the TOML source of a scenario from the package or from a file.
 
     Args:
-        source: Name of a scenario in the package, or a path. A text counts as a path if it ends
-            in ".toml" or contains a slash or backslash.
+        source: Name of a scenario in the package, or a path. Treated as a path if it ends in
+            ".toml" or contains a slash or backslash.
 
     Returns:
-        The text, and the folder with the files that the scenario names.
+        The TOML source, and the folder in which files named in the scenario are looked up.
 
     Raises:
         ScenarioError: The source cannot be read.
@@ -306,13 +306,13 @@ def parse_scenario(
 
 @lru_cache(maxsize=4)
 def _parse_toml(text: str) -> bytes:
-    """Returns the tables of a TOML text, pickled.
+    """Parses TOML and returns the tables, pickled.
 
-    The runs of a study have the same text with different overrides. Copying the tables takes
-    far less time than parsing the text again.
+    The runs of a study share one source with different overrides. Copying the tables takes far
+    less time than parsing the source again.
 
     Raises:
-        ScenarioError: The text is not TOML, or has a key of very many parts.
+        ScenarioError: The text is not valid TOML, or contains a key with too many parts.
     """
     return pickle.dumps(parse_toml(text))
 

@@ -54,11 +54,11 @@ from .site_spec import SiteSpec
 _POSE_NUMBERS = 7
 """Number of values of the pose of a body: three for the position, four for the quaternion."""
 _SLAVE_COLOUR = 2
-"""Index of the slave's colour in a palette."""
+"""Palette index of the slave's colour."""
 _LOOP_GROWS = ", but the roots of the sampled loop grow"
-"""Addition to the line about a satisfied condition if the sampled loop is unstable."""
+"""Appended to the line about a satisfied condition if the sampled loop is unstable."""
 _SAMPLING_BREAKS = ", but sampling breaks it here: the roots of the sampled loop grow"
-"""The same addition for a condition that proves decay in continuous time."""
+"""The same, for a condition that proves decay in continuous time."""
 
 ScenarioName = Annotated[str, Meta(pattern=r"^[A-Za-z0-9][A-Za-z0-9_\-]*\Z", max_length=64)]
 Duration = Annotated[float, Meta(gt=0.0, le=86_400.0)]
@@ -107,10 +107,10 @@ class Scenario(Frozen, frozen=True, dict=True):
     assumed: tuple[str, ...] = ()
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """Returns the state for a copy in another process, together with the canonical text.
+        """Returns the state for a copy in another process, including the canonical text.
 
-        msgspec leaves out a default if it is the same object as the default of the class. A
-        copy has equal but different objects, so its text would contain additional keys.
+        msgspec omits a default if it is the same object as the default of the class. A copy has
+        equal but distinct objects, so its text would contain additional keys.
         """
         return (*super().__reduce__(), {"text": self.text})
 
@@ -206,10 +206,10 @@ class Scenario(Frozen, frozen=True, dict=True):
             yield name, self.controls[n], situation
 
     def _find_hold_time(self) -> float:
-        """Returns for how long the torque of an arm is held constant, in s.
+        """Returns how long the torque of an arm is held constant, in s.
 
         This is the control period for the integration scheme "digital", and 0 for other
-        schemes. It is NaN if the control loops of the arms have different rates.
+        schemes. NaN if the control loops have different rates.
         """
         if self.scheme != "digital":
             return 0.0
@@ -358,7 +358,7 @@ class Scenario(Frozen, frozen=True, dict=True):
                 yield change.start_ns, change.after
 
     def _all_links(self) -> list[LinkBase]:
-        """Returns the settings of all network links, at the start and after planned changes.
+        """Returns the settings of all links, both initially and after planned changes.
 
         For example, a run is random if any of these settings has random delays.
         """
@@ -617,11 +617,11 @@ class Scenario(Frozen, frozen=True, dict=True):
 
     @cached_property
     def _setups(self) -> dict[str, SiteSetup]:
-        """The results of earlier calls of `setup`, by the name of the site."""
+        """Cache of `setup`: mapping from site name to result."""
         return {}
 
     def _build_setup(self, site: str) -> SiteSetup:
-        """Builds the settings that `setup` returns and caches.
+        """Builds the settings returned and cached by `setup`.
 
         Args:
             site: Name of the site.
@@ -707,9 +707,9 @@ class Scenario(Frozen, frozen=True, dict=True):
     def _rest_gains(self, site: str) -> RestGains:
         """Returns the gains of the controller that brings an arm to rest.
 
-        This controller acts, for example, when another arm has fallen silent. The gains depend
-        on the inertia of the arm, its largest torque, the control period, and the damping of
-        the control law.
+        This controller acts, for example, when a peer has fallen silent. The gains depend on
+        the inertia of the arm, its torque limits, the control period, and the damping of the
+        control law.
         """
         spec = self.sites[site]
         arm = self.arms[site]
@@ -725,9 +725,9 @@ class Scenario(Frozen, frozen=True, dict=True):
         )
 
     def _link_setup(self, peer: str, site: str) -> LinkSetup:
-        """Returns the network link between two arms in the format of the compiled simulation.
+        """Returns the link between two sites in the format read by the compiled simulation.
 
-        It includes the planned changes of the link.
+        Includes the planned changes of the link.
 
         Args:
             peer: Name of the sender.
@@ -762,17 +762,17 @@ class Scenario(Frozen, frozen=True, dict=True):
         )
 
     def _followed_sites(self, index: int) -> int:
-        """Returns the arms that an arm follows, as an integer with bit n set for arm n.
+        """Returns the sites that a site follows, as a bit mask with bit n set for site n.
 
-        For example, 0b101 stands for the first and the third arm. The compiled code needs this
-        compact form.
+        For example, 0b101 stands for the first and the third site. The compiled code requires
+        this form.
         """
         return sum(1 << n for n, share in enumerate(self.alpha[index]) if share > 0.0)
 
     def _speed_limit(self, site: str) -> tuple[float, ...]:
-        """Returns the largest speed of each joint of an arm, in rad/s.
+        """Returns the speed limit of each joint of an arm, in rad/s.
 
-        The result is empty if the arms follow each other's end effectors.
+        Empty if the arms follow each other's end effectors.
         """
         spec = self.sites[site]
         joints = self.arms[site].counts.joints

@@ -91,9 +91,9 @@ SharedSpeedLimits = Annotated[
 
 
 GLIDE_TAU_RATE_NM_S = 1000.0
-"""Default limit of the torque's rate of change under the stale rule "glide", in N m/s.
+"""Default limit on the torque's rate of change under the stale rule "glide", in N m/s.
 
-It is the limit of Franka's arms, 1 N m per millisecond.
+This is the limit of Franka arms, 1 N m per millisecond.
 """
 
 
@@ -268,4 +268,4 @@ SITE_GROUPS: dict[str, type[Frozen]] = {
     "on_stale": OnStale,
     "task": Task,
 }
-"""Groups of keys that may be written once for all sites and again for one site, by table."""
+"""Groups of keys that may be set for all sites and overridden for individual ones, by table."""

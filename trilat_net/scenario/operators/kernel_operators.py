@@ -583,7 +583,7 @@ class Wall(SampledActor, frozen=True, tag="wall"):
     damping_n_s_m: fields.NotNegative = 0.0
 
     def _source(self) -> TorqueSource:
-        """Returns the wall, with a unit normal, in the format read by the compiled simulation."""
+        """Returns the wall, with a unit normal, in the format read by the simulation."""
         x, y, z = (*self.normal, 0.0)[:3]
         # `math.hypot` of three numbers, unlike that of two, is rounded differently on different
         # machines.
