@@ -65,16 +65,16 @@ def new_plant(path: str | Path, *, force: bool = False) -> list[Path]:
 
 
 def _write_skeleton(kind: str, file: Path, *, force: bool) -> list[Path]:
-    """Writes a Python file with a template of a class, and a file with its test.
+    """Writes a Python file with a template for a class, and a file with its test.
 
     Args:
         kind: "law", "hand" or "plant".
-        file: File of the skeleton.
-        force: If True, existing files are replaced.
+        file: Path of the skeleton.
+        force: If True, existing files are overwritten.
 
     Raises:
-        UsageError: A file exists, its name is not that of a module, or Python has another
-            module of that name.
+        UsageError: A file already exists, its name is not a valid module name, or Python has
+            another module of that name.
     """
     module = file.stem
     is_module_name = module.isidentifier() and not keyword.iskeyword(module)
@@ -100,7 +100,7 @@ def _write_skeleton(kind: str, file: Path, *, force: bool) -> list[Path]:
 
 
 def _is_other_module(module: str, file: Path) -> bool:
-    """Returns True if Python would find another file under the name of a new module."""
+    """Returns True if the name of a new module is already taken by another Python module."""
     spec = find_spec(module)
     if spec is None:
         return False

@@ -79,9 +79,9 @@ def written_type(hint: Any, takes_distributions: bool) -> Any:
 
 
 def _list_type(hint: Any, takes_distributions: bool) -> Any:
-    """Returns the type of the list that an author may write for the type of a complete list.
+    """Returns the type of the list that an author may write in place of a complete list.
 
-    The length of a vector depends on the arm, and is checked when the arm is known.
+    The length of a vector depends on the arm, and is checked once the arm is known.
     """
     base, annotations = _split_annotation(hint)
     entry = get_args(base)[0]
@@ -100,7 +100,7 @@ def _list_type(hint: Any, takes_distributions: bool) -> Any:
 
 
 def _split_annotation(hint: Any) -> tuple[Any, tuple[Meta, ...]]:
-    """Splits the annotation of a field into the type itself and its limits."""
+    """Splits the annotation of a field into the type and its limits."""
     if get_origin(hint) is Annotated:
         return get_args(hint)[0], hint.__metadata__
     return hint, ()

@@ -36,12 +36,12 @@ from .suggestions import list_group_paths
 from .written_kinds import written_kind, written_type
 
 MAX_SITES = 32
-"""Largest number of sites of an experiment. Every pair of sites has two links."""
+"""Maximum number of sites. Every pair of sites has two links."""
 _SITE_NAME = re.compile(r"[a-z][a-z0-9_]{0,31}")
 _RESERVED_NAME = "recorder"
-"""Name that no site may have, because it is the name of the program that writes the log."""
+"""Name that no site may have, since the program that writes the log uses it."""
 TRACE_KEYS = ("file", "of")
-"""Keys of a link that name a file of delays. A resolved link contains the delays instead."""
+"""Keys of a link that name a delay file. A resolved link contains the delays instead."""
 
 
 if TYPE_CHECKING:
@@ -73,14 +73,14 @@ _LINK_TABLES: dict[str, StructType] = {
 _LAW_TABLES: dict[str, StructType] = {
     law: written_kind(kind, "law") for law, kind in LAWS.items()
 }
-"""Types of the tables of a link and of a control law, by the name of the model or law."""
+"""Mapping from name to table type, for delay models and for control laws."""
 for _kind in _LINK_TABLES.values():
     # The types are used once now, because msgspec 0.22 crashes if two threads first use a type
     # at once.
     msgspec.convert({}, _kind)
 _USER_LAW = "own"
-"""Name that all laws of users have. Since their arguments differ, a message about a misplaced
-key does not name them as the owners of the key.
+"""Name shared by all users' laws. Since their arguments differ, messages about misplaced keys
+do not mention them.
 """
 
 
@@ -187,7 +187,7 @@ class WrittenScenario(Frozen, frozen=True, kw_only=True):
 
 
 def _check_site_names(names: Collection[str]) -> None:
-    """Refuses names that an arm cannot have, and too few or too many arms in a scenario.
+    """Raises ScenarioError if a site name, or the number of sites, is not valid.
 
     Args:
         names: Names of the sites.
@@ -244,17 +244,17 @@ def check_link(table: TomlTable, model: str, path: str) -> None:
 def _check_foreign_keys(
     table: TomlTable, kinds: Mapping[str, StructType], group: str, chosen: str, path: str
 ) -> None:
-    """Refuses a key that does not belong to the chosen control law or delay model.
+    """Raises ScenarioError if a key belongs to another control law or delay model.
 
-    Upper and lower case count as equal, so that the user of `control.D` learns of `d`. If a key
-    differs from a valid key only in its case, `check_table` refuses it and suggests the valid
+    The comparison ignores case, so that the user of `control.D` learns about `d`. A key that
+    differs from a valid key only in case is rejected by `check_table`, which suggests the valid
     key.
 
     Args:
         table: Table of a control law or a delay model.
         kinds: Types of the tables of all laws or models.
         group: "law" or "model".
-        chosen: The law or model of the table.
+        chosen: Name of the law or model of the table.
         path: Dotted path of the table.
 
     Raises:

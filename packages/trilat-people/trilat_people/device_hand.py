@@ -34,14 +34,14 @@ from trilat_net.scenario import LiveHand
 RETRY_NS = 1_000_000_000
 """Time between two attempts to connect to the device, in ns."""
 _MIN_STATE_GAP_S = 0.005
-"""Shortest time between two states that the detection of jumps assumes, in s.
+"""Shortest time between two states assumed in jump detection, in s.
 
 The operating system may deliver states late, and several at once.
 """
 _MAX_STATE_GAP_S = 0.05
-"""Longest time between two states that the detection of jumps assumes, in s."""
+"""Longest time between two states assumed in jump detection, in s."""
 _TRIPS_KEPT = 60_000
-"""Number of round trips that are kept for statistics."""
+"""Number of round trips kept for statistics."""
 
 
 class DeviceHand:
@@ -143,12 +143,12 @@ class DeviceHand:
     def _follow(self, state: DeviceState, now_ns: int) -> None:
         """Applies the buttons of the device, and moves the target if the clutch is pressed.
 
-        The release button releases the arm. When the clutch is pressed for the first time, the
-        target starts at the present pose of the arm. Later it starts where it was left.
+        The release button releases the arm. The first time the clutch is pressed, the target
+        starts at the current pose of the arm; after that, it starts where it was left.
 
         Args:
-            state: State of the device, with finite numbers.
-            now_ns: Present time on the local clock, in ns.
+            state: State of the device, with finite values.
+            now_ns: Current time on the local clock, in ns.
         """
         settings = self._settings
         previous_position_m = self._position_m
@@ -182,8 +182,8 @@ class DeviceHand:
     def _move_target(self, step_m: list[float], elapsed_s: float) -> None:
         """Moves the target of the arm by a motion of the device, rotated and scaled.
 
-        A motion that is faster than the speed limit of the scenario is a jump, for example
-        after a lost message. It is counted and ignored.
+        Motion above the speed limit of the scenario is treated as a jump, for example after a
+        lost message, which is counted and ignored.
 
         Args:
             step_m: Change of the device's position, in m.
@@ -203,10 +203,10 @@ class DeviceHand:
         self._target = list(self._reach.find_nearest(target))
 
     def _compute_force(self) -> Vector:
-        """Computes the force to render, the reaction force of the arm in device coordinates.
+        """Computes the force to render: the reaction force of the arm in device coordinates.
 
-        The force grows from zero within `GRIP_NS` after the clutch was pressed. It is zero if
-        the clutch is not pressed, the newest record is old, or this operator does not hold the
+        The force is faded in over `GRIP_NS` after the clutch is pressed. It is zero if the
+        clutch is released, the newest record is too old, or this operator does not hold the
         arm.
 
         Returns:
@@ -230,11 +230,11 @@ class DeviceHand:
         return x, y, z
 
     def _measure_trips(self) -> None:
-        """Measures the round trip time from a position of the device to the rendered force.
+        """Measures the round-trip time from a device position to the rendered force.
 
-        Each target was sent with a number. The newest record of the site states the number of
-        the target that the arm follows. The round trips of this target and of all earlier
-        targets end with the force that was just rendered.
+        Each target is sent with a number, and the newest record of the site contains the number
+        of the target that the arm follows. The round trips of this target and of all earlier
+        ones end with the force that was just rendered.
         """
         used_number = self._hand.number
         now_ns = self._clock.monotonic_ns()
@@ -299,5 +299,5 @@ class DeviceHand:
 
 
 def _compute_product(first: Sequence[float], second: Sequence[float]) -> float:
-    """Returns the scalar product of two vectors of equal length."""
+    """Returns the dot product of two vectors of equal length."""
     return sum(a * b for a, b in zip(first, second, strict=True))

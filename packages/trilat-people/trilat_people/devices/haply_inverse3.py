@@ -23,7 +23,7 @@ from trilat_net.net import check_hosts
 SILENCE_S = 0.15
 """Silence of the service after which the connection is closed, in s.
 
-This time is shorter than the silence after which the site releases the arm.
+Shorter than the silence after which the site releases the arm.
 """
 _NO_POSITION = (math.nan, math.nan, math.nan)
 """Position of a state that could not be parsed."""
@@ -35,14 +35,14 @@ _PARSE_ERRORS = (
     OverflowError,
     msgspec.MsgspecError,
 )
-"""Errors that a message with unexpected content may cause."""
+"""Errors that a message with unexpected content may raise."""
 _CONNECT_OPTIONS: dict[str, Any] = {
     "compression": None,
     "proxy": None,
     "ping_interval": None,
     "close_timeout": 0.2,
 }
-"""Options of the WebSocket for short delays."""
+"""WebSocket options for low latency."""
 
 
 class HaplyInverse3:
@@ -115,12 +115,12 @@ class HaplyInverse3:
             return DeviceState(_NO_POSITION, _NO_POSITION, {})
 
     def _parse_state(self, message: Any) -> DeviceState:
-        """Returns position, velocity and buttons of the device from a message of its service.
+        """Extracts position, velocity and buttons from a message of the service.
 
-        The device is the first Inverse3 in the message. The buttons are those of all grips.
+        Uses the first Inverse3 in the message, and the buttons of all grips.
 
         Args:
-            message: Decoded message of the service.
+            message: Decoded message from the service.
 
         Raises:
             ConnectionError: The service has no Inverse3.
@@ -167,5 +167,5 @@ class HaplyInverse3:
 
 
 def _parse_vector(point: dict[str, float]) -> Vector:
-    """Returns a point of the service, {"x": ..., "y": ..., "z": ...}, as a tuple of floats."""
+    """Converts a point of the service, {"x": ..., "y": ..., "z": ...}, to a tuple of floats."""
     return float(point["x"]), float(point["y"]), float(point["z"])

@@ -14,15 +14,15 @@ from trilat_net.app import DeviceState, Vector
 from trilat_net.net import Clock, SystemClock
 
 STILL_NS = 100_000_000
-"""Time without a report after which the cap counts as not deflected, in ns."""
+"""Time with no report after which the cap counts as not deflected, in ns."""
 SPEED_M_S = 0.2 / 350.0
 """Velocity per count of an axis, in m/s. A fully deflected cap reports 350 counts."""
 _MAKER_IDS = (":0000256F:", ":0000046D:0000C62")
-"""USB identifiers of a SpaceMouse in a uevent file: 3Dconnexion, and earlier Logitech."""
+"""USB vendor identifiers of a SpaceMouse in a uevent file: 3Dconnexion, formerly Logitech."""
 _MOTION_REPORT = 1
-"""Number of the reports that contain the deflection of the cap."""
+"""Identifier of reports that contain the deflection of the cap."""
 _BUTTON_REPORT = 3
-"""Number of the reports that contain the buttons."""
+"""Identifier of reports that contain the buttons."""
 
 
 class SpaceMouse:
@@ -106,13 +106,13 @@ class SpaceMouse:
         return DeviceState(self._position_m, self._velocity_m_s, buttons)
 
     def _read_report(self, now_ns: int) -> bool:
-        """Reads the next report of the device, and stores the velocity or the buttons in it.
+        """Reads the next report of the device, and stores its velocity or buttons.
 
         Args:
-            now_ns: Present time, in ns.
+            now_ns: Current time, in ns.
 
         Returns:
-            True if a report was read. Another report may then follow. False if no report was
+            True if a report was read, in which case another may follow; False if no report was
             waiting.
 
         Raises:

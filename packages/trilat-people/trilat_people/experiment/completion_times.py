@@ -28,9 +28,9 @@ import numpy as np
 from .statistics import CONFIDENCE, Row, correct_holm, read_number
 
 COMPLETION = "completion_s"
-"""Column of the completion times."""
+"""Name of the column with completion times."""
 SUCCESS = "succeeded"
-"""Column that states whether a trial was completed."""
+"""Name of the column that tells whether a trial was completed."""
 
 
 class CompletionTime(NamedTuple):
@@ -192,17 +192,17 @@ def summarise_times(
 
 
 def _find_median_interval(times_s: Sequence[float]) -> tuple[float, float | None] | None:
-    """Returns a confidence interval of at least 95 % for a median, by order statistics.
+    """Returns a confidence interval of at least 95 % for a median, from order statistics.
 
     The r-th smallest and the r-th largest time enclose the median with probability 1 - 2 P(B <
-    r), where B is binomial with p = 1/2. r is the largest rank for which this probability is 95
-    % or more.
+    r), where B is binomial with p = 1/2. r is the largest rank for which this probability is at
+    least 95 %.
 
     Args:
-        times_s: Times, in s. They are infinite for trials that were not completed.
+        times_s: Times, in s; infinite for trials that were not completed.
 
     Returns:
-        Lower and upper end, in s. The upper end is `None` if it was not reached. The whole
+        Lower and upper end, in s. The upper end is `None` if it was not reached. The entire
         interval is `None` if there is no such rank, which is the case for fewer than six times.
     """
     # imported late: the import takes half a second, and trials do not need it
@@ -258,13 +258,13 @@ def compare_times(
 def _compare(
     first: str, second: str, pairs: Sequence[tuple[float, float]]
 ) -> CompletionComparison:
-    """Compares the completion times of two conditions by a sign test, which needs no means.
+    """Compares the completion times of two conditions with a sign test, which needs no means.
 
     Args:
         first: Name of the first condition.
         second: Name of the second condition.
-        pairs: Medians of each unit under both conditions, in s. A median that was not reached
-            is infinite.
+        pairs: Medians of each unit under both conditions, in s; infinite if a median was not
+            reached.
     """
     # imported late: the import takes half a second, and trials do not need it
     from scipy import stats
@@ -291,14 +291,14 @@ def _compare(
 def _find_median_difference(pairs: Sequence[tuple[float, float]]) -> float | None:
     """Returns the median of the differences between two conditions, in s.
 
-    A median that was not reached may have any value above 0. Therefore each difference lies
-    between two bounds. The median difference is known if the medians of both bounds agree.
+    A median that was not reached may have any positive value, so each difference lies between
+    two bounds. The median difference is known if the medians of both bounds agree.
 
     Args:
         pairs: Medians of each unit under both conditions, in s.
 
     Returns:
-        The median difference. `None` if it depends on medians that were not reached.
+        The median difference, or `None` if it depends on medians that were not reached.
     """
     if not pairs:
         return None
@@ -317,5 +317,5 @@ def _find_median_difference(pairs: Sequence[tuple[float, float]]) -> float | Non
 
 
 def _replace_infinity(time_s: float) -> float | None:
-    """Returns a median for a result: `None` instead of infinity if it was not reached."""
+    """Returns `None` in place of an infinite median, that is, one that was not reached."""
     return time_s if math.isfinite(time_s) else None

@@ -26,7 +26,7 @@ from .completion_times import COMPLETION, find_median, find_unit_medians, summar
 from .statistics import ConditionMean, Row, average_trials, summarise_conditions
 
 Look = dict[str, Any]
-"""Options of matplotlib for a line and its markers."""
+"""Matplotlib options for a line and its markers."""
 
 _FORM = FigureSize.for_print(COLUMN_IN)
 _HEIGHT_IN = 2.6
@@ -127,13 +127,13 @@ def draw_times(rows: Sequence[Row], limit_s: float, *, unit: str = "participant"
 def _list_unit_lines(
     values: Mapping[str, Mapping[str, float]],
 ) -> Iterator[tuple[list[int], list[float]]]:
-    """Yields the points of each participant or pair, which a thin line joins in the figure.
+    """Yields the points of each participant or pair, which the figure joins with a thin line.
 
     Args:
-        values: A value by condition and unit. Each condition is a column of the figure.
+        values: Value by condition and unit. Each condition is a column of the figure.
 
     Yields:
-        The indices of the columns, and their values. Conditions without a value are left out.
+        Indices of the columns, and their values. Conditions with no value are skipped.
     """
     all_units = chain.from_iterable(values.values())
     for unit in dict.fromkeys(all_units):
@@ -147,7 +147,7 @@ def _list_unit_lines(
 
 
 def _label_conditions(axes: Axes, values: Mapping[str, Mapping[str, float]]) -> None:
-    """Labels the horizontal axis with each condition and its number of participants or pairs.
+    """Labels the x axis with each condition and its number of participants or pairs.
 
     Args:
         axes: The panel.
@@ -169,12 +169,12 @@ def _plot_times(
     limit_s: float,
     look: Look,
 ) -> None:
-    """Draws completion times as a line, with an open marker for each time beyond the limit.
+    """Plots completion times as a line, with an open marker for each time beyond the limit.
 
     Args:
         axes: Panel of the figure, as Matplotlib axes.
-        positions: Positions of the times along the horizontal axis.
-        times_s: The times, in s. They are infinite beyond the limit.
+        positions: Positions along the x axis.
+        times_s: The times, in s; infinite if beyond the limit.
         limit_s: Time limit of a trial, in s.
         look: Options of the line and its markers.
     """
@@ -196,9 +196,10 @@ def _mark_beyond_limit(
 
     Args:
         axes: The panel.
-        positions: Horizontal positions of the markers.
+        positions: Positions of the markers along the x axis.
         limit_s: Time limit of a trial, in s.
-        look: Plot options of the condition, which determine shape and colour of the markers.
+        look: Plot options of the condition, which determine the shape and colour of the
+            markers.
     """
     open_marker: Look = {
         "marker": look["marker"],
@@ -253,9 +254,10 @@ def draw_learning(
 
 
 def _assign_looks(rows: Sequence[Row]) -> dict[str, Look]:
-    """Returns the plot options of the line of each experimental condition, such as its colour.
+    """Returns a mapping from condition to the plot options of its line, such as the colour.
 
-    Colours follow the order in which conditions appear in the rows, and repeat after the last.
+    Colours are assigned in the order in which conditions appear in the rows, and are reused
+    once exhausted.
     """
     conditions = dict.fromkeys(row["condition"] for row in rows)
     looks: dict[str, Look] = {}
@@ -266,13 +268,13 @@ def _assign_looks(rows: Sequence[Row]) -> dict[str, Look]:
 
 
 def _label_trials(axes: Axes) -> None:
-    """Labels the horizontal axis with the numbers of the trials."""
+    """Labels the x axis with trial numbers."""
     axes.set_xlabel("trial of the block")
     axes.xaxis.set_major_locator(MaxNLocator(integer=True))
 
 
 def _group_by_trial(rows: Sequence[Row], condition: str) -> dict[Any, list[Row]]:
-    """Returns the rows of a condition by the number of the trial in its block, ascending."""
+    """Groups the rows of a condition by trial number in the block, in ascending order."""
     groups: dict[Any, list[Row]] = {}
     for row in rows:
         if row["condition"] == condition:
@@ -282,10 +284,10 @@ def _group_by_trial(rows: Sequence[Row], condition: str) -> dict[Any, list[Row]]
 
 
 def _draw_learning_times(rows: Sequence[Row], limit_s: float, unit: str) -> Figure:
-    """Draws how the median completion time changes over the trials of a block.
+    """Plots how the median completion time changes over the trials of a block.
 
-    The task has a time limit, and some trials were not completed, so means do not exist. A
-    median beyond the limit has an open marker on the line of the limit.
+    Used when some trials were not completed within the time limit, so that means do not exist.
+    A median beyond the limit is drawn as an open marker on the line of the limit.
 
     Args:
         rows: Rows of the trials.
@@ -315,9 +317,9 @@ def _draw_learning_times(rows: Sequence[Row], limit_s: float, unit: str) -> Figu
 
 
 def _add_panel(figure: Figure, measure: str) -> Axes:
-    """Adds the only panel of a figure, with a vertical axis for one measure.
+    """Adds the only panel of a figure, with a y axis for one measure.
 
-    The unit is the end of the measure's name: "path_m" is labelled "path, m".
+    The unit is taken from the end of the measure's name: "path_m" is labelled "path, m".
     """
     panels = style.add_panels(figure, 1, 1)
     axes: Axes = panels[0, 0]
@@ -332,7 +334,7 @@ def _plot_interval(axes: Axes, position: float, mean: ConditionMean, look: Look)
 
     Args:
         axes: The panel.
-        position: Horizontal position of the condition.
+        position: Position of the condition along the x axis.
         mean: Mean of the condition. With a single participant, there is no interval.
         look: Plot options.
     """
