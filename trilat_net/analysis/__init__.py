@@ -1,11 +1,11 @@
-"""Computes results from the log of a run: delays, events, metrics and a stability judgement.
+"""Computes delays, events, metrics and a stability verdict from the log of a run.
 
-A log is the file that a run leaves behind. It has a record of the state of every arm for each
-period of the control loop. For example, `metrics` computes the RMS tracking error of an arm
-from these records, and `certificate` judges whether the run was stable.
+A log contains one record per site and tick. For example, `metrics` computes the RMS tracking
+error of an arm from these records, and `certificate` judges whether the run was stable.
 
 Invariant:
-    - Nothing in this package draws, formats or prints. The package `presentation` does so.
+    - Nothing in this package draws, formats or prints. That is the task of the package
+      `presentation`.
 """
 
 from typing import TYPE_CHECKING

@@ -1,11 +1,11 @@
-"""Finds which combinations of an arm's dynamic parameters can be learnt from its torques.
+"""Finds the combinations of an arm's dynamic parameters that can be learnt from its torques.
 
-A chain of joints has ten inertial parameters per link, but its torques depend only on some
-linear combinations of these parameters, the base parameters. Estimation errors are expressed in
-the base parameters, which are found with a QR decomposition: M. Gautier, "Numerical calculation
-of the base inertial parameters of robots", J. Robotic Systems 8 (1991).
+A chain of joints has ten inertial parameters per link, but its torques depend only on certain
+linear combinations of them, the base parameters. Estimation errors are expressed in these base
+parameters. They are found with a QR decomposition: M. Gautier, "Numerical calculation of the
+base inertial parameters of robots", J. Robotic Systems 8 (1991).
 
-Whether a rigid body can have the parameters of a link is checked by its pseudo-inertia: P. M.
+The pseudo-inertia of a link shows whether its parameters are physically possible: P. M.
 Wensing, S. Kim, J.-J. Slotine, "Linear matrix inequalities for physically consistent inertial
 parameter identification", IEEE Robotics and Automation Letters 3 (2018).
 """
@@ -46,8 +46,8 @@ class _BaseParameters(NamedTuple):
 def stack_regressors(arm: ChainArmRows, states: int) -> Array:
     """Returns the regressors of random motions, stacked into one matrix.
 
-    The regressor maps the dynamic parameters to joint torques. The column space of this matrix
-    shows which combinations of parameters have an effect on torques.
+    A regressor maps the dynamic parameters to joint torques. The column space of the stacked
+    matrix shows which combinations of parameters affect the torques.
 
     Args:
         arm: The chain with n joints.
@@ -124,16 +124,16 @@ def _find_chain_base(chain: ChainSetup, learnt: tuple[bool, ...]) -> _BaseParame
 
 
 def find_base_parameters(arm: ArmRows, learnt: NDArray[np.bool_]) -> _BaseParameters:
-    """Finds which combinations of an arm's dynamic parameters can be learnt from its torques.
+    """Finds the combinations of dynamic parameters that can be learnt from an arm's torques.
 
-    Torques do not determine every single parameter of a chain, but only some linear
-    combinations of the parameters, which are called base parameters. For the planar arm, each
-    of its five parameters is a base parameter.
+    Torques do not determine every parameter of a chain, only certain linear combinations of
+    them, called base parameters. For the planar arm, each of the five parameters is a base
+    parameter.
 
     Args:
         arm: The arm, with P dynamic parameters.
         learnt: True for each parameter that the control law learns, shape (P,). The other
-            parameters are in no combination.
+            parameters are excluded from all combinations.
     """
     if isinstance(arm, ChainArmRows):
         return _find_chain_base(arm.chain, tuple(learnt.tolist()))
@@ -145,10 +145,10 @@ def find_base_parameters(arm: ArmRows, learnt: NDArray[np.bool_]) -> _BaseParame
 def find_pseudo_inertias(theta: Array) -> Array:
     """Returns the pseudo-inertia of every link, shape (n, 4, 4).
 
-    This symmetric matrix contains the ten parameters of a link, and is positive definite if and
-    only if a rigid body can have these parameters. It is [[S, m c], [m c', m]] with S = tr(I) /
-    2 - I. Here m is the mass of the link, m c its first moment, I its inertia, and tr the
-    trace.
+    This symmetric matrix combines the ten parameters of a link. It is positive definite if and
+    only if the parameters belong to a possible rigid body. The matrix is [[S, m c], [m c', m]]
+    with S = tr(I) / 2 - I, where m is the mass of the link, m c its first moment, I its
+    inertia, and tr the trace.
 
     Args:
         theta: Parameters of the links, shape (10 n,).
@@ -177,10 +177,10 @@ def find_pseudo_inertias(theta: Array) -> Array:
 
 
 def find_consistent_links(theta: Array) -> list[bool]:
-    """Finds the links whose learnt masses and inertias a rigid body can have.
+    """Finds the links whose learnt masses and inertias are physically possible.
 
-    A negative mass, for example, is impossible. The condition is that the link's pseudo-inertia
-    (see `find_pseudo_inertias`) is positive definite (Wensing et al. 2018).
+    A negative mass, for example, is impossible. The condition is that the pseudo-inertia of the
+    link (see `find_pseudo_inertias`) is positive definite (Wensing et al. 2018).
 
     Args:
         theta: Parameters of the links, shape (10 n,).

@@ -1,14 +1,14 @@
 """Decides whether a recorded or simulated run is stable, from all available evidence.
 
-All commands of the program call this module and therefore reach the same decision.
-`certify_run` judges the log of a run by three kinds of evidence: the energy function V of the
-stability proof, repetitions of the run with small disturbances (twins), and the characteristic
-roots of the linearised control loop. `judge_virtual_run` judges a simulated run without a log,
-for example one run of a parameter sweep. To save computing time, it computes V only if V may
-change the decision.
+All commands of the program use this module and therefore reach the same decision. `certify_run`
+judges the log of a run from three kinds of evidence: the energy function V of the stability
+proof, repetitions of the run with small disturbances (twins), and the characteristic roots of
+the linearised control loop. `judge_virtual_run` judges a simulated run without a log, such as
+one run of a parameter sweep. To save computing time, it computes V only if V may change the
+decision.
 
 Invariant:
-    - All commands decide by `analysis.stability_decision.decide_stability`, with roots from
+    - All commands decide with `analysis.stability_decision.decide_stability`, using roots from
       `loop_roots`.
 """
 
@@ -35,16 +35,16 @@ from .twins.twin_growth import TwinGrowth
 
 
 def list_law_proofs(scenario: Scenario) -> list[str]:
-    """Lists the stability conditions of control laws that prove that all motions die away.
+    """Lists the stability conditions of control laws that prove that all motions decay.
 
-    The conditions are evaluated for the delays and dominance factors (the weights with which
-    arms follow each other) at the end of the scenario.
+    The conditions are evaluated for the delays and dominance factors at the end of the
+    scenario.
 
     Args:
-        scenario: Description of the experiment.
+        scenario: The scenario.
 
     Returns:
-        A phrase per condition. Empty unless the condition of every site holds and is a proof.
+        One phrase per condition. Empty unless the condition of every site holds and is a proof.
     """
     if any(change.dominance for change in scenario.timeline):
         return []
@@ -67,22 +67,21 @@ def certify_run(
     own_laws: bool = False,
     twins: int | None = None,
 ) -> Certificate:
-    """Certifies whether a recorded run was stable, with all available checks.
+    """Certifies whether a recorded run was stable, using all available checks.
 
     In addition to the checks of `Certificate.of_log`, the run is repeated with small pushes,
     which shows whether disturbances grow. The characteristic roots of the coupled arms are
-    computed at the end pose.
+    computed at the final pose.
 
     Args:
         log: The log of the run.
-        min_coverage: Least fraction of the ticks (periods of the control loop) of each arm's
-            process that must be recorded.
+        min_coverage: Smallest acceptable fraction of recorded ticks at each site.
         own_laws: True if the code of users' control laws may be executed.
-        twins: Number of repeated runs with a push. `None` for one push of every joint, 0 for no
+        twins: Number of repeated runs with a push. `None` for one push per joint, 0 for no
             repetition.
 
     Raises:
-        LogError: A record cannot be read, or contains a change that is not valid.
+        LogError: A record cannot be read, or contains an invalid change.
     """
     certificate = Certificate.of_log(log, min_coverage=min_coverage, own_laws=own_laws)
 
@@ -138,10 +137,10 @@ def judge_virtual_run(
 ) -> _VirtualJudgement:
     """Judges a simulated run as its certificate would, without a log.
 
-    Twins, one for every joint, are executed only if they may change the decision. The run is
-    repeated with all its records only if it has settled or is open, if its laws have an energy
-    function V or declare energies, and if it has at most `MAX_RECORDED_TICKS` ticks. Energies
-    need the records, and may prove that the run is stable, or contradict that it settled.
+    Twins, one per joint, are executed only if they may change the decision. The run is repeated
+    with all its records only if it has settled or is open, if its laws have an energy function
+    V or declare energies, and if it has at most `MAX_RECORDED_TICKS` ticks. Energies, which
+    require the records, may prove that the run is stable, or contradict that it settled.
 
     Args:
         scenario: Scenario of the run. Its duration may be shorter than that of the run.

@@ -1,11 +1,12 @@
-"""Presents the results of runs as figures, as a web page, as text and as files for other tools.
+"""Presents the results of runs as figures, web pages, text, and files for other tools.
 
-The package `analysis` computes the results. This package draws and writes them, for example the
-report of a run (`page`), or the text of `trilat certify` (`certificate_text`).
+The package `analysis` computes the results; this package draws and writes them. For example,
+`page` writes the report of a run, and `certificate_text` composes the output of `trilat
+certify`.
 
 Invariant:
-    - Matplotlib is imported only in this package and in the figures of `studies`, so that
-      programs that draw nothing start fast.
+    - Matplotlib is imported only here and in the figures of `studies`, so programs that draw
+      nothing start quickly.
 """
 
 from typing import TYPE_CHECKING

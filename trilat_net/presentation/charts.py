@@ -1,18 +1,19 @@
-"""Computes the data of the interactive charts in the report of a run, a web page.
+"""Computes the data for the interactive charts in the report of a run, a web page.
 
-Scripts in the page draw the charts. The charts need signals of the run, such as joint angles
-and torques. A log typically contains a value per millisecond, which is far too much for a page.
-`ChartBuilder` therefore divides the time into intervals, and keeps the least and the largest
-value of each interval (decimation). The result consists of tables of columns, and of charts
-whose lines refer to these columns by index. `page_data` defines the types of the data.
+Scripts in the page draw the charts from signals of the run, such as joint angles and torques. A
+log typically contains one value per millisecond, which is far too much for a page, so
+`ChartBuilder` decimates the signals: it divides the time axis into intervals and keeps the
+minimum and maximum of each interval. The result consists of tables of columns, and of charts
+whose lines refer to these columns by index. The data types are defined in `page_data`.
 
 Invariant:
-    - Every spike of the log is on the page, because decimation keeps the least and the largest
-      value of an interval.
-    - Every line of a chart has a value to draw. A chart without any line is left out, and
-      `_PageCharts.missing` names the chart, so that the page can mention it.
-    - Numbers are stored as base64 text of little-endian int32 and float32, which is a third of
-      the length of decimal text.
+    - Every spike in the log is visible on the page, because decimation keeps the minimum and
+      maximum of each interval.
+    - Every line of a chart has at least one value to draw. Charts without any lines are
+      omitted, and their titles are listed in `_PageCharts.missing` so that the page can mention
+      them.
+    - Numbers are stored as base64-encoded little-endian int32 and float32, which takes a third
+      of the space of decimal text.
 """
 
 import base64
@@ -40,39 +41,37 @@ from .page_leaders import SlaveLead
 from .plot_signals import decimate
 
 Values = NDArray[Any]
-"""Numbers of any type."""
+"""Numerical array of any type."""
 
 BUCKET_BUDGET = 48_000
-"""Number of buckets of all columns together. This limit keeps a page near 1 MB for any number
-of sites.
+"""Total number of buckets of all columns. This limit keeps a page near 1 MB for any number of
+sites.
 """
 _MIN_BUCKETS = 100
-"""Smallest number of buckets of a column, whatever the budget."""
+"""Minimum number of buckets per column, whatever the budget."""
 _MAX_BUCKETS = 1200
-"""Largest number of buckets of a column."""
+"""Maximum number of buckets per column."""
 _BOX_INSTANTS = 60
-"""Number of instants at which the box around the motion of the arms is measured."""
+"""Number of instants used to compute the bounding box of the arms' motion."""
 _CHAIN_INSTANTS = 400
-"""Largest number of instants for which the page has the joint positions of a chain."""
+"""Maximum number of instants for which the page contains the joint positions of a chain."""
 _MAXIMA = 400
-"""Number of intervals of a line of maxima."""
+"""Number of time intervals in a line of maxima."""
 _LEAST_DRAWN = 1e-6
-"""Smallest drawn maximum. Smaller maxima are drawn at this value, because a logarithmic axis
-has no zero.
+"""Smallest maximum that is drawn. Smaller maxima are drawn at this value, because a logarithmic
+axis has no zero.
 """
 PICTURE_SIDE = 4.0
-"""Longer side of a scaled picture, in the unit of the line widths of the page."""
+"""Longer side of a scaled picture, in the unit of line widths on the page."""
 
 
 class _PageCharts(NamedTuple):
-    """All charts of a run's report, as `ChartBuilder.build` returns them.
-
-    The report is a web page whose scripts draw the charts.
+    """All charts of a run's report page, as returned by `ChartBuilder.build`.
 
     Attributes:
         data: Data that the scripts of the page draw.
-        missing: Titles of the charts that are left out because the log has no value for them,
-            by section of the page.
+        missing: Mapping from page section to the titles of charts that are omitted because the
+            log has no data for them.
     """
 
     data: PageData
@@ -80,21 +79,21 @@ class _PageCharts(NamedTuple):
 
 
 class ChartBuilder:
-    """Computes from a log the charts of the web page that reports the run.
+    """Computes the charts of a run's report page from its log.
 
-    The values of the signals become tables, from which the scripts of the page draw the charts
-    in the browser.
+    The signals are stored in tables, from which scripts draw the charts in the browser.
 
     Args:
         log: Log of the run.
-        twin: Log of the same run without operators, the people or programs that move the arms.
-            If `None`, the chart of the motion due to operators is left out.
+        twin: Log of the same run without operators. If `None`, the chart of the motion caused
+            by operators is omitted.
 
     Attributes:
-        bounds_m: Left, right, bottom and top of a box around the motion of all arms, in m.
-        units_per_m: Scale of the pictures of the arms, in units of the picture per m. Pictures
-            with a chain, and of planar arms that move in less than half of `PICTURE_SIDE`, are
-            scaled to that size, because the widths of lines are fixed. Other pictures have the
+        bounds_m: Left, right, bottom and top of the bounding box of the motion of all arms, in
+            m.
+        units_per_m: Scale of the pictures of the arms, in picture units per m. Pictures that
+            contain a chain, or planar arms that move within less than half of `PICTURE_SIDE`,
+            are scaled up to that size because line widths are fixed. All other pictures have
             scale 1.
         leads: Weights with which each slave follows the other arms over time.
     """
@@ -137,11 +136,11 @@ class ChartBuilder:
     def build(self) -> _PageCharts:
         """Computes all charts of the page: overview, motion of the arms, and timing.
 
-        A chart without any curve is left out, for example the estimates of a law that has none.
-        The page lists the titles of such charts by section.
+        A chart without any curves is omitted, for example the estimates of a law that estimates
+        nothing. The page lists the titles of omitted charts by section.
 
         Returns:
-            The data of the page, and the titles of the charts that are left out.
+            The page data, including the titles of omitted charts.
         """
         log = self._log
         charts: list[Chart] = []
@@ -189,10 +188,10 @@ class ChartBuilder:
         return _PageCharts(data, missing)
 
     def _build_overview_charts(self) -> Iterator[TimeChart]:
-        """Yields the two charts of the first screen: the error and the delay of each site.
+        """Yields the two charts at the top of the page: the error and the delay of each site.
 
-        In each chart a site has a single line: the largest error of its joints, or the age of
-        the oldest sample that its controller used.
+        Each chart has one line per site: the largest error of any joint, or the age of the
+        oldest sample used by the controller.
         """
         log = self._log
         unit = plot_signals.shared_unit(log)
@@ -241,14 +240,14 @@ class ChartBuilder:
         return ""
 
     def _add_maxima(self, read_values: Callable[[str], Array]) -> list[TimeChart.Series]:
-        """Adds a line per arm with the largest value of a signal in each short time interval.
+        """Adds one line per arm with the largest value of a signal in each short time interval.
 
-        Within an interval, the line is constant. A line of the values themselves would be a
-        broad band wherever the values oscillate.
+        The line is constant within an interval. Plotting the values themselves would result in
+        a broad band wherever they oscillate.
 
         Args:
-            read_values: Function that returns the values of a site, given its name, with a row
-                for each record.
+            read_values: Function that takes the name of a site and returns its values, with one
+                row per record.
         """
         series = []
         for site in self._log.sites:
@@ -278,7 +277,8 @@ class ChartBuilder:
     def _build_motion_charts(self) -> Iterator[TimeChart]:
         """Yields charts of the arms' torques, positions, errors, estimates and displacements.
 
-        A chart is left out if the run lacks the quantity, such as the operator's torque.
+        Charts of quantities that the run does not have, such as an operator torque, are
+        omitted.
         """
         log = self._log
         operated_sites = plot_signals.sites_with_operator(log)
@@ -316,8 +316,7 @@ class ChartBuilder:
     def _build_timing_charts(self) -> Iterator[Chart]:
         """Yields charts of the network delays and of the timing of the control loops.
 
-        Charts of delays need a delay that varies, and charts of the loop need a run in real
-        time.
+        Delay charts require a delay that varies, and loop charts require a run in real time.
         """
         log = self._log
         yield from self._chart_ages()
@@ -337,12 +336,12 @@ class ChartBuilder:
     def _add_table(self, site: str, tick: Ints, values: Values) -> int:
         """Adds a table of values to the report, from which its scripts draw curves.
 
-        The values are encoded in binary form, which is shorter than decimal text.
+        The values are encoded in binary form, which is more compact than decimal text.
 
         Args:
-            site: Name of the site, whose tick rate converts ticks (control periods) to times.
+            site: Name of the site, whose tick rate converts ticks to times.
             tick: Ticks of the values, shape (P,).
-            values: The values, shape (P, C), a column per quantity.
+            values: The values, one column per quantity, shape (P, C).
 
         Returns:
             The index of the table.
@@ -356,9 +355,9 @@ class ChartBuilder:
         return len(self._tables) - 1
 
     def _add_decimated(self, site: str, tick: Ints, t_s: Array, values: Values) -> int:
-        """Reduces values to the extremes of intervals, and adds them to the page as a table.
+        """Decimates values to the extremes of each interval, and adds them as a table.
 
-        Each interval keeps its least and largest value, so that no spike is lost.
+        Each interval keeps its minimum and maximum, so that no spike is lost.
 
         Args:
             site: Name of the site.
@@ -375,11 +374,12 @@ class ChartBuilder:
     def _add_records(self, site: str, values: Values) -> int:
         """Adds as many recorded values of one arm as a page can show, as a table.
 
-        A long run has more records than the page can show. The extremes of the values are kept.
+        A long run has more records than the page can show. In that case, the extremes of the
+        values are kept.
 
         Args:
             site: Name of the site.
-            values: A row of values for each record of the site, shape (K, C).
+            values: One row of values per record, shape (K, C).
 
         Returns:
             The index of the table.
@@ -390,7 +390,7 @@ class ChartBuilder:
     def _add_signal(
         self, signal: Callable[[SiteLog], Values], sites: Sequence[str] = ()
     ) -> dict[str, list[TimeChart.Series]]:
-        """Adds the values of a signal, such as joint torques, to the report, for several arms.
+        """Adds the values of a signal, such as joint torques, to the report for several arms.
 
         Args:
             signal: Function that computes the values of the signal, shape (K, C), from the K
@@ -398,7 +398,7 @@ class ChartBuilder:
             sites: Names of the sites. Empty for all sites.
 
         Returns:
-            For each site, the lines of the chart: one per column of the signal.
+            For each site, the lines of the chart, one per column of the signal.
         """
         series = {}
         for site in sites or self._log.sites:
@@ -412,7 +412,7 @@ class ChartBuilder:
     ) -> list[TimeChart.Series]:
         """Adds as many values of one arm to the page as a screen can show.
 
-        All columns share one table if there are few of them. Otherwise each column has its own
+        If there are only a few columns, they share one table. Otherwise each column has its own
         table, which is smaller in total, see `__init__`.
 
         Args:
@@ -422,7 +422,7 @@ class ChartBuilder:
             values: The values, shape (K, C).
 
         Returns:
-            A line per column.
+            One line per column.
         """
         if self._has_table_per_column:
             tables = [
@@ -437,13 +437,13 @@ class ChartBuilder:
     def _make_series(
         self, site: str, table: int, column: int, label: str = ""
     ) -> TimeChart.Series:
-        """Returns a line of a chart in the colour of an arm.
+        """Returns a chart line in the colour of an arm.
 
         Args:
             site: Name of the site.
             table: Index of the table with the values of the line.
             column: Index of the column in this table.
-            label: Text in the legend. Empty for the name of the site.
+            label: Label in the legend. Empty to use the name of the site.
         """
         colour = self._log.sites.index(site)
         return TimeChart.Series(label=label or site, colour=colour, table=table, column=column)
@@ -457,10 +457,10 @@ class ChartBuilder:
         sites: Sequence[str] = (),
         **options: Any,
     ) -> TimeChart:
-        """Returns a chart over time, without lines that have no value to draw.
+        """Returns a chart over time, excluding lines that have no values to draw.
 
         Args:
-            section: Key of the section of the page, as in `report.toml`.
+            section: Key of the page section, as in `report.toml`.
             title: Title of the chart.
             unit: Unit of the values.
             series: The lines.
@@ -486,15 +486,15 @@ class ChartBuilder:
         series_by_site: dict[str, list[TimeChart.Series]],
         titles: Sequence[str] = (),
     ) -> Iterator[TimeChart]:
-        """Yields one chart per joint, in which each arm has a line.
+        """Yields one chart per joint, with one line per arm.
 
         Args:
-            section: Key of the section of the page, as in `report.toml`.
+            section: Key of the page section, as in `report.toml`.
             title: Name of the quantity.
             unit: Unit of the quantity.
-            series_by_site: For each site, a line per joint. Sites may have different numbers of
-                joints.
-            titles: Names of the joints, or of the axes of the task. Empty for the joints'
+            series_by_site: For each site, one line per joint. Sites may have different numbers
+                of joints.
+            titles: Names of the joints, or of the task-space axes. Empty to use the joint
                 names.
         """
         for joint, name in enumerate(titles or self._joint_titles):
@@ -502,9 +502,9 @@ class ChartBuilder:
             yield self._make_chart(section, f"{title}, {name}", unit, series)
 
     def _chart_positions(self) -> Iterator[TimeChart]:
-        """Yields a chart per arm and joint, with the actual and the desired angle over time.
+        """Yields one chart per arm and joint, with the actual and the desired angle over time.
 
-        The desired angle follows from the received states of the other arms.
+        The desired angle is computed from the received states of the other arms.
         """
         for site in self._log.sites:
             records = self._log[site]
@@ -528,10 +528,10 @@ class ChartBuilder:
                 )
 
     def _chart_estimates(self) -> Iterator[TimeChart]:
-        """Yields a chart per inertial parameter of the arms.
+        """Yields one chart per inertial parameter of the arms.
 
         Adaptive control laws estimate the inertial parameters of their arm while it moves. Each
-        chart has a line per site, and dashed lines at the true values of the scenario.
+        chart has one line per site, and dashed lines at the true values from the scenario.
         """
         log = self._log
         estimates = self._add_signal(site_signals.parameter_estimates)
@@ -556,14 +556,14 @@ class ChartBuilder:
     def _draw_truths(self, truths: Sequence[float]) -> list[TimeChart.StatedLine]:
         """Returns lines at the true values of a parameter over the whole run.
 
-        An adaptive control law estimates the parameters of the arm, and the lines show how
-        close the estimates come.
+        The lines show how close the estimates of an adaptive control law come to the true
+        values.
 
         Args:
-            truths: The true value for each site.
+            truths: The true value at each site.
 
         Returns:
-            A line per site in its colour. If all values are equal, a single line in a neutral
+            One line per site in its colour. If all values are equal, a single line in a neutral
             colour.
         """
         if len(set(truths)) == 1:
@@ -576,15 +576,14 @@ class ChartBuilder:
         return lines
 
     def _draw_limit(self, value: float) -> TimeChart.StatedLine:
-        """Returns a line at a value over the whole run, in a neutral colour."""
+        """Returns a line at a constant value over the whole run, in a neutral colour."""
         return TimeChart.StatedLine(value=value, colour="limit", from_s=0.0, to_s=self._end_s)
 
     def _chart_ages(self) -> Iterator[TimeChart]:
-        """Yields a chart per site with the age of the samples that its controller uses.
+        """Yields one chart per site with the ages of the samples that its controller uses.
 
-        A sample is the state that a peer (another site) publishes in one control period. Its
-        age is the time since it was sent: the delay that the controller experiences. Dashed
-        lines show the delays that the scenario states.
+        The age of a sample is the time since it was sent, which is the delay experienced by the
+        controller. Dashed lines show the delays specified in the scenario.
         """
         log = self._log
         for site in log.sites:
@@ -612,16 +611,16 @@ class ChartBuilder:
             )
 
     def _list_stated_delays(self, site: str) -> list[TimeChart.StatedLine]:
-        """Returns lines at the mean delays that the scenario states for the links to a site.
+        """Returns lines at the mean delays that the scenario specifies for the links to a site.
 
-        They are drawn next to the measured delays, so that a reader sees whether the network
-        had the stated delays.
+        They are drawn next to the measured delays, to show whether the network had the
+        specified delays.
 
         Args:
             site: Name of the receiving site.
 
         Returns:
-            A line per peer and link model, from the start to the end of the model. If all
+            One line per peer and link model, from the start to the end of the model. If all
             delays are equal, a single line in a neutral colour.
         """
         log = self._log
@@ -648,10 +647,10 @@ class ChartBuilder:
         return lines
 
     def _chart_distributions(self) -> Iterator[DistributionChart]:
-        """Yields a chart per receiving site with the distributions of message ages and delays.
+        """Yields one chart per receiving site with the distributions of sample ages and delays.
 
         A curve at x shows the percentage of ages, or of delays, that are at most x ms. The age
-        of a message is its delay plus the time until a newer message replaces it.
+        of a sample is its delay plus the time until a newer sample replaces it.
         """
         distributions = DelayDistribution.list_of_log(self._log)
         axis = age_and_lateness.DelayAxis.of_links(distributions)
@@ -688,8 +687,8 @@ class ChartBuilder:
     def _chart_histograms(self) -> Iterator[HistogramChart]:
         """Yields histograms that show whether the control loops kept their timing.
 
-        One histogram shows how late the loops woke up for their ticks (control periods), the
-        other how long the computation of a tick took.
+        One histogram shows how late the loops woke up for their ticks, the other how long the
+        computation of a tick took.
         """
         log = self._log
         bins = age_and_lateness.LoopTimeBins.of_log(log)
@@ -718,13 +717,13 @@ class ChartBuilder:
             )
 
     def _build_arm(self, index: int, site: str) -> PageData.PlanarArm | PageData.ChainArm:
-        """Adds the motion of an arm, and of bodies that it touches, for the moving picture.
+        """Adds the motion of an arm, and of bodies that it touches, for the animated picture.
 
-        The script of the page draws planar arms from their joint angles and link lengths. Other
-        arms, called chains, are handled by `_build_chain`.
+        The script of the page draws planar arms from their joint angles and link lengths. All
+        other arms are chains and handled by `_build_chain`.
 
         Args:
-            index: Index of the site, which is also the index of its colour.
+            index: Index of the site, which is also its colour index.
             site: Name of the site, which must have at least one record.
 
         Returns:
@@ -750,14 +749,14 @@ class ChartBuilder:
         )
 
     def _build_chain(self, index: int, site: str) -> PageData.ChainArm:
-        """Adds the motion of a chain, an arm of any number of joints in space.
+        """Adds the motion of a chain, an arm with any number of joints in space.
 
-        The page cannot compute the forward kinematics of chains. Its table therefore contains
-        the joint positions in the picture, of the actual arm, of the reference and of the arm's
-        shadow on the floor, at up to `_CHAIN_INSTANTS` records.
+        The page cannot compute the forward kinematics of chains. The table therefore contains
+        projected joint positions of the actual arm, of the reference and of the arm's shadow on
+        the floor, for up to `_CHAIN_INSTANTS` records.
 
         Args:
-            index: Index of the site, which is also the index of its colour.
+            index: Index of the site, which is also its colour index.
             site: Name of the site, which must have at least one record.
 
         Returns:
@@ -794,17 +793,17 @@ class ChartBuilder:
         )
 
     def _trace_bodies(self, site: str, rows: NDArray[np.int64]) -> list[NDArray[np.float64]]:
-        """Returns the edges of each body that a site's arm can touch, as lines of the picture.
+        """Returns the edges of each body that a site's arm can touch, as lines in the picture.
 
-        The page draws them with the arm, for example the box that an arm pushes.
+        The page draws them together with the arm, for example a box pushed by the arm.
 
         Args:
             site: Name of the site.
             rows: Indices of K records.
 
         Returns:
-            For each body the coordinates of its P corners along all edges, shape (K, 2 P), in
-            units of the picture. Empty if the site has no bodies.
+            For each body, the coordinates of the P corners along its edge path, in picture
+            units, shape (K, 2 P). Empty if the site has no bodies.
         """
         sizes_m = self._log.scenario.bodies_m(site).values()
         if not sizes_m:
@@ -816,12 +815,12 @@ class ChartBuilder:
 
 
 def _lateness_ms(records: SiteLog) -> Values:
-    """Returns the lateness of each tick, ms, shape (K, 1)."""
+    """Returns the lateness of each tick in ms, shape (K, 1)."""
     return records.late_us[:, np.newaxis] * 1e-3
 
 
 def _encode(column: Values, kind: str) -> str:
-    """Encodes numbers as base64 text, so that a web page can contain them compactly.
+    """Encodes numbers as a base64 string, for compact storage in a web page.
 
     Args:
         column: The numbers, shape (P,).
@@ -837,7 +836,7 @@ def _caption_site(scenario: Scenario, site: str) -> str:
 
 
 def _name_role(scenario: Scenario, site: str) -> str:
-    """Returns the role of an arm in words: "master 2", or "slave" if there is only one.
+    """Returns the role of an arm in words: "master 2", or "slave" if there is only one slave.
 
     Args:
         scenario: Scenario of the run.

@@ -1,12 +1,12 @@
-"""Composes a paragraph for a paper about the stability of a run, with its references.
+"""Composes a paragraph about the stability of a run for use in a paper, with references.
 
-The paragraph names the scenario, the program, the verdict with its basis, and the values behind
-it, so that a reader of the paper can reproduce and judge the statement. References follow as
-BibTeX entries.
+The paragraph names the scenario, the program, the verdict and its basis, and the underlying
+values, so that a reader of the paper can reproduce and assess the statement. References follow
+as BibTeX entries.
 
 Invariant:
-    - The paragraph states only facts that the certificate states.
-    - A source is listed only if the statement rests on it.
+    - The paragraph states only facts that are in the certificate.
+    - A source is listed only if the statement relies on it.
 """
 
 from collections.abc import Iterator, Mapping
@@ -67,13 +67,13 @@ _STATEMENTS = {
 
 
 def compose_citation(log: Log, certificate: Certificate) -> Iterator[str]:
-    """Yields a paragraph for a paper about a run, and then its references as BibTeX.
+    """Yields a paragraph about a run for use in a paper, followed by its references as BibTeX.
 
-    The paragraph states the scenario, the judgement and its basis, and the program.
+    The paragraph states the scenario, the verdict and its basis, and the program.
 
     Args:
         log: The log of the run.
-        certificate: Judgement whether the run was stable, with its reasons.
+        certificate: Stability certificate of the run.
     """
     yield " ".join(_compose_sentences(log, certificate))
     yield ""
@@ -84,10 +84,10 @@ def compose_citation(log: Log, certificate: Certificate) -> Iterator[str]:
 
 
 def _compose_sentences(log: Log, certificate: Certificate) -> Iterator[str]:
-    """Yields the sentences of a paragraph, for a paper, about a run and its stability.
+    """Yields the sentences of a paragraph about a run and its stability, for use in a paper.
 
-    The sentences state the scenario, the control laws and delays, the judgement and its basis,
-    the methods that were used (with their citations), and the state of the log.
+    The sentences state the scenario, the control laws and delays, the verdict and its basis,
+    the methods used (with citations), and the condition of the log.
     """
     scenario = log.scenario
     ticks = sum(len(log[site]) for site in log.sites)
@@ -136,10 +136,9 @@ def _compose_sentences(log: Log, certificate: Certificate) -> Iterator[str]:
 
 
 def _state_settings(scenario: Scenario) -> Iterator[str]:
-    """Yields sentences for a paper on the control laws with their gains, and on the delays.
+    """Yields sentences for a paper on the delays and on the control laws with their gains.
 
-    Arms with the same law and gains share an entry, and so do network links with the same
-    delay.
+    Arms with the same law and gains share an entry, and so do links with the same delay.
     """
     law_texts = {}
     for name, site in scenario.sites.items():
@@ -172,9 +171,9 @@ def _state_settings(scenario: Scenario) -> Iterator[str]:
 
 
 def _group_equal(texts: Mapping[str, str]) -> str:
-    """Joins the texts about several objects, each with the names of its objects.
+    """Joins descriptions of several objects, merging equal ones and listing the object names.
 
-    If all texts are equal, the text is returned once, without names.
+    If all descriptions are equal, the description is returned once, without names.
     """
     names: dict[str, list[str]] = {}
     for name, text in texts.items():
@@ -185,7 +184,7 @@ def _group_equal(texts: Mapping[str, str]) -> str:
 
 
 def _format_commit() -> str:
-    """Returns the field of a BibTeX entry with the commit of this program. Empty if unknown."""
+    """Returns the BibTeX field with the commit of this program. Empty if unknown."""
     facts = collect_provenance()
     if facts["commit"] == "unknown":
         return ""
@@ -194,7 +193,7 @@ def _format_commit() -> str:
 
 
 def _list_sources(certificate: Certificate) -> list[str]:
-    """Returns the BibTeX entries of the papers whose methods a judgement has used."""
+    """Returns the BibTeX entries of the papers whose methods were used for a verdict."""
     sources = []
     if certificate.roots is not None and certificate.roots.verdict:
         sources.append(_ROOTS)

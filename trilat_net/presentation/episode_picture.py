@@ -1,12 +1,13 @@
-"""Draws the arms at one time of an episode, as an array of pixels for a video.
+"""Draws the arms at one moment of an episode as a pixel array, for use in a video.
 
-An episode is one attempt of a learned program at a task, see `trilat_studies`. A picture has
-one panel per arm. One of the panels also shows the goal of the task.
+An episode is one attempt of a learned program at a task, see `trilat_studies`. The picture has
+one panel per arm, and one of the panels also shows the goal of the task.
 
 Invariant:
-    - A picture depends only on the poses of the arms, the goal of the task and the title.
-    - All pictures of an episode have the same size and the same axis limits, so that only arms
-      and bodies move in the video.
+    - A picture depends only on the poses of the arms and bodies, the goal of the task, and the
+      title.
+    - All pictures of an episode have the same size and axis limits, so that only arms and
+      bodies move in the video.
 """
 
 from collections.abc import Mapping
@@ -26,10 +27,10 @@ from .appearance import SITE_COLOURS
 from .figures.arm_poses import project_arm_m, trace_bodies_m
 
 PANEL_PX = 240
-"""Side of a panel, in pixels."""
+"""Side length of a panel, in pixels."""
 _DPI = 100
 _MARGIN = 1.08
-"""Half the side of a panel, as a multiple of the reach of its arm."""
+"""Half the side length of a panel, as a multiple of the reach of its arm."""
 _GOAL: dict[str, Any] = {
     "marker": "x",
     "markersize": 9.0,
@@ -45,9 +46,7 @@ _BASE: dict[str, Any] = {
 
 
 class EpisodePicture:
-    """Draws pictures of the arms in a learning episode, one after another, into one figure.
-
-    An episode is one attempt of a learning program at a task.
+    """Draws successive pictures of the arms in a learning episode, reusing one figure.
 
     Args:
         scenario: Scenario of the task, with the arms.
@@ -74,19 +73,17 @@ class EpisodePicture:
         goal_m: Array | None,
         title: str,
     ) -> NDArray[np.uint8]:
-        """Draws the arms, the bodies and the goal of the task at one time of an episode.
-
-        An episode is one attempt at a task. Its pictures can be combined to a video.
+        """Draws the arms, the bodies and the goal of the task at one moment of an episode.
 
         Args:
-            q_rad: Joint angles by site, in rad, shape (n,) each.
-            bodies: Poses of the bodies that the arms can touch, by site and name, shape (7,)
-                each.
-            goal_m: Position that the task requires, in m. `None` if the goal is not a position.
+            q_rad: Joint angles of each site, in rad, shape (n,) each.
+            bodies: For each site, the poses of the bodies that its arm can touch, keyed by body
+                name, shape (7,) each.
+            goal_m: Position required by the task, in m. `None` if the goal is not a position.
             title: Text in the lower left corner of the first panel.
 
         Returns:
-            Colours of the pixels (red, green, blue), shape (height, width, 3).
+            RGB pixels, shape (height, width, 3).
         """
         for number, (site, axes) in enumerate(self._panels.items()):
             arm = self._arms[site]
@@ -116,7 +113,7 @@ class EpisodePicture:
         Args:
             axes: Panel of the figure, as Matplotlib axes.
             site: Name of the site.
-            bodies: Pose of each body by name, shape (7,) each.
+            bodies: Mapping from body name to pose, shape (7,) each.
         """
         if not bodies:
             return
@@ -127,7 +124,7 @@ class EpisodePicture:
             axes.plot(*path[0].T, color=style.REFERENCE, linewidth=0.8)
 
     def _read_pixels(self) -> NDArray[np.uint8]:
-        """Returns the pixels of the figure without their opacity."""
+        """Returns the RGB pixels of the figure, without the alpha channel."""
         self._canvas.draw()  # type: ignore[no-untyped-call]
         rgba = np.asarray(self._canvas.buffer_rgba())  # type: ignore[no-untyped-call]
         pixels: NDArray[np.uint8] = rgba[:, :, :3].copy()
@@ -137,11 +134,11 @@ class EpisodePicture:
 def _scale_panel(axes: Axes, points_m: Array) -> None:
     """Sets the axis limits of a panel so that the arm fits in every pose.
 
-    The limits are the reach of the arm, the sum of its links' lengths.
+    The limits are based on the reach of the arm, which is the sum of its link lengths.
 
     Args:
         axes: Panel of the figure, as Matplotlib axes.
-        points_m: Base, joints and end effector in any pose, shape (L, 2) or (L, 3), in m.
+        points_m: Base, joints and end effector in any pose, in m, shape (L, 2) or (L, 3).
     """
     lengths_m = np.linalg.norm(np.diff(points_m, axis=0), axis=1)
     half_m = _MARGIN * float(lengths_m.sum())
@@ -150,11 +147,11 @@ def _scale_panel(axes: Axes, points_m: Array) -> None:
 
 
 def _draw_arm(axes: Axes, points_m: Array, colour: str) -> None:
-    """Draws the links, joints and base of an arm into a panel of a figure.
+    """Draws the links, joints and base of an arm in a panel.
 
     Args:
         axes: Panel of the figure, as Matplotlib axes.
-        points_m: Base, joints and end effector in the picture, shape (L, 2), in m.
+        points_m: Base, joints and end effector in the picture, in m, shape (L, 2).
         colour: Colour of the arm.
     """
     axes.plot(*points_m.T, color=colour, linewidth=3.0, solid_capstyle="round")

@@ -1,22 +1,23 @@
-"""Writes the report of a recorded run: a web page, and a file with the key numbers of the run.
+"""Writes the report of a recorded run: a web page, and a file with the key figures of the run.
 
-`write_report` computes the key numbers of the run from its log, draws the figures that explain
+`write_report` computes the key figures of the run from its log, draws the figures that explain
 whether the run was stable, and writes two files:
 
 - `report.html`, a page for readers. `render_report` fills the template `templates/report.html`.
-  The sections about links and sites are composed in this module, the other ones in the modules
-  `page_...`. Interactive charts are drawn in the browser by scripts, from data that
-  `charts.ChartBuilder` computes.
+  The sections about links and sites are composed in this module, the others in the `page_...`
+  modules. Scripts draw interactive charts in the browser from data computed by
+  `charts.ChartBuilder`.
 - `summary.json`, the same numbers for programs.
 
 Invariant:
     - The page is a single file that contains its images, styles and scripts. It loads nothing
-      from a network, and can therefore be sent by mail and read offline.
-    - Every text that comes from a scenario or from a log is escaped by the template in which it
-      stands. Such a text therefore cannot add HTML to the page.
-    - The page has the same colours and type as the live page, because both read `theme.css`.
-    - Empty tables are left out.
-    - In a section about links or sites, a sentence with the main results comes first, and each
+      from the network, so it can be sent by mail and read offline.
+    - Every string that comes from a scenario or a log is escaped by the template that inserts
+      it, and therefore cannot add HTML to the page.
+    - The page has the same colours and typefaces as the live page, because both use
+      `theme.css`.
+    - Empty tables are omitted.
+    - Sections about links or sites start with a sentence that gives the main results, and each
       table has a legend.
 """
 
@@ -64,20 +65,20 @@ def write_report(
     twin: Log | None = None,
     verdicts: Iterable[Finding] = (),
 ) -> list[Path]:
-    """Writes the report of a run, report.html and summary.json, into a folder.
+    """Writes the report of a run, report.html and summary.json, to a folder.
 
-    The page shows the results of a run to readers, and the JSON file contains the same numbers
-    for programs.
+    The page presents the results to readers; the JSON file contains the same numbers for
+    programs.
 
     Args:
         log: Log of the run.
-        folder: Folder of both files. It is created if it does not exist.
-        certificate: Judgement whether the run was stable, with its reasons.
-        twin: Log of the same run, simulated without the people or programs that move the arms.
-            The page shows the difference, which is the motion due to these operators. If
-            `None`, this section is left out.
-        verdicts: Results of the checks of the log. They are read only after the figures of the
-            certificate are drawn, because another process may still check the log until then.
+        folder: Folder for both files. Created if it does not exist.
+        certificate: Stability certificate of the run.
+        twin: Log of the same run, simulated without operators. The page shows the difference,
+            which is the motion caused by the operators. If `None`, this section is omitted.
+        verdicts: Results of the log checks. They are read only after the figures of the
+            certificate are drawn, because another process may still be checking the log until
+            then.
 
     Returns:
         The paths of the page and of the summary.
@@ -114,19 +115,18 @@ def render_report(
     verdict: Markup = Markup(),  # noqa: B008
     reasons: Markup = Markup(),  # noqa: B008
 ) -> Markup:
-    """Composes the web page (HTML) that reports a run: judgement, charts and tables.
+    """Composes the web page (HTML) that reports a run: verdict, charts and tables.
 
     Args:
         log: Log of the run.
         twin: Log of the same run without operators, or `None`, see `write_report`.
-        verdicts: Results of the checks of the log.
-        facts: Key numbers of the run, from `summarise_run`.
-        verdict: HTML of the judgement about stability, with which the page begins. Empty for
-            none.
-        reasons: HTML of the section that explains the judgement. Empty for no such section.
+        verdicts: Results of the log checks.
+        facts: Key figures of the run, from `summarise_run`.
+        verdict: HTML of the stability verdict, shown at the top of the page. Empty for none.
+        reasons: HTML of the section that explains the verdict. Empty to omit the section.
 
     Returns:
-        The whole page.
+        The complete page.
     """
     scenario = log.scenario
     builder = ChartBuilder(log, twin)
@@ -163,12 +163,12 @@ def render_report(
 
 
 def _read_asset(name: str) -> Markup:
-    """Returns the text of a file of the page, such as a style or a script."""
+    """Returns the contents of an asset of the page, such as a style sheet or a script."""
     return Markup((_ASSETS / name).read_text(encoding="utf-8"))
 
 
 def _render_motion(charts: Markup) -> Markup:
-    """Returns the section with positions, torques and estimates. Empty if it has no charts."""
+    """Renders the section with positions, torques and estimates. Empty if it has no charts."""
     if not charts:
         return Markup()
     intro = (
@@ -180,10 +180,10 @@ def _render_motion(charts: Markup) -> Markup:
 
 
 def _render_site_css(scenario: Scenario) -> Markup:
-    """Returns the CSS rules for the colours of the sites (arms), which `theme.css` defines.
+    """Returns the CSS rules for the colours of the sites, which `theme.css` defines.
 
-    The site with index i has the classes `site-i`, for lines in its colour, and `fill-i`, for
-    areas in its colour. Colours repeat if there are more sites than colours.
+    The site with index i has the class `site-i` for lines in its colour, and `fill-i` for areas
+    in its colour. Colours repeat if there are more sites than colours.
     """
     colour_numbers = scenario.assign_colours(len(SITE_COLOURS))
     rules = ""
@@ -219,7 +219,7 @@ _SAMPLE_COLUMNS = {
     "duplicate": ("duplicates", "samples that arrived twice"),
     "copies": ("of the model", "duplicates that the delay model made"),
 }
-"""Header and meaning of each count of a link, by its key in the summary."""
+"""Header and meaning of each count of a link, keyed by its name in the summary."""
 _LOSS_COLUMNS = {
     "lost in all (%)": "share of the samples that could not come into use",
     "in a row": "mean number of samples that were lost together",
@@ -242,17 +242,17 @@ _CLOCK_COLUMNS = {
     "rtt_min_us": ("round trip, min (µs)", "shortest time to the peer and back"),
     "faults": ("faults", "samples that arrived before they were sent"),
 }
-"""Header and meaning of each value of a sender's clock, by its key in the summary."""
+"""Header and meaning of each clock value of a sender, keyed by its name in the summary."""
 
 
 def _render_links(log: Log, facts: JsonObject, charts: Markup = Markup()) -> Markup:  # noqa: B008
     """Renders the section about network links: a sentence, and tables of ages and losses.
 
-    A further table compares the clocks of the machines.
+    Another table compares the clocks of the machines.
 
     Args:
         log: Log of the run.
-        facts: Numbers of the run, from `summarise_run`.
+        facts: Key figures of the run, from `summarise_run`.
         charts: HTML of the charts about the links. Empty for no charts.
     """
     rows = _list_age_rows(log, facts)
@@ -272,7 +272,7 @@ def _render_links(log: Log, facts: JsonObject, charts: Markup = Markup()) -> Mar
 
 
 def _summarise_links(facts: JsonObject) -> str:
-    """Returns a sentence about the communication: stated delays, ages of messages, and losses.
+    """Returns a sentence about communication: specified delays, sample ages, and losses.
 
     For example: "Every link has the delay model ...; the controllers used samples that were 400
     to 402 ms old, and no sample was lost."
@@ -308,10 +308,10 @@ def _summarise_links(facts: JsonObject) -> str:
 
 
 def _list_age_rows(log: Log, facts: JsonObject) -> list[list[str]]:
-    """Returns table rows with each network link's stated delay and the ages of its messages.
+    """Returns table rows with the specified delay and the sample ages of each link.
 
-    The scenario may change the delay of a link during the run. In this case the cell lists all
-    stated delays, each with the time from which it applied.
+    If the scenario changes the delay of a link during the run, the cell lists all delays with
+    the times from which they applied.
     """
     rows = []
     for name, link in facts["links"].items():
@@ -331,9 +331,9 @@ def _list_age_rows(log: Log, facts: JsonObject) -> list[list[str]]:
 
 
 def _render_samples(log: Log, facts: JsonObject) -> Markup:
-    """Renders the table of delivered and lost messages of each network link.
+    """Renders the table of delivered and lost samples of each link.
 
-    The columns with measured one-way delays are added only if at least one link has them.
+    The columns with measured one-way delays are included only if at least one link has them.
     """
     links: dict[str, JsonObject] = facts["links"]
     is_measured = any(link["one_way_us"] for link in links.values())
@@ -361,10 +361,10 @@ def _render_clocks(log: Log, facts: JsonObject) -> Markup:
 
     Args:
         log: Log of the run.
-        facts: Numbers of the run.
+        facts: Key figures of the run, from `summarise_run`.
 
     Returns:
-        HTML of the table. Empty if all sites read the same clock.
+        HTML of the table. Empty if all sites use the same clock.
     """
     rows = []
     for name, link in facts["links"].items():
@@ -390,7 +390,7 @@ _MOTION_KEYS = (
     "saturated_ticks",
 )
 _MOST_OPEN_ROWS = 4
-"""Largest number of sites for which the table is not folded."""
+"""Maximum number of sites for which the table is expanded."""
 _ANGLE_COLUMNS = {
     "site": "",
     "q at the end (rad)": "angle of each joint at the last record",
@@ -406,7 +406,7 @@ def _render_sites(log: Log, facts: JsonObject) -> Markup:
 
     Args:
         log: Log of the run.
-        facts: Numbers of the run, from `summarise_run`.
+        facts: Key figures of the run, from `summarise_run`.
     """
     unit = shared_unit(log)
     limit = f"{facts['settle_below_rad']:g} {unit}"
@@ -467,12 +467,11 @@ _LOOP_COLUMNS = {
 def _render_loops(log: Log, facts: JsonObject, charts: Markup = Markup()) -> Markup:  # noqa: B008
     """Renders the section of the report about the timing of each site's control loop.
 
-    The section shows how punctual the ticks (control periods) were, and how long they took to
-    compute.
+    The section shows how punctual the ticks were, and how long their computation took.
 
     Args:
         log: Log of the run.
-        facts: Numbers of the run, from `summarise_run`.
+        facts: Key figures of the run, from `summarise_run`.
         charts: HTML of the charts about the loops. Empty for no charts.
     """
     reason = explain_missing_loop_times(log)
@@ -510,15 +509,16 @@ def _render_loops(log: Log, facts: JsonObject, charts: Markup = Markup()) -> Mar
 
 
 def _render_legend(columns: Mapping[str, str]) -> Markup:
-    """Renders the meanings of a table's columns as a line of text, for touch screens.
+    """Renders the explanations of a table's columns as a line of text, for touch screens.
 
-    On other screens, the meaning of a column is shown while the pointer is on its header.
+    On other screens, an explanation is shown while the pointer hovers over the column header.
 
     Args:
-        columns: Meanings of the columns by header. Columns with an empty meaning are left out.
+        columns: Mapping from column header to its explanation. Columns with an empty
+            explanation are omitted.
 
     Returns:
-        The line. Empty if no column has a meaning.
+        The line. Empty if no column has an explanation.
     """
     items = [f"{header}: {meaning}" for header, meaning in columns.items() if meaning]
     return render_macro("parts.html", "legend", text="; ".join(items)) if items else Markup()
@@ -527,7 +527,7 @@ def _render_legend(columns: Mapping[str, str]) -> Markup:
 def _label_site(log: Log, name: str) -> Markup:
     """Renders the label of a site in a table, for example "m1 (master)".
 
-    A square before the label has the colour of the site in all charts.
+    The label is preceded by a square in the colour that the site has in all charts.
     """
     role = log.scenario.sites[name].role
     return render_macro(
@@ -538,7 +538,7 @@ def _label_site(log: Log, name: str) -> Markup:
 def _label_link(log: Log, link: str) -> Markup:
     """Renders the label of a link in a table, for example "m1 → s" for the link "m1->s".
 
-    A square before the label has the colour of the sending site.
+    The label is preceded by a square in the colour of the sending site.
     """
     peer, site = link.split("->")
     return render_macro(
@@ -547,9 +547,9 @@ def _label_link(log: Log, link: str) -> Markup:
 
 
 def _format_numbers(values: Iterable[float] | None) -> str:
-    """Returns numbers as one cell of a table, for example "0.1000, -0.2500".
+    """Formats numbers as one table cell, for example "0.1000, -0.2500".
 
-    `None`, for values that do not exist, gives a dash.
+    `None`, for missing values, becomes a dash.
     """
     if values is None:
         return NO_NUMBER
@@ -557,5 +557,5 @@ def _format_numbers(values: Iterable[float] | None) -> str:
 
 
 def _to_percent(share: float | None) -> float | None:
-    """Converts a fraction to percent: 0.05 gives 5. `None` (unknown) gives `None`."""
+    """Converts a fraction to percent: 0.05 becomes 5, and `None` (unknown) remains `None`."""
     return None if share is None else 100.0 * share

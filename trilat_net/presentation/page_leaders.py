@@ -1,13 +1,13 @@
-"""Renders bars in a report that show which user leads the slave arm at each time.
+"""Renders bars in a report that show which user leads the slave arm over time.
 
-A slave arm may follow several master arms, each with a weight, the dominance factor. The master
-with the larger factor leads. The factors may change during a run, for example when a trainer
-takes over from a trainee. The bars are below the moving arms of the report.
+A slave can follow several masters, each weighted by a dominance factor. The master with the
+largest factor leads. The factors may change during a run, for example when a trainer takes over
+from a trainee. The bars are shown below the moving arms of the report.
 
 Invariant:
-    - The factors are those with which the slave computed, from the scenario and the records.
+    - The factors are those that the slave used, taken from the scenario and the records.
     - For a slave whose factors never change, a sentence replaces the bar.
-    - The bar has the time axis of the slider that moves the arms.
+    - The bar has the same time axis as the slider that moves the arms.
 """
 
 from typing import NamedTuple
@@ -24,27 +24,25 @@ from .html_templates import render_macro
 from .page_data import PageData
 
 _MAX_BARS = 4
-"""Largest number of slaves with a bar or a sentence."""
+"""Maximum number of slaves with a bar or a sentence."""
 _MAX_PHASES = 6
-"""Largest number of spans of time that the text beside a bar describes."""
+"""Maximum number of time spans described in the text beside a bar."""
 _INSTANTS = 600
 """Number of equally spaced instants at which the factors are computed."""
 _STEP_S = 1e-6
 """Time before a sudden change at which the old factors still apply, in s."""
 _SAME_SHARE = 1e-9
-"""Largest difference of two factors that count as equal."""
+"""Maximum difference between two factors that are considered equal."""
 
 
 class SlaveLead(NamedTuple):
-    """The weights with which each user's arm leads the slave arm over time.
-
-    The slave follows the arms of several users, each with a dominance factor from 0 to 1.
+    """The dominance factors with which a slave arm follows its peers over time.
 
     Attributes:
         slave: Name of the slave.
-        peers: Names of the P peers that the slave follows at some time.
+        peers: Names of the P peers that the slave follows at any time in the run.
         t_s: Times of the K points between which the factors change linearly, in s.
-        shares: Dominance factor of each peer at these times, shape (K, P).
+        shares: Dominance factor of each peer at these times, from 0 to 1, shape (K, P).
     """
 
     slave: str
@@ -54,16 +52,16 @@ class SlaveLead(NamedTuple):
 
     @property
     def is_constant(self) -> bool:
-        """True if no weight with which the slave arm follows the others changes during the run.
+        """True if none of the slave's dominance factors change during the run.
 
-        A sentence then describes the weights completely, and a bar over time would show
+        In that case a sentence describes the factors completely, and a bar over time would add
         nothing.
         """
         return len(self.t_s) < 2 or bool(np.ptp(self.shares, axis=0).max() <= _SAME_SHARE)
 
     @classmethod
     def list_of_log(cls, log: Log) -> list["SlaveLead"]:
-        """Returns the weights with which each slave arm follows the other arms over the run.
+        """Returns the dominance factors of each slave in a log over the run.
 
         The bars, the sentences and the slider of the page use these data.
 
@@ -71,8 +69,8 @@ class SlaveLead(NamedTuple):
             log: Log of the run.
 
         Returns:
-            An entry for each slave that has records and follows another arm, at most
-            `_MAX_BARS` entries.
+            One entry per slave that has records and follows another arm, at most `_MAX_BARS`
+            entries.
         """
         leads = []
         for site, site_settings in log.scenario.sites.items():
@@ -84,10 +82,10 @@ class SlaveLead(NamedTuple):
 
     @classmethod
     def _trace(cls, log: Log, slave: str) -> "SlaveLead":
-        """Returns the weights (dominance factors) with which a slave follows its peers.
+        """Computes the dominance factors with which a slave follows its peers.
 
-        The points are those at which the slopes of the weights change. Straight lines between
-        the points therefore show the weights at all times.
+        The points are those at which the slope of any factor changes, so that straight lines
+        between them represent the factors at all times.
         """
         end_s = Timeline(log).end_s
 
@@ -107,7 +105,7 @@ class SlaveLead(NamedTuple):
 
     @property
     def bar(self) -> PageData.LeadBar:
-        """Data from which a script of the page shows who leads the slave at a chosen time."""
+        """Data from which a script of the page shows who leads the slave at a selected time."""
         return PageData.LeadBar(
             site=self.slave,
             peers=self.peers,
@@ -116,7 +114,7 @@ class SlaveLead(NamedTuple):
         )
 
     def describe_constant(self, scenario: Scenario) -> str:
-        """Returns a sentence that says who leads the slave, whose weights never change.
+        """Returns a sentence that says who leads the slave, for factors that never change.
 
         For example: "m1 leads the slave with 80 % and m2 with 20 %, during the whole run."
 
@@ -133,12 +131,12 @@ class SlaveLead(NamedTuple):
         return f"{join_words(phrases)}, during the whole run."
 
     def describe_phases(self) -> str:
-        """Returns a text on who leads at which times.
+        """Returns a text that says who leads at which times.
 
-        An example is "0 to 10 s: m1 90 %, m2 10 %; from 12 s: m1 10 %, m2 90 %". Ramps between
-        two spans are left out, because these spans show the weights before and after the ramp.
-        If there are more than `_MAX_PHASES` spans, only the number of the remaining ones is
-        stated.
+        An example is "0 to 10 s: m1 90 %, m2 10 %; from 12 s: m1 10 %, m2 90 %". Ramps are
+        omitted, because the time spans on either side show the factors before and after the
+        ramp. Only the first `_MAX_PHASES` spans are listed, followed by the number of remaining
+        ones.
         """
         phase_texts = []
         first_point = 0
@@ -170,10 +168,10 @@ class SlaveLead(NamedTuple):
         return "; ".join(phase_texts)
 
     def render_bar(self, log: Log) -> Markup:
-        """Returns a bar that shows over time how much a slave follows each peer, as SVG.
+        """Returns a bar showing how much the slave follows each peer over time, as SVG.
 
-        The areas of the peers are stacked. The height of an area is the weight of its peer, and
-        the areas together fill the bar.
+        The areas of the peers are stacked and together fill the bar. The height of an area is
+        the dominance factor of its peer.
 
         Args:
             log: Log of the run.
@@ -204,10 +202,10 @@ class SlaveLead(NamedTuple):
 
 
 def _find_corners(t_s: Array, shares: Array) -> list[int]:
-    """Returns the indices of the points that are needed to draw weights over time as a line.
+    """Returns the indices of the points needed to draw factors over time as a line.
 
-    Points on a straight line between other points are left out. The first and the last point
-    are kept.
+    Points on a straight line between other points are omitted. The first and the last point are
+    kept.
     """
     slopes = np.diff(shares, axis=0) / np.diff(t_s)[:, np.newaxis]
     turns = np.abs(np.diff(slopes, axis=0)).max(axis=1, initial=0.0)
@@ -216,17 +214,17 @@ def _find_corners(t_s: Array, shares: Array) -> list[int]:
 
 
 def _list_points(t_s: Array, heights: Array) -> list[str]:
-    """Returns points of an SVG shape, with the time in s to the right."""
+    """Formats points for an SVG shape, with time in s increasing to the right."""
     points = zip(t_s.tolist(), heights.tolist(), strict=True)
     return [f"{time_s:.6g},{height:.4f}" for time_s, height in points]
 
 
 def _name_slave(scenario: Scenario, slave: str) -> str:
-    """Returns "the slave", with its name if there are several slaves."""
+    """Returns "the slave", including its name if there are several slaves."""
     roles = [spec.role for spec in scenario.sites.values()]
     return "the slave" if roles.count("slave") == 1 else f"the slave {slave}"
 
 
 def _format_percent(share: float) -> str:
-    """Returns a dominance factor in percent, with three digits."""
+    """Formats a dominance factor as a percentage with three digits."""
     return f"{100.0 * share:.3g} %"

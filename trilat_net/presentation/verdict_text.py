@@ -1,16 +1,15 @@
-"""Writes the sentences for users about V, the energy function of the stability proof.
+"""Writes sentences for users about V, the energy function in the stability proof.
 
-`analysis` determines whether and when V rose, and whether each condition of the theorem (a
-premise, such as constant delays) holds. It returns names and numbers. For example, this module
-writes that V rose by 0.2 J at 3.1 s, or which premise failed.
+`analysis` determines whether and when V rose, and whether each premise of the theorem, such as
+constant delays, holds. It returns names and numbers. This module writes, for example, that V
+rose by 0.2 J at 3.1 s, or which premise failed.
 
 Invariant:
     - Each class of `VerdictFacts` has exactly one function in `FACT_DESCRIBERS`, and each class
       of `premise_quantities` one in `PREMISE_DESCRIBERS`.
     - A sentence about a premise lists at most `MAX_LISTED_NAMES` arms, links or joints, and
-      states the number of the others.
-    - A sentence that names a condition (premise) that fails says in plain words what the
-      condition requires.
+      states how many more there are.
+    - A sentence about a failed premise explains in plain words what the premise requires.
     - The name of the theorem mentions its premise of continuous time, which no log can show.
 """
 
@@ -23,7 +22,7 @@ from ..errors import count_nouns
 from ..scenario import Scenario
 
 THEOREM = "the theorem (continuous time; every premise checked here holds)"
-"""Basis of the judgement of a run if the stability theorem proves the run stable."""
+"""Basis of a verdict if the stability theorem proves that the run is stable."""
 FALSE_RECORDS_TEXT = "these records do not follow from the equations in the log"
 _PERIOD_OR_FALSE = (
     f"the period is too long for these gains, or {FALSE_RECORDS_TEXT}; "
@@ -34,7 +33,7 @@ _PREFIXES = {
     facts.StabilityFinding.BROKEN: "the energy balance is broken: ",
     facts.StabilityFinding.NOT_JUDGED: "V cannot be judged: ",
 }
-"""Beginning of a sentence if V does not decide."""
+"""Start of the sentence if V is inconclusive."""
 RECORD_GAPS = {
     facts.RecordGap.NO_COMMON_TIME: "there is no time at which every site has records",
     facts.RecordGap.NO_PERIOD: "there is no period whose records are complete",
@@ -54,18 +53,18 @@ REQUIREMENTS = {
     "hands": "must add no energy",
     "presence": "must not be interrupted",
 }
-"""Requirements of the theorem as ends of clauses, by the name of the premise."""
+"""Requirements of the theorem as ends of clauses, keyed by the name of the premise."""
 
 
 def name_theorem() -> str:
-    """Returns the phrase by which judgements of runs refer to the paper's stability theorem."""
+    """Returns the phrase with which verdicts refer to the paper's stability theorem."""
     return THEOREM
 
 
 def _describe_verdict(verdict: facts.StabilityVerdict) -> str:
     """Returns a sentence on whether the energy function V of a run rose.
 
-    V is the energy of the stability proof, which must not rise.
+    V is the energy function in the stability proof, which must not rise.
     """
     sentence = FACT_DESCRIBERS[type(verdict.facts)](verdict.facts)
     return f"{_PREFIXES.get(verdict.finding, '')}{sentence}"
@@ -111,8 +110,8 @@ def _describe_coarse_energies(energies: facts.CoarseEnergies) -> str:
 def _describe_course(course: facts.FunctionalCourse) -> str:
     """Returns a sentence on whether the energy V of the stability proof rose during a run.
 
-    The sentence also says whether the premises (conditions) of the theorem hold, under which V
-    must not rise.
+    The sentence also says whether the premises of the theorem, under which V must not rise,
+    hold.
     """
     if course.rise is not None:
         context = "although the premises of the theorem, which is about continuous time, hold"
@@ -135,7 +134,7 @@ def _describe_course(course: facts.FunctionalCourse) -> str:
 
 
 def _describe_failed(names: Sequence[str]) -> str:
-    """Returns a sentence that the theorem does not apply, with its failed requirements."""
+    """Returns a sentence stating why the theorem does not apply: its failed requirements."""
     premises = [f"{name} {REQUIREMENTS[name]}" for name in names]
     return f"the theorem does not apply (premises that fail: {'; '.join(premises)})"
 
@@ -160,14 +159,13 @@ FACT_DESCRIBERS: dict[type, Callable[[Any], str]] = {
     facts.CoarseEnergies: _describe_coarse_energies,
     facts.FunctionalCourse: _describe_course,
 }
-"""For each class of facts, the function that writes its sentence."""
+"""For each class of facts, the function that describes it in a sentence."""
 
 
 def _describe_growth(growth: facts.UnsuppliedGrowth) -> str:
-    """Returns a sentence on a growth of the energy V that no operator or wall explains.
+    """Returns a sentence on a rise of the energy V that no operator or wall explains.
 
-    V is the energy of the stability proof. Such a growth makes the judgement doubtful, even if
-    the run looks stable.
+    Such a rise makes the verdict doubtful, even if the run looks stable.
     """
     energy = f"{growth.energy_j:.3g} J"
     if growth.from_s is None:
@@ -182,12 +180,12 @@ def _describe_evidence(evidence: facts.Evidence) -> str:
 
 
 def _list_lacks(evidence: facts.Evidence) -> list[str]:
-    """Returns sentences that say why records do not suffice to judge the stability of a run."""
+    """Returns sentences on why the records are insufficient to judge the stability of a run."""
     return [_describe_lack(doubt) for doubt in evidence.doubts]
 
 
 def _describe_lack(doubt: facts.EvidenceDoubt) -> str:
-    """Returns a sentence that says why records do not suffice to judge a run."""
+    """Returns a sentence on why the records are insufficient to judge a run."""
     evidence = doubt.evidence
     if doubt.name == "changed log":
         return f"the log was changed after the run: {evidence.integrity.text}"
@@ -208,13 +206,13 @@ DESCRIBERS: dict[type, Callable[[Any], str]] = {
     facts.Evidence: _describe_evidence,
     facts.EvidenceDoubt: _describe_lack,
 }
-"""The functions that describe the findings of this module, by the class of the finding."""
+"""Functions that describe findings, keyed by the class of the finding."""
 SENTENCE_LISTERS: dict[type, Callable[[Any], Iterable[str]]] = {facts.Evidence: _list_lacks}
-"""The functions that list the sentences of a finding, by its class."""
+"""Functions that list the sentences of a finding, keyed by the class of the finding."""
 
 
 MAX_LISTED_NAMES = 4
-"""Largest number of links or sites that a sentence names."""
+"""Maximum number of links or sites listed in a sentence."""
 _OBSTACLES = {
     premise_quantities.FunctionalObstacle.UNKNOWN_PARAMETERS: (
         "theta of the arm is unknown, and V depends on it"
@@ -237,9 +235,9 @@ _PARAMETER_FAULTS = {
 
 
 def describe_quantities(quantities: premise_quantities.PremiseQuantities) -> str:
-    """Returns a sentence on what a run shows about a condition of the stability theorem.
+    """Returns a sentence on what a run shows about a premise of the stability theorem.
 
-    An example of a condition is that all network delays are constant.
+    For example, one premise is that all network delays are constant.
 
     Args:
         quantities: The data on the premise.
@@ -248,16 +246,16 @@ def describe_quantities(quantities: premise_quantities.PremiseQuantities) -> str
 
 
 def explain_no_functional(scenario: Scenario) -> str:
-    """Explains for which arms the energy function V of the stability proof does not exist.
+    """Explains for which arms the energy function V in the stability proof does not exist.
 
-    A certificate then judges the run without V.
+    In that case, a certificate judges the run without V.
 
     Args:
-        scenario: The description of the experiment.
+        scenario: Scenario of the run.
 
     Returns:
-        The names of these arms' sites and the reasons, separated by semicolons. Empty if the
-        energy exists for every arm.
+        The names of these sites with the reasons, separated by semicolons. Empty if V exists
+        for every arm.
     """
     return _describe_missing_functionals(
         premise_quantities.MissingFunctional.list_of_scenario(scenario)
@@ -290,10 +288,10 @@ def _describe_missing_functionals(
     The text states the reasons. A run with such an arm is judged without the energy function.
 
     Args:
-        missing: Sites of these arms, grouped by the reason.
+        missing: Sites of these arms, grouped by reason.
 
     Returns:
-        The names of the sites and the reasons, separated by semicolons. Empty if the energy
+        The names of the sites with the reasons, separated by semicolons. Empty if the energy
         exists for every arm.
     """
     clauses = []
@@ -306,11 +304,11 @@ def _describe_missing_functionals(
 def _describe_closed_groups(groups: Sequence[Sequence[str]]) -> str:
     """Returns a sentence on why the total energy of all arms is not uniquely defined.
 
-    The total energy weights each site, the process that runs one arm. If no group of sites
-    follows another group, the weights of the groups relative to each other are arbitrary.
+    The total energy is a weighted sum over the sites. If groups of sites do not follow each
+    other, the relative weights of the groups are arbitrary.
 
     Args:
-        groups: Names of the sites in each group. They follow each other and no site outside the
+        groups: Names of the sites in each group. They follow each other but no site outside the
             group.
     """
     group_texts = " and ".join("{" + ", ".join(group) + "}" for group in groups)
@@ -455,7 +453,7 @@ def _describe_stops(quantities: premise_quantities.StopQuantities) -> str:
 
 
 def _name_joints(joints: Sequence[str]) -> str:
-    """Returns the names of joints in parentheses, with a space before them."""
+    """Returns the names of joints in parentheses, with a leading space."""
     return f" ({_join_limited(joints)})" if joints else ""
 
 
@@ -574,16 +572,16 @@ PREMISE_DESCRIBERS: dict[type, Callable[[Any], str]] = {
     premise_quantities.BookedTorqueQuantities: _describe_booked_torques,
     premise_quantities.SamplingQuantities: _describe_sampling,
 }
-"""For each class of quantities, the function that writes its sentence."""
+"""For each class of quantities, the function that describes it in a sentence."""
 
 
 def _join_limited(items: Sequence[str]) -> str:
-    """Joins texts with commas. Only the number of texts beyond `MAX_LISTED_NAMES` is stated."""
+    """Joins strings with commas. Strings beyond `MAX_LISTED_NAMES` are only counted."""
     text = ", ".join(items[:MAX_LISTED_NAMES])
     hidden = len(items) - MAX_LISTED_NAMES
     return f"{text} and {hidden} more" if hidden > 0 else text
 
 
 def _format_by_site(values: Mapping[str, float]) -> str:
-    """Formats a value per site, for example as "m1 0.5, s 2"."""
+    """Formats one value per site, for example as "m1 0.5, s 2"."""
     return ", ".join(f"{site} {value:.4g}" for site, value in values.items())

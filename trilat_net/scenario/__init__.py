@@ -1,13 +1,12 @@
-"""Describes experiments as scenarios: reads them from files, completes them and checks them.
+"""Reads scenario files, fills in the default values and validates the result.
 
-A scenario describes one experiment: the robot arms, the control law of each arm, the network
-links between the arms with their delays, and the people or programs that move the arms. Its
-author writes it as a TOML file. The program converts it to typed objects that cannot be changed
-afterwards.
+A scenario is a TOML file that describes one experiment: the robot arms, the control law of each
+arm, the network links between them with their delays, and the people or programs that move the
+arms. It is converted to typed, immutable objects.
 
 Invariant:
-    - A scenario that loads also runs. Every mistake that a person can make is refused when the
-      scenario is loaded, with the path of the key and the nearest valid name.
+    - A scenario that loads also runs. Every mistake in a scenario is reported when the scenario
+      is loaded, with the path of the key and the nearest valid name.
 """
 
 from typing import TYPE_CHECKING

@@ -1,10 +1,9 @@
-"""Writes a complete scenario as a TOML text in a unique (canonical) form.
+"""Writes a complete scenario as TOML in canonical form.
 
-A scenario is the description of an experiment. The SHA-256 hash of its canonical text
-identifies the experiment.
+The SHA-256 hash of the canonical text identifies the experiment.
 
 Invariant:
-    - Keys without effect are left out, so that they do not change the hash of a scenario.
+    - Keys that have no effect are omitted, so they do not change the hash of a scenario.
 """
 
 import re
@@ -24,20 +23,21 @@ _ABSENT_VALUES: dict[str, tuple[Any, ...]] = {
         ("tau_rate_limit_nm_s", "qd_des_limit_rad_s", "q_min_rad", "q_max_rad", "view"), (None,)
     ),
 }
-"""Values that mean the same as a missing key, for keys that were added in later versions.
+"""Values equivalent to a missing key, for keys that were added in later versions.
 
-They are left out of the canonical text. Otherwise the text of an older scenario, and thereby
-its hash, would change.
+They are omitted from the canonical text; otherwise, the text and hash of an older scenario
+would change.
 """
 _NUMBER_LIST = re.compile(r"\[\n(?:    [-+.\de]+,\n)+\]")
-"""Matches a list in which each number has its own line, as `tomli_w` writes lists."""
+"""Matches a list with each number on its own line, as written by `tomli_w`."""
 
 
 def write_canonical_text(tables: dict[str, Any]) -> str:
-    """Returns a complete scenario as a TOML text in its canonical form.
+    """Formats a complete scenario as TOML in canonical form.
 
     Args:
-        tables: All keys of the scenario as nested tables. Keys without effect are removed.
+        tables: All keys of the scenario as nested tables. Keys that have no effect are omitted
+            from the text.
     """
     descriptions = {key: tables.pop(key) for key in ("name", "title", "about", "assumed")}
     descriptions = {key: value for key, value in descriptions.items() if value}
@@ -61,10 +61,9 @@ def write_canonical_text(tables: dict[str, Any]) -> str:
 
 
 def _drop_unused_keys(arm: dict[str, Any]) -> None:
-    """Removes the keys that have no effect from the table of an arm, in place.
+    """Removes keys that have no effect from the table of an arm, in place.
 
-    These are the keys of the other kind of arm, and keys of a chain that have their default
-    values.
+    These are keys of the other kind of arm, and keys of a chain that have their default values.
     """
     defaults = msgspec.to_builtins(Arm())
     is_chain = bool(arm["urdf"])
@@ -76,12 +75,12 @@ def _drop_unused_keys(arm: dict[str, Any]) -> None:
 
 
 def _drop_absent_values(table: dict[str, Any]) -> None:
-    """Removes values from a table, in place, that mean the same as leaving their keys out."""
+    """Removes values that are equivalent to a missing key from a table, in place."""
     for key, absent_values in _ABSENT_VALUES.items():
         if key in table and table[key] in absent_values:
             del table[key]
 
 
 def _join_number_list(match: re.Match[str]) -> str:
-    """Returns a list of numbers, which TOML text spreads over several lines, on one line."""
+    """Joins a list of numbers that spans several lines of TOML into one line."""
     return " ".join(match[0].split()).replace("[ ", "[").replace(", ]", "]")

@@ -1,13 +1,12 @@
-"""Computes which states of the other arms the user of an arm sees, without a run.
+"""Computes which states of the other arms the user of an arm sees, without running anything.
 
-In each control period, an arm sends its state to the other arms. The picture that shows these
-states to a user is delayed and lost at random, but the random numbers follow from a seed in the
-scenario, the description of the experiment. They can therefore be drawn again. For example, a
-report can show what a user saw although the log does not contain it.
+The picture in which a user sees the other arms has a delay and loss of its own. These are
+random, but the random numbers follow from the seed of the scenario and can be drawn again. For
+example, a report can show what a user saw even though the log does not contain it.
 
 Invariant:
-    - The picture that a user sees depends only on the scenario, its seed and the number of the
-      control period.
+    - What a user sees depends only on the scenario, its seed and the number of the control
+      period.
 """
 
 from collections.abc import Mapping
@@ -21,16 +20,14 @@ from .scenario_types import Scenario
 class PictureDelay:
     """Delay of the picture in which the user of a site sees the other arms.
 
-    A site is the process that runs one arm, and its user is the person who moves the arm. The
-    picture is transmitted over a network connection of its own, with its own random delays and
-    losses. It changes in the first control period in which a newer state of another arm has
-    arrived.
+    The picture is sent over its own network link, with its own random delays and losses. It
+    changes in the first control period after a newer state of another arm arrives.
 
-    The table `[sites.NAME.view]` of a scenario describes the delay. Without the table, the user
-    sees the states that the controller uses.
+    The delay is configured in the table `[sites.NAME.view]` of a scenario. Without that table,
+    the user sees the states that the controller uses.
 
     Args:
-        scenario: Description of the experiment.
+        scenario: The scenario.
         site: Name of the site whose user looks at the picture.
     """
 
@@ -61,16 +58,15 @@ class PictureDelay:
         self._shown = dict.fromkeys(self._links, -1)
 
     def advance_to(self, tick: int, used: Mapping[str, int]) -> Mapping[str, int]:
-        """Returns the state of each other arm that the user sees in one control period.
-
-        The states are called samples, and the other arms peers.
+        """Returns the index of the sample that the user sees of each peer in one tick.
 
         Args:
-            tick: The tick. It must not be earlier than the tick of the previous call.
-            used: For each peer, the sample that the controller uses in this tick.
+            tick: The tick, no earlier than that of the previous call.
+            used: Mapping from peer name to the index of the sample that the controller uses in
+                this tick.
 
         Returns:
-            Number of the shown sample of each peer. -1 before the first sample.
+            Mapping from peer name to sample index; -1 before the first sample.
         """
         for peer, (rate_hz, schedule) in self._links.items():
             end = self._find_end(tick, rate_hz)
@@ -84,17 +80,15 @@ class PictureDelay:
         return {**used, **self._shown}
 
     def list_shown_samples(self, ticks: int) -> dict[str, IntArray]:
-        """Returns the states of the other arms that the user sees in all control periods.
-
-        The picture is delayed, so it shows states of earlier periods.
+        """Returns the indices of the samples that the user sees in every control period.
 
         Args:
             ticks: Number of control periods of the user's site, from the start of the run.
 
         Returns:
-            For each other site, by name, the number of the shown message in every period, shape
-            (ticks,). It is -1 before the first message. Empty if the scenario describes no
-            delay of the picture; then the user sees what the controller uses.
+            Mapping from peer name to the index of the shown sample in every period, shape
+            (ticks,); -1 before the first sample. Empty if the scenario specifies no delay of
+            the picture, in which case the user sees the samples that the controller uses.
         """
         return {
             peer: schedule.draw_used(
@@ -104,12 +98,12 @@ class PictureDelay:
         }
 
     def _find_end(self, tick: int, rate_hz: int) -> int:
-        """Returns the number of samples that another arm sent before a tick of the site.
+        """Returns the number of samples that a peer sent before a tick of the site.
 
-        A sample that is sent at the time of the tick itself is not shown yet.
+        A sample sent at the time of the tick itself is not shown yet.
 
         Args:
             tick: Tick of the site.
-            rate_hz: Tick rate of the other arm, in Hz.
+            rate_hz: Tick rate of the peer, in Hz.
         """
         return -(-tick * rate_hz // self._receiver_hz)

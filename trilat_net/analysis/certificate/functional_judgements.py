@@ -5,9 +5,9 @@ rose.
 
 Invariant:
     - A rise of V beyond the work of operators and environments is reported with its time and
-      amount, because the theorem excludes such a rise.
-    - Energy without any cause means that the equations stated in the log did not produce the
-      records. The energy balance is then called broken.
+      amount, because the theorem rules out such a rise.
+    - Energy of unknown origin means that the records were not produced by the equations stated
+      in the log. The energy balance is then called broken.
 """
 
 from collections.abc import Sequence

@@ -1,24 +1,25 @@
 """Checks whether a recorded run meets the conditions of the stability theorem.
 
-The theorem says that an energy function V of all arms never rises, unless an operator supplies
-energy. Its proof is in docs/theory/theorem.md. The theorem has conditions, called premises:
+The theorem states that an energy function V of all arms never rises unless an operator supplies
+energy. Its proof is in docs/theory/theorem.md. The conditions of the theorem are called
+premises:
 
 - The network delays are constant.
-- The dominance factors, the weights with which the arms follow each other, are constant. Every
-  arm follows every other arm, directly or through further arms.
-- The damping gain Kd is the same at every arm, up to a factor per arm.
+- The dominance factors are constant, and every arm follows every other arm, directly or through
+  further arms.
+- The damping gain Kd is the same at every arm, up to one factor per arm.
 - Every arm uses the adaptive law, which estimates the parameters theta of the arm.
-- No operator moves an arm, or the operators are passive with respect to the filtered error r.
-  This is the joint velocity plus a gain Lambda times the position error.
+- No operator moves an arm, or the operators are passive with respect to the filtered error r,
+  which is the joint velocity plus a gain Lambda times the position error.
 
-The module also finds the times for which records are missing.
+The module also finds time spans in which records are missing.
 
 Invariant:
     - A premise holds, fails, or cannot be decided, and always contains the quantities that show
-      it. The package `presentation` writes the sentences.
-    - Missing information never makes a run stable. The judgement stays open if too many records
+      which. The package `presentation` generates the sentences.
+    - Missing information never makes a run stable. The verdict stays open if too many records
       are missing, or if the run was repeated with the recorded motion of some arms.
-    - A log that was changed after it was written does not pass.
+    - A log that was modified after it was written does not pass.
 """
 
 from collections.abc import Mapping
@@ -98,22 +99,22 @@ Slower speeds are the rounding error of an axis along which the end effector can
 
 
 class FunctionalFacts(NamedTuple):
-    """Quantities of a run that the checks of the stability theorem's conditions read.
+    """Quantities of a run that depend on V and are used to check the theorem's conditions.
 
-    They include V, the energy function of the stability proof, and the gaps in the log.
-    `RunFacts.of_log` computes this object once for all checks.
+    V is the energy function of the stability proof. The quantities also include the gaps in the
+    log. `RunFacts.of_log` computes this object once for all checks.
 
     Attributes:
         log: The log of the run.
-        energies: Energies of every site, by name.
+        energies: Energies of every site, keyed by site name.
         balance: Energy balance of all sites together.
         groups: Closed groups of sites, which follow no site outside their group, at the first
             time at which there are several groups. The weights beta of the sites in V are then
             not unique. Empty if the weights are always unique.
-        absent: Spans during which a site was absent.
-        unjudged: Spans, as (start, end) in s, in which records are missing although all sites
+        absent: Time intervals in which a site was absent.
+        unjudged: Time spans (start, end) in s in which records are missing although all sites
             were present.
-        tolerance: Size that a rise of V must exceed to count, in J.
+        tolerance: Threshold that a rise of V must exceed to count, in J.
     """
 
     log: Log
@@ -126,17 +127,17 @@ class FunctionalFacts(NamedTuple):
 
 
 class RunFacts(NamedTuple):
-    """Quantities of a run that are needed to check the conditions of the stability theorem.
+    """Quantities of a run needed to check the conditions of the stability theorem.
 
-    The theorem says that an energy function V of all arms does not rise by itself.
+    The theorem states that an energy function V of all arms does not rise by itself.
 
     Attributes:
         log: The log of the run.
-        constants: Gains and limits of every site, the process that runs one arm, by name. Empty
-            if V does not exist for some site.
-        functional: V over time, and the energies that changed it. `None` if V cannot be
+        constants: Gains and limits of every site, keyed by site name. Empty if V does not exist
+            for some site.
+        functional: V over time and the energies that changed it, or `None` if V cannot be
             computed.
-        unknown: The reason why V cannot be computed. `None` if V can be computed.
+        unknown: The reason why V cannot be computed, or `None` if it can.
     """
 
     log: Log
@@ -146,18 +147,18 @@ class RunFacts(NamedTuple):
 
     @classmethod
     def of_log(cls, log: Log) -> "RunFacts":
-        """Computes from a log the quantities that the conditions of the theorem are about.
+        """Computes the quantities needed to check the conditions of the theorem from a log.
 
-        The stability theorem uses an energy function of all arms. This function does not exist
-        for every control law. The function cannot be computed if the records of the arms have
-        too few times in common. The result then contains the reason.
+        The stability theorem uses an energy function of all arms. If this function does not
+        exist for one of the control laws, or if the records of the arms overlap at too few
+        times to compute it, the result contains the reason.
 
         Args:
             log: The log of the run.
 
         Raises:
-            LogError: A recorded change of the settings, such as of a dominance factor, is not
-                valid.
+            LogError: The log records an invalid change of the settings, such as of a dominance
+                factor.
         """
         missing = MissingFunctional.list_of_scenario(log.scenario)
         if missing:
@@ -199,12 +200,12 @@ class RunFacts(NamedTuple):
     def check_premises(self) -> list[Premise]:
         """Checks whether a run meets the conditions (premises) of the stability theorem.
 
-        It also checks that virtual walls, whose force is computed once per tick, generate no
+        Also checks that virtual walls, whose force is computed once per tick, generate no
         energy. If the energy function of the theorem cannot be computed, only the control laws
         and the walls are checked.
 
         Returns:
-            The premises that concern this run, in the order in which a certificate lists them.
+            The premises that apply to this run, in the order used in the stability certificate.
         """
         missing = MissingFunctional.list_of_scenario(self.log.scenario)
         law = Premise("law", bool(self.constants), LawQuantities(tuple(missing)))
@@ -220,14 +221,13 @@ class RunFacts(NamedTuple):
         return [premise for premise in premises if premise is not None]
 
     def collect_evidence(self, min_coverage: float) -> Evidence:
-        """Collects evidence on how complete the records are and whether the log was changed.
+        """Collects evidence on how complete the records are and whether the log was modified.
 
-        A run with too few records is not called stable, see `Evidence.reasons`.
+        A run with too few records is not judged stable (see `Evidence.reasons`).
 
         Args:
-            min_coverage: Least fraction of ticks that must be recorded, and least fraction of
-                tick periods in which the energy of the stability proof must be known, for a
-                certificate. Between 0 and 1.
+            min_coverage: Smallest acceptable fraction of ticks that were recorded, and of tick
+                periods in which the energy of the stability proof is known. Between 0 and 1.
         """
         log = self.log
         facts = self.functional

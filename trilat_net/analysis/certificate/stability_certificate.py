@@ -1,4 +1,4 @@
-"""Judges from a log whether the run was stable, and explains the judgement.
+"""Judges from a log whether the run was stable, and explains the verdict.
 
 `Certificate.of_log` is the entry point, and `judge.certify_run` adds the repetitions of the run
 and the characteristic roots. `stability_decision` decides from the evidence. A certificate
@@ -10,13 +10,13 @@ combines:
 - the motion at the end of the run, which `run_end` judges without any theory;
 - repetitions of the run with small disturbances, if they were computed;
 - the energies that control laws declare, which `observed_energy` checks;
-- how complete the records are, and whether the log was changed.
+- how complete the records are, and whether the log was modified.
 
 Invariant:
-    - Questions that a log cannot decide are named. If V does not exist, the end of the run
-      alone decides.
+    - The certificate names every question that a log cannot answer. If V does not exist, only
+      the end of the run decides.
     - Keys of the JSON output end in their unit, and unknown values are null.
-    - The package `presentation` writes every sentence on request.
+    - The package `presentation` generates every sentence on request.
 """
 
 from collections.abc import Collection, Mapping
@@ -52,7 +52,7 @@ _REFUTING_FINDINGS = (ObservedFinding.NEGATIVE, ObservedFinding.BROKEN)
 
 @dataclass(frozen=True, repr=False)
 class Certificate(Result):
-    """Judgement whether a recorded run was stable, with every reason. `of_log` creates it.
+    """Verdict on whether a recorded run was stable, with every reason. Created by `of_log`.
 
     A certificate combines several kinds of evidence: the energy function V of the stability
     proof, the end of the motion, the roots of the linearised loop, and repeated runs with a
@@ -61,27 +61,27 @@ class Certificate(Result):
     Attributes:
         premises: The conditions of the stability theorem, each checked.
         verdict: Result of examining the energy function V.
-        end: The end of the run, judged from the errors e and the velocities qd alone.
-        evidence: The number of records on which the certificate rests, and whether the log was
-            changed.
-        balance: Energy balance of all sites. `None` if V does not exist, or if the weights beta
+        end: Verdict on the end of the run, from the errors e and the velocities qd only.
+        evidence: How many records the certificate is based on, and whether the log was
+            modified.
+        balance: Energy balance of all sites, or `None` if V does not exist or the weights beta
             of the sites in V are not unique.
         paper_balance: Energy balance with the weights of the paper, which are 1 for every site.
-            `None` if these are the right weights, or if there is no balance.
+            `None` if these are the correct weights, or if there is no balance.
         groups: Closed groups of sites, which follow no site outside their group. Empty unless
             there are several groups, in which case beta is not unique.
-        energies: Energies of every site, by name. Empty if V does not exist.
-        roots: Roots of the loop at the pose where the run ended. `None` if not computed.
-        observed: Check of the energies that control laws declare. `None` if no law declares
+        energies: Energies of every site, keyed by site name. Empty if V does not exist.
+        roots: Roots of the loop at the final pose of the run, or `None` if not computed.
+        observed: Check of the energies that control laws declare, or `None` if no law declares
             any.
-        twins: Growth of small pushes in repeated runs. `None` if not computed.
+        twins: Growth of small pushes in repeated runs, or `None` if not computed.
         law_proofs: Phrases that name the stability conditions of control laws that hold at
-            every site and prove that small motions die away. Empty if there are none.
+            every site and prove that small motions decay. Empty if there are none.
         law_conditions: Sentences on the stability conditions of the control laws of the run.
         has_lasting_delays: True if delays that are constant in the run remain constant after
             the run.
-        circumstances: Circumstances that readers of the judgement should know, such as a motor
-            at its torque limit. Empty if they were not examined.
+        circumstances: Circumstances that readers of the verdict should know about, such as a
+            motor at its torque limit. Empty if they were not examined.
     """
 
     premises: list[Premise]
@@ -116,13 +116,13 @@ class Certificate(Result):
 
         Args:
             log: The log of the run.
-            min_coverage: Least fraction of the ticks of each site that must be recorded. With a
-                smaller fraction, a run that would be stable is left open.
-            own_laws: True to run the code of control laws that are not part of this program.
-                This is necessary to check the energies that they declare.
+            min_coverage: Smallest acceptable fraction of recorded ticks at each site. Below
+                this fraction, a run that would otherwise be judged stable is left open.
+            own_laws: True to execute the code of control laws that are not part of this
+                program, which is necessary to check the energies that they declare.
 
         Raises:
-            LogError: A record cannot be read, or contains a change that is not valid.
+            LogError: A record cannot be read, or contains an invalid change.
         """
         run = RunFacts.of_log(log)
         facts = run.functional
@@ -161,9 +161,9 @@ class Certificate(Result):
 
     @property
     def has_functional(self) -> bool:
-        """True if the energy function V of the stability proof exists for this run's laws.
+        """True if the energy function V of the stability proof exists for the laws of this run.
 
-        If V does not exist, texts and pages leave out V and its terms.
+        If V does not exist, reports and pages omit V and its terms.
         """
         laws = [premise.holds for premise in self.premises if premise.name == "law"]
         return laws != [False]
@@ -172,9 +172,8 @@ class Certificate(Result):
     def paper_weights_rise(self) -> FunctionalRise | None:
         """The largest rise that the total energy would have if all arms had the same weight.
 
-        The paper on which the control law is based uses such equal weights in the energy
-        function of its stability proof. `None` if this energy does not rise, or was not
-        computed.
+        The paper on which the control law is based uses equal weights in the energy function of
+        its stability proof. `None` if this energy does not rise, or was not computed.
         """
         if self.paper_balance is None:
             return None
@@ -184,11 +183,11 @@ class Certificate(Result):
     def bounded_by_v(self) -> bool:
         """True if the energy V of the stability proof bounds the motion of every arm.
 
-        V must not have risen, and every arm must have a positive weight in V. An arm has the
-        weight zero if the arms that it follows do not follow it. The motion of such an arm is
-        still bounded if the dominance factors (the weights with which arms follow each other)
-        are constant, and if the condition on these factors is the only condition that fails.
-        The arm then converges after the arms that it follows.
+        This requires that V did not rise and that every arm has a positive weight in V. The
+        weight of an arm is zero if the arms that it follows do not follow it. The motion of
+        such an arm is still bounded if the dominance factors are constant and the condition on
+        these factors is the only one that fails. The arm then converges after the arms that it
+        follows.
         """
         did_not_rise = (StabilityFinding.COVERED, StabilityFinding.DID_NOT_RISE)
         if self.balance is None or self.verdict.finding not in did_not_rise:
@@ -200,14 +199,14 @@ class Certificate(Result):
         return failed == ["shares"] and constant
 
     def accepts(self, accepted: Collection[str]) -> bool:
-        """Returns True if the run is stable, or has another judgement that the user accepts.
+        """Returns True if the run is stable, or has another verdict that the user accepts.
 
         For example, a user may accept "settled". A run with a broken energy balance or a
-        changed log is never accepted.
+        modified log is never accepted.
 
         Args:
-            accepted: Further judgements to accept: "settled" for a run that slowed down and in
-                whose repetitions all pushes died away, "bounded" for a bounded oscillation,
+            accepted: Further verdicts to accept: "settled" for a run that slowed down and in
+                whose repetitions all pushes decayed, "bounded" for a bounded oscillation,
                 "open" for a run that cannot be decided.
         """
         if self.verdict.finding is StabilityFinding.BROKEN:
@@ -225,11 +224,11 @@ class Certificate(Result):
 
     @cached_property
     def decision(self) -> StabilityDecision:
-        """The decision whether the run is stable, with its evidence and the reasons against it.
+        """Whether the run is stable, with the evidence and the reasons against it.
 
         The decision combines the motion at the end, the repetitions with small pushes, the
-        characteristic roots, the proofs and the doubts, by the rules of `stability_decision`.
-        The property is computed at first use.
+        characteristic roots, the proofs and the doubts, according to the rules of
+        `stability_decision`. It is computed when first used.
         """
         findings = RunFindings(
             end=self.end,
@@ -256,7 +255,7 @@ class Certificate(Result):
     def proofs(self) -> tuple[str, ...]:
         """Phrases that name the proofs for this loop, apart from its characteristic roots.
 
-        The stability theorem is a proof if all of its premises hold, also after the run, and V
+        The stability theorem is a proof if all of its premises hold, even after the run, and V
         did not rise. The stability condition of a control law is a proof if it holds at every
         site.
         """
@@ -282,27 +281,26 @@ class Certificate(Result):
 
     @property
     def reasons(self) -> tuple[str, ...]:
-        """Sentences on all findings that prevent the judgement "stable".
+        """Sentences on all findings that rule out the verdict "stable".
 
-        The sentences concern the end of the run, the energy V, the roots at the end pose, the
-        energies that control laws declare, and the completeness of the log. Empty for a stable
-        run.
+        They cover the end of the run, the energy V, the roots at the final pose, the energies
+        that control laws declare, and the completeness of the log. Empty for a stable run.
         """
         return self.decision.reasons
 
     @property
     def remarks(self) -> tuple[str, ...]:
-        """Sentences on circumstances that readers of the judgement should know.
+        """Sentences on circumstances that readers of the verdict should know about.
 
-        For example, a motor was at its torque limit. See `run_remarks`.
+        An example is a motor at its torque limit. See `run_remarks`.
         """
         return self.circumstances.remarks
 
     @property
     def stability(self) -> Stability:
-        """The judgement of the run in one word: stable, settled, not stable, or open.
+        """The verdict on the run in one word: stable, settled, not stable, or open.
 
-        `stability_decision` explains how the findings lead to this judgement.
+        `stability_decision` explains how the findings lead to this verdict.
         """
         return self.decision.stability
 
@@ -310,21 +308,21 @@ class Certificate(Result):
     def passed(self) -> bool:
         """True if the run is judged stable, in the strict sense.
 
-        A run that merely settled, which means that its motion became slow, has not passed.
-        `accepts` is less strict.
+        A run that merely settled (its motion became slow) has not passed. `accepts` is less
+        strict.
         """
         return self.accepts(())
 
     def headline(self) -> str:
-        """Returns the judgement and its basis in one line for people.
+        """Returns the verdict and its basis as one line for people.
 
-        For example "stable: converged; rests on: exact roots, slowest -0.832 /s". The line is
-        composed by the package `presentation`.
+        An example is "stable: converged; rests on: exact roots, slowest -0.832 /s". The package
+        `presentation` generates the line.
         """
         return str(find_hook("head a certificate")(self))
 
     def to_dict(self) -> JsonObject:
-        """Converts the certificate to plain values, as `trilat certify --json` prints them.
+        """Converts the certificate to the plain values that `trilat certify --json` prints.
 
         docs/reference/json.md explains the most important keys. The entry "functional" is
         `None` if the energy function V cannot be computed.
@@ -363,9 +361,10 @@ class Certificate(Result):
         }
 
     def to_rows(self) -> list[JsonObject]:
-        """Returns the conditions (premises) of the stability theorem as rows of a table.
+        """Returns the conditions (premises) of the stability theorem as table rows.
 
-        A row has the keys "name", "holds" and "text", from which `to_frame` makes a data frame.
+        Each row has the keys "name", "holds" and "text". `to_frame` converts the rows to a data
+        frame.
         """
         return [premise.to_json() for premise in self.premises]
 

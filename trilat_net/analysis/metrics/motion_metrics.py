@@ -2,13 +2,12 @@
 
 A metric is a number that describes a recorded run or a part of it, for example the RMS tracking
 error of the slave arm in rad. The tracking error is the difference between the joint angles of
-an arm and the weighted mean of the angles of the arms that it follows, which arrive with a
-delay. docs/reference/metrics.md defines every metric.
+an arm and the weighted mean of its peers' angles, which arrive with a delay.
+docs/reference/metrics.md defines every metric.
 
 Invariant:
-    - The tracking error includes the network delay. The largest distance between the arms
-      (spread) is computed at the same instant. A slave is compared with its master at the time
-      at which the state that it uses was sent.
+    - The tracking error compares a slave with its master at the time when the state in use was
+      sent. The largest distance between the arms (spread) compares all arms at one instant.
     - The effort is computed from the recorded motor torque, after the torque limit and with
       gravity compensation.
     - The force of a wall is computed from the scenario and the recorded motion. Ticks without a
@@ -114,22 +113,22 @@ def _measure_tracking(view: RunView, site: str) -> MetricValues:
 
 @measures("site", UNDELAYED, *Quantity.list_shared(_UNDELAYED_ERRORS))
 def measure_undelayed_error(view: RunView, site: str, other: Log | None = None) -> MetricValues:
-    """Measures how far a site is from where its peers are at the same time.
+    """Measures how far a site is from its peers at the same time.
 
-    The error e of a site compares its coordinates with what its peers sent some time ago. The
-    undelayed error compares them with the peers' coordinates at the same time t, weighted by
-    the dominance factors:
+    The error e of a site compares its coordinates with those that its peers sent some time ago.
+    The undelayed error compares them with the peers' coordinates at the same time t, weighted
+    by the dominance factors:
 
         q_i(t) - sum_j alpha_ij(t) q_j(t)
 
-    It therefore includes the effect of the delay. Between the ticks of a peer the peer's motion
-    is interpolated.
+    It therefore includes the effect of the delay. The motion of a peer is interpolated between
+    its ticks.
 
     Args:
         view: The run.
         site: Name of the site.
         other: Log of a run with the same sites, such as a rerun, which may end earlier. If
-            given, only times at which this run also has a record of the site are used.
+            given, only times are used at which this run also has a record of the site.
     """
     followed = _list_followed_peers(view, site)
     missing = [name for name in (site, *followed) if name not in view.sites]
@@ -430,18 +429,18 @@ class _BaseEstimates(NamedTuple):
 
 
 class ParameterEstimates(NamedTuple):
-    """Estimates of an arm's dynamic parameters theta that an adaptive control law learnt.
+    """Estimates of an arm's dynamic parameters theta, as learnt by an adaptive control law.
 
     The parameters combine masses, inertias and lengths of the links. Each array has shape (P,).
 
     Attributes:
         learnt: True for each parameter that the law adapts.
-        theta: True parameters. `None` if unknown.
+        theta: True parameters, or `None` if unknown.
         first: Estimates in the first record.
         last: Estimates in the last record.
-        slope_per_s: Slopes of straight lines through the last 5 s, in 1/s. `None` with fewer
-            than two records.
-        base: Estimates of a chain in base parameters. `None` for the planar arm.
+        slope_per_s: Slopes of straight lines fitted to the last 5 s, in 1/s, or `None` with
+            fewer than two records.
+        base: Estimates of a chain in base parameters, or `None` for the planar arm.
     """
 
     learnt: list[bool]
@@ -454,7 +453,7 @@ class ParameterEstimates(NamedTuple):
     def to_json(self) -> JsonObject:
         """Converts the estimates of the control law to plain values for JSON.
 
-        The key "base" is left out if there are no base parameters.
+        The key "base" is omitted if there are no base parameters.
         """
         content = self._asdict()
         del content["base"]
@@ -466,13 +465,13 @@ class ParameterEstimates(NamedTuple):
     def by_site(cls, view: RunView) -> "dict[str, ParameterEstimates]":
         """Reads the parameter estimates that adaptive control laws learnt during a run.
 
-        The result contains the first, the last and the true values of masses and inertias.
+        Each entry contains the first, last and true values of masses and inertias.
 
         Args:
             view: The run.
 
         Returns:
-            The estimates, by name of the site. Sites without records are missing.
+            A mapping from site name to estimates. Sites without records are missing.
         """
         return {
             site: _read_parameter_estimates(view.scenario, run.records)

@@ -1,19 +1,19 @@
 """Computes the energy that enters each arm, and the energy that network delays inject.
 
 Delays can make coupled arms unstable, because the control torques then supply energy that no
-operator supplied. The metrics of this module show where this energy comes from. Energy enters
+operator supplied. The metrics in this module show where this energy comes from. Energy enters
 an arm from the controller, the operator and the environment. The work of a torque tau during a
 small motion dq of the joints is tau'dq. If the torque tau_k is constant during tick k, its work
 is exactly tau_k' (q_{k+1} - q_k), where q_k are the joint angles. If the torque follows the
-motion, the trapezoid rule is used, which is exact for springs. The sum of this work over the
+motion, the trapezoidal rule is used, which is exact for springs. The sum of this work over the
 ticks is known as a passivity observer (Hannaford and Ryu 2002).
 
 A link carries the state of arm j to arm i with the delay T_ij. The control torque of arm i is
-the torque without delay, plus a term for each link. The energy of this term is
+the torque without delay, plus one term per link. The energy of this term is
 
     E_ij = int qd_i' S_i ( p_j(t - T_ij) - p_j(t) ) dt
 
-Here qd_i is the joint velocity of arm i, p_j the signal that the law uses from arm j, such as
+where qd_i is the joint velocity of arm i, p_j the signal from arm j that the law uses, such as
 its position, and S_i the gain of the law for this signal. docs/reference/metrics.md lists p_j
 and S_i for each law, and the literature.
 """
@@ -32,7 +32,7 @@ _NO_FRICTION = Metric(None, "the joints have no friction", applies=False)
 
 
 def held_work(torque: Array, q: Array) -> Array:
-    """Returns the work of a torque that is constant within each control period, in J.
+    """Returns the work of a torque that is held constant within each tick period, in J.
 
     The work in period k is exactly tau_k' (q_{k+1} - q_k), whatever the motion within the
     period.
@@ -51,7 +51,7 @@ def held_work(torque: Array, q: Array) -> Array:
 
 
 def trapezoid_work(torque: Array, q: Array) -> Array:
-    """Returns the work of a torque in each control period (tick), by the trapezoid rule.
+    """Returns the work of a torque in each tick period, computed with the trapezoidal rule.
 
     The torque is assumed to change linearly with the joint angle between two ticks.
 
@@ -151,7 +151,7 @@ def _measure_port_energy(view: RunView, site: str) -> MetricValues:
         return unavailable(ENERGY, "no two records in a row", of="site")
 
     def accumulate(work: Array) -> Array:
-        """Returns the sum of work over time. Periods without records count as zero."""
+        """Returns the cumulative work over time. Periods without records count as zero."""
         known_work = np.where(known, work, 0.0)
         return np.cumsum(known_work)
 

@@ -1,14 +1,14 @@
 """Computes how several users share one slave arm: authority, disagreement and takeovers.
 
 In trilateral teleoperation, for example, two users (a trainer and a trainee) move two master
-arms, and one slave arm follows both. It follows each master with a weight, the dominance factor
-of the user, which may change during the run. The slave is the first one of the scenario.
+arms, and one slave arm follows both. It follows each master with a dominance factor, which may
+change during the run. The slave is the first one of the scenario.
 
 Invariant:
     - The user with the largest dominance factor leads.
     - Only the torques with which the operators push their arms count, not the torques of walls
       and other environments. In task space, forces at the end effectors replace them.
-    - Ticks without a record do not count.
+    - Ticks without a record are ignored.
 """
 
 import math

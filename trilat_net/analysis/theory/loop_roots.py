@@ -1,26 +1,27 @@
 """Computes the characteristic roots of the control loop at the end of a run, for all commands.
 
-If all roots have a negative real part, small motions about the last pose of the run die away.
-The control loop of the coupled arms may change during a run, by planned changes or commands.
-Therefore this module first finds the final loop: the delays, weights, operators and
-environments that are in force at the end. Then it linearises this loop at the last pose.
+If all roots have a negative real part, small motions about the final pose of the run decay. The
+control loop of the coupled arms may change during a run, through planned changes or commands.
+This module therefore first finds the final loop: the delays, weights, operators and
+environments in effect at the end. It then linearises this loop at the final pose.
 
 The delays of the final loop are known if they are constant, or follow sinusoids or tables that
-repeat. If a table has ended, its last delay is constant. Random and measured delays are known
-from the records only. The roots are then those for the delays that occurred in the last quarter
-of the records.
+repeat. If a table has ended, its last delay remains in effect. Random and measured delays are
+known only from the records. The roots are then those for the delays that occurred in the last
+quarter of the records.
 
 Invariant:
     - Roots are called exact only if every delay is constant or repeats after the analysed
-      period, if the loop is analysed with its ticks (the periods of its controllers), and if
-      the rightmost root has the same sign at the last pose and at the nearest pose of rest.
-    - A command that sets a link or a dominance factor to its present value counts as no change.
+      period, if the loop is analysed with its ticks, and if the rightmost root has the same
+      sign at the final pose and at the nearest equilibrium.
+    - A command that sets a link or a dominance factor to its present value is not counted as a
+      change.
     - The code of imported control laws is executed only with permission. Without permission, no
       roots are computed for such a loop.
     - With permission, unstable roots count as exact and stable ones do not, because the law may
       contain thresholds that its derivative at the pose does not show. The same rule applies to
-      sampled walls, because an arm may oscillate at a wall although the pose of rest next to
-      the wall is stable.
+      sampled walls, because an arm may oscillate at a wall although the equilibrium next to the
+      wall is stable.
 """
 
 import math
@@ -63,9 +64,9 @@ _BATCH_RECORDS = 4096
 
 
 class EndLoop(NamedTuple):
-    """Control loop of all arms as it was at the end of a run, with its pose of rest.
+    """Control loop of all arms at the end of a run, with its equilibrium.
 
-    The loop is linearised about this pose to decide whether small motions die away.
+    The loop is linearised about the equilibrium to decide whether small motions decay.
 
     Attributes:
         scenario: The scenario up to the end of the run. Delays that only the run shows are
@@ -76,11 +77,11 @@ class EndLoop(NamedTuple):
             measured. `None` if the scenario determines all delays.
         has_mean_ages: True if the age of the samples on some link is a mean over the last
             quarter of the run.
-        distance_rad: Largest difference between the last angle of a joint and its angle at
-            the rest, in rad.
-        last_pose: The last pose of the run. `None` if it is the pose of rest. Arms that no
+        distance_rad: Largest difference between the final angle of a joint and its angle at the
+            equilibrium, in rad.
+        last_pose: The final pose of the run, or `None` if it is the equilibrium. Arms that no
             operator holds may come to rest anywhere between the two.
-        programs: Sites whose arms a program of the user moves. The reaction of the program to
+        programs: Sites whose arms are moved by a user's program. The reaction of the program to
             the arms is not part of the linearised loop.
     """
 
@@ -95,7 +96,7 @@ class EndLoop(NamedTuple):
 
     @classmethod
     def of_log(cls, log: Log, *, own_laws: bool = False) -> "EndLoop":
-        """Finds the control loop at the end of a recorded run, and the nearest pose of rest.
+        """Finds the control loop at the end of a recorded run, and the nearest equilibrium.
 
         The linear analysis of this loop shows whether the run is stable.
 
@@ -104,8 +105,8 @@ class EndLoop(NamedTuple):
             own_laws: True if the code of imported control laws may be executed.
 
         Raises:
-            ScenarioError: The loop cannot be linearised, or the run did not end near a pose of
-                rest.
+            ScenarioError: The loop cannot be linearised, or the run did not end near an
+                equilibrium.
         """
         site_logs = [log[site] for site in log.sites]
         if not all(map(len, site_logs)):
@@ -114,11 +115,10 @@ class EndLoop(NamedTuple):
             _check_mode(site_log.name, site_log.mode[-1], log.source)
 
         def read_used_samples(i: int, j: int, ticks: Ints) -> Ints:
-            """Returns which messages of another arm were in use at given ticks.
+            """Returns which samples of another arm were in use at given ticks.
 
-            Such a message, a sample, is the state that an arm sends once per tick (control
-            period). Samples are numbered from 0. For a tick without a record, the samples of
-            the last record before it are returned.
+            Samples are numbered from 0. For a tick without a record, the samples of the last
+            preceding record are returned.
 
             Args:
                 i: Index of the receiving site.
@@ -151,18 +151,18 @@ class EndLoop(NamedTuple):
 
     @classmethod
     def of_run(cls, scenario: Scenario, run: FusedRun) -> "EndLoop":
-        """Finds the control loop at the end of a simulated run, and the nearest pose of rest.
+        """Finds the control loop at the end of a simulated run, and the nearest equilibrium.
 
         The linear analysis of this loop shows whether the run is stable. The code of imported
         control laws is executed.
 
         Args:
-            scenario: The experiment.
-            run: Its run in the fused loop.
+            scenario: The scenario of the run.
+            run: The run in the fused loop.
 
         Raises:
-            ScenarioError: The loop cannot be linearised, or the run did not end near a pose of
-                rest.
+            ScenarioError: The loop cannot be linearised, or the run did not end near an
+                equilibrium.
         """
         if run.diverged_s is not None:
             _check_mode(scenario.names[0], "diverged", scenario.name)
@@ -173,11 +173,11 @@ class EndLoop(NamedTuple):
         last_ticks = [ended.ticks(name) - 1 for name in ended.names]
 
         def draw_samples(i: int, j: int, ticks: Ints) -> Ints:
-            """Returns which messages (samples) of another arm were in use, by the delay model.
+            """Returns which samples of another arm were in use, according to the delay model.
 
-            The function corresponds to `read_used_samples` of `of_log`. A simulated run without
-            a log has no records, but the random delays of the link can be drawn again from its
-            seed. The drawn delays include the planned changes and outages of the link.
+            This corresponds to `read_used_samples` in `of_log`. A simulated run without a log
+            has no records, but the random delays of the link can be drawn again from its seed.
+            The drawn delays include the planned changes and outages of the link.
 
             Args:
                 i: Index of the receiving site.
@@ -210,9 +210,9 @@ class EndLoop(NamedTuple):
 
 @limit_blas_threads()
 def find_log_roots(log: Log, *, own_laws: bool = False) -> LoopRoots:
-    """Decides by linear analysis whether small motions at the end of a recorded run die away.
+    """Decides by linear analysis whether small motions at the end of a recorded run decay.
 
-    The coupled arms are linearised at the pose of rest nearest to the last pose. The result may
+    The coupled arms are linearised at the equilibrium nearest to the final pose. The result may
     prove the run stable, or refute it.
 
     Args:
@@ -232,14 +232,14 @@ def find_log_roots(log: Log, *, own_laws: bool = False) -> LoopRoots:
 
 @limit_blas_threads()
 def find_run_roots(scenario: Scenario, run: FusedRun) -> LoopRoots:
-    """Decides by linear analysis whether small motions at the end of a simulated run die away.
+    """Decides by linear analysis whether small motions at the end of a simulated run decay.
 
-    The result is that of `find_log_roots` for a log of the same run, but no log is needed.
+    The result equals that of `find_log_roots` for a log of the same run, but no log is needed.
     Studies with many runs use this function.
 
     Args:
-        scenario: The experiment.
-        run: Its run in the fused loop.
+        scenario: The scenario of the run.
+        run: The run in the fused loop.
 
     Returns:
         The roots of the loop at the end of the run, or the reason why there are none.
@@ -271,8 +271,8 @@ def _check_mode(site: str, mode: str, source: str) -> None:
 def resolve_final_scenario(log: Log) -> Scenario:
     """Returns the scenario of a log, with the users' commands of the run as planned changes.
 
-    The duration of the scenario is the recorded duration. The settings in force at its end are
-    therefore those of the final control loop.
+    Its duration is the recorded duration. The settings in effect at its end are therefore those
+    of the final control loop.
 
     Args:
         log: The log of the run.

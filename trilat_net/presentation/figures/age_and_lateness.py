@@ -1,20 +1,20 @@
-"""Draws figures of network delays, and of the timing of control loops.
+"""Draws figures of network delays and of the timing of control loops.
 
-An arm publishes its state, a sample, in each period of its control loop (tick). These figures
-show whether the network and the computers were fast enough. They show three times:
+Each tick, an arm publishes a sample of its state. These figures show whether the network and
+the computers were fast enough, using three durations:
 
-- The delay of a sample is the time that it needs from sender to receiver.
-- The age of a sample is the time since it was sent. At a receiver it grows until a newer sample
-  arrives.
-- The lateness is the time by which a tick started after it was due.
+- The delay of a sample is the time it takes to travel from sender to receiver.
+- The age of a sample is the time since it was sent. At the receiver, the age grows until a
+  newer sample arrives.
+- The lateness of a tick is how long after its due time it started.
 
 Invariant:
     - If the delays of a link follow a measured series, the figure has no line for the delay
-      that the scenario states.
-    - A run whose links all have one constant delay has no figure of distributions, because
-      these would be vertical lines.
-    - A run in virtual time reads no clock. The figure of its loops gives this reason instead of
-      showing zeros.
+      specified in the scenario.
+    - A run whose links all have one constant delay has no figure of delay distributions, which
+      would be vertical lines.
+    - A run in virtual time does not read a clock. The figure of its loop timing states this
+      reason instead of showing zeros.
 """
 
 from collections.abc import Sequence
@@ -33,35 +33,35 @@ from ..plot_signals import sample_ages_ms
 from .figure_entry import draws, unless
 
 _POINTS = 400
-"""Number of points of a distribution."""
+"""Number of points on a distribution curve."""
 _RARE_RATIO = 6.0
-"""An axis is logarithmic if the largest value exceeds the 95th percentile by this factor."""
+"""The axis is logarithmic if the largest value exceeds the 95th percentile by this factor."""
 _STEP_MS = 1.5
-"""If an age falls by more than this from one tick to the next, it counts as a fluctuation.
+"""A drop in age from one tick to the next counts as a fluctuation if it exceeds this value.
 
-If two samples arrive in the same tick of 1 ms, the age falls by about 1 ms, which is normal.
+A drop of about 1 ms is normal: it occurs whenever two samples arrive in the same tick of 1 ms.
 """
 NO_LOOP_CLOCK = "virtual time: no clock was read, so no loop was late and no tick was timed"
 NO_LOOP_TIMES = "no lateness and no computing time in this log"
 _SPREAD_BUCKETS = 120
-"""Number of intervals of time for which `_plot_spread` draws a median and a band."""
+"""Number of time intervals for which `_plot_spread` draws a median and a band."""
 _SPREAD: style.LineOptions = {"color": style.FAINT, "alpha": 0.35, "linewidth": 6.0}
-"""Options of the line that represents the band of a spread in a legend."""
+"""Options of the legend line that represents the band of a spread."""
 _BINS_PER_DECADE = 20
-"""Number of bins of a histogram per decade, for example between 1 us and 10 us."""
+"""Number of histogram bins per decade, for example between 1 us and 10 us."""
 
 
 @draws("sample_age", "age of the samples in use, per link", in_report=True)
 def _draw_sample_age(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
     """Draws the age of the sample in use on every link over time, in ms.
 
-    The age of a sample of a peer's state is the time from its sending until its use. The figure
-    has a row per receiver. An age that fluctuates is drawn as a band with its median, because a
-    line would fill the area between its extremes.
+    The age is the time since the sample was sent. The figure has one row per receiver. An age
+    that fluctuates is drawn as a band with its median, because a line would fill the area
+    between its extremes.
 
     Args:
         log: Log of the run.
-        form: Width, type sizes and resolution of the figure.
+        form: Width, font sizes and resolution of the figure.
     """
     ages_ms = _read_ages_ms(log)
     timeline = Timeline(log)
@@ -99,7 +99,7 @@ def _draw_sample_age(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
 
 
 def _read_ages_ms(log: Log) -> dict[tuple[str, str], Array]:
-    """Returns the age of the sample in use, shape (K,), in ms, by sender and receiver."""
+    """Returns the ages of the samples in use, in ms, shape (K,), by (sender, receiver)."""
     ages_ms = {}
     for site in log.sites:
         columns = sample_ages_ms(log, site).T
@@ -111,12 +111,12 @@ def _read_ages_ms(log: Log) -> dict[tuple[str, str], Array]:
 def _add_link_panels(
     figure: Figure, log: Log
 ) -> tuple[style.AxesGrid, dict[tuple[str, str], Axes]]:
-    """Adds a grid of panels to a figure: a row per receiving site, with a panel per sender.
+    """Adds a grid of panels to a figure: one row per receiving site, one panel per sender.
 
     All panels share their axes, so that the delays of links can be compared.
 
     Returns:
-        The grid of panels, and the panels by sender and receiver.
+        The grid of panels, and a mapping from (sender, receiver) to panel.
     """
     site_count = len(log.sites)
     sender_count = site_count - 1  # a site does not send to itself
@@ -130,28 +130,28 @@ def _add_link_panels(
 
 
 def has_varying_delay(log: Log) -> bool:
-    """Returns True if the delays of a run vary and their distribution is therefore of interest.
+    """Returns True if the delays of a run vary, so that their distribution is worth showing.
 
-    If the delays do not vary, figures and pages leave the distribution out.
+    Figures and pages omit the distribution if the delays do not vary.
 
     Args:
         log: Log of the run.
 
     Returns:
-        True if at least one link has more than one constant delay.
+        True if at least one link does not have a single constant delay.
     """
     links = Timeline(log).stated_links.values()
     return not all(link.has_one_constant_delay for link in links)
 
 
 class DelayAxis(NamedTuple):
-    """The axis of delays that the distributions of all links of a run share.
+    """Delay axis shared by the distributions of all links of a run.
 
     Attributes:
-        x_ms: Delays at which the curves have points, in ms, shape (P,). They reach up to the
-            longest delay or age. Their steps are equal, or equal on a logarithmic axis.
-        is_logarithmic: True if only few values are long, so that a linear axis would hide the
-            others.
+        x_ms: Delays at which the curves are evaluated, in ms, shape (P,). They extend to the
+            longest delay or age, and are equally spaced on a linear or a logarithmic axis.
+        is_logarithmic: True if only a few values are large, in which case a linear axis would
+            hide the others.
     """
 
     x_ms: Array
@@ -159,7 +159,7 @@ class DelayAxis(NamedTuple):
 
     @classmethod
     def of_links(cls, links: Sequence[DelayDistribution]) -> "DelayAxis":
-        """Chooses the axis for the delays and ages of links.
+        """Chooses an axis that covers the delays and ages of links.
 
         Args:
             links: Delays and ages of all links that share the axis.
@@ -181,9 +181,9 @@ class DelayAxis(NamedTuple):
         return cls(np.geomspace(start_ms, end_ms, _POINTS), True)
 
     def compute_percent(self, values_ms: Array) -> Array:
-        """Returns the percentage of values that do not exceed each delay of the axis.
+        """Returns the percentage of values that do not exceed each delay on the axis.
 
-        The points are the cumulative distribution of the values, for example of ages.
+        This is the cumulative distribution of the values, such as ages.
 
         Args:
             values_ms: The values to count, in ms, shape (K,).
@@ -206,13 +206,13 @@ class DelayAxis(NamedTuple):
 def _draw_delay_distributions(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
     """Draws the distributions of the delay and of the age of samples on every link.
 
-    The delay of a sample is the time until its arrival, its age the time until its use. A curve
-    at x shows the percentage of samples with a delay of at most x ms, or of ticks with an age
-    of at most x ms. The figure has a row per receiver.
+    The delay of a sample is the time from sending to arrival, and its age the time from sending
+    to use. A curve at x shows the percentage of samples with a delay of at most x ms, or of
+    ticks with an age of at most x ms. The figure has one row per receiver.
 
     Args:
         log: Log of the run.
-        form: Width, type sizes and resolution of the figure.
+        form: Width, font sizes and resolution of the figure.
     """
     links = DelayDistribution.list_of_log(log)
     axis = DelayAxis.of_links(links)
@@ -242,18 +242,18 @@ def _draw_delay_distributions(log: Log, form: FigureSize = REPORT_SIZE) -> Figur
 
 
 def trace_stated_delay(timeline: Timeline, link: str) -> tuple[Array, Array]:
-    """Returns the mean delay that the scenario states for a network link, as a line to draw.
+    """Returns the mean delay that the scenario specifies for a link, as a line to plot.
 
-    Figures draw this line dashed beside the measured delays, which should agree with it.
+    Figures draw this line dashed next to the measured delays, which should agree with it.
 
     Args:
-        timeline: What happened in the run. It has the delay models of the link. A model applies
+        timeline: Timeline of the run, with the delay models of the link. Each model applies
             until the next one replaces it.
         link: Name of the link, "j->i".
 
     Returns:
-        Times in s, and mean delays in ms, each of shape (3 M,) for M models. Each model has a
-        point at its start, a point at its end, and a NaN that interrupts the line.
+        Times in s and mean delays in ms, each of shape (3 M,) for M models. Each model
+        contributes a point at its start, a point at its end, and a NaN that breaks the line.
     """
     models = timeline.stated_links[link].models
     starts_s = [model.from_s for model in models]
@@ -270,12 +270,12 @@ def trace_stated_delay(timeline: Timeline, link: str) -> tuple[Array, Array]:
 
 
 def needs_log_axis(ages_ms: Array) -> bool:
-    """Returns True if a few ages are so long that a linear axis would hide the others.
+    """Returns True if a few large ages would hide the others on a linear axis.
 
-    This happens after an outage of a link, for example.
+    This happens after a link outage, for example.
 
     Args:
-        ages_ms: Ages, shape (K,). NaN values are ignored.
+        ages_ms: Ages in ms, shape (K,). NaN values are ignored.
     """
     known_ms = ages_ms[np.isfinite(ages_ms)]
     if not len(known_ms):
@@ -287,10 +287,10 @@ def needs_log_axis(ages_ms: Array) -> bool:
 def _is_unsteady(ages_ms: Array) -> bool:
     """Returns True if ages fluctuate so often that a line would look like a filled area.
 
-    The figure then draws the spread of the ages as a band.
+    In that case, the figure shows the spread of the ages as a band.
 
     Args:
-        ages_ms: Ages of the message in use over time, shape (K,), in ms.
+        ages_ms: Age of the sample in use over time, in ms, shape (K,).
     """
     # The age falls whenever a newer message comes into use.
     falls = np.flatnonzero(np.diff(ages_ms) < -_STEP_MS)
@@ -298,17 +298,17 @@ def _is_unsteady(ages_ms: Array) -> bool:
 
 
 def _plot_spread(axes: Axes, t_s: Array, values: Array, **options: Any) -> None:
-    """Draws a fluctuating signal as its median in a band from least to largest value.
+    """Plots a fluctuating signal as its median within a band from minimum to maximum.
 
-    The time is divided into `_SPREAD_BUCKETS` intervals with equal numbers of values. Each
-    interval gives a point of the median and of the edges of the band.
+    The time axis is divided into `_SPREAD_BUCKETS` intervals with equal numbers of values. Each
+    interval contributes one point of the median and of the band edges.
 
     Args:
         axes: Panel of the figure, as Matplotlib axes.
         t_s: Times of the values, in s, shape (K,).
         values: The values, shape (K,). NaN values are ignored.
-        **options: Options of the line of the median. They must include a "color", which also
-            applies to the band.
+        **options: Options of the median line. They must include a "color", which also applies
+            to the band.
     """
     buckets = np.array_split(np.arange(len(values)), _SPREAD_BUCKETS)
     points = []
@@ -330,7 +330,7 @@ def _plot_spread(axes: Axes, t_s: Array, values: Array, **options: Any) -> None:
 
 
 def _compute_spread(values: Array) -> tuple[float, float, float]:
-    """Returns the least, median and largest of the finite values, or NaN if there are none."""
+    """Returns the minimum, median and maximum of the finite values. NaN if there are none."""
     # NumPy prints a warning if all values are NaN.
     if not np.isfinite(values).any():
         return np.nan, np.nan, np.nan
@@ -338,7 +338,7 @@ def _compute_spread(values: Array) -> tuple[float, float, float]:
 
 
 def _scale_age_axis(axes: Axes, values_ms: Array) -> None:
-    """Scales the value axis of ages to all values, shape (K,). NaN values are ignored."""
+    """Scales the age axis to fit all values, shape (K,). NaN values are ignored."""
     known = values_ms[np.isfinite(values_ms)]
     if needs_log_axis(known):
         least_ms = float(known[known > 0.0].min())
@@ -349,7 +349,7 @@ def _scale_age_axis(axes: Axes, values_ms: Array) -> None:
 
 
 def _list_sender_entries(log: Log) -> list[tuple[str, dict[str, Any]]]:
-    """Returns the legend entries of the senders of samples."""
+    """Returns the legend entries for the senders of samples."""
     return [
         (f"from {style.site_title(log, site)}", style.site_line(log, site, 1.8))
         for site in log.sites
@@ -357,15 +357,15 @@ def _list_sender_entries(log: Log) -> list[tuple[str, dict[str, Any]]]:
 
 
 def explain_missing_loop_times(log: Log) -> str:
-    """Returns the reason why a log has no figures about the timing of the control loops.
+    """Returns the reason why a log has no figures of control loop timing.
 
-    Only runs in real time measure how late a tick (control period) began, and how long it took.
+    Only runs in real time measure how late a tick started and how long it took.
 
     Args:
         log: Log of the run.
 
     Returns:
-        The reason. Empty if at least one site has such times.
+        The reason. Empty if at least one site has timing data.
     """
     for site in log.sites:
         records = log[site]
@@ -376,19 +376,19 @@ def explain_missing_loop_times(log: Log) -> str:
 
 
 class LoopTimeBins(NamedTuple):
-    """Bins for histograms of the lateness and the computing time of control loops.
+    """Histogram bins for the lateness and the computing time of control loops.
 
     The bins have equal widths on a logarithmic axis.
 
     Attributes:
-        edges_us: Edges of the bins in us, shape (B + 1,).
+        edges_us: Bin edges in us, shape (B + 1,).
     """
 
     edges_us: Array
 
     @classmethod
     def of_log(cls, log: Log) -> "LoopTimeBins":
-        """Chooses the bins from 1 us to just above the longest time in a log.
+        """Chooses bins from 1 us to just above the longest time in a log.
 
         Args:
             log: Log of the run.
@@ -404,7 +404,7 @@ class LoopTimeBins(NamedTuple):
         return cls(np.power(10.0, exponents))
 
     def count_times(self, times_us: Ints) -> Ints:
-        """Counts how many times lie in each bin. Times below 1 us are in the first bin.
+        """Counts the times in each bin. Times below 1 us are counted in the first bin.
 
         Args:
             times_us: Times in us, shape (K,).
@@ -423,13 +423,13 @@ class LoopTimeBins(NamedTuple):
     in_report=True,
 )
 def _draw_loop_timing(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
-    """Draws histograms of how late the control loops began their periods, in us.
+    """Draws histograms of how late the control loops started their ticks, in us.
 
-    Further histograms show how long the computation of a period (tick) took.
+    Further histograms show how long the computation of a tick took.
 
     Args:
         log: Log of the run.
-        form: Width, type sizes and resolution of the figure.
+        form: Width, font sizes and resolution of the figure.
     """
     bins = LoopTimeBins.of_log(log)
     labels = ("wake-up after the deadline", "computing time of a tick")
@@ -465,7 +465,7 @@ def _draw_histogram(axes: Axes, times_us: Ints, bins: LoopTimeBins, colour: str)
 
 
 def _title_histogram(axes: Axes, site: str, times_us: Ints, form: FigureSize) -> None:
-    """Writes the site and the percentiles of its times, shape (K,), above a histogram."""
+    """Adds a title with the site and percentiles of its times, shape (K,), to a histogram."""
     if not len(times_us):
         style.annotate_empty_panel(axes, f"no times of {site}")
         return

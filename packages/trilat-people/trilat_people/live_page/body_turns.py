@@ -1,9 +1,9 @@
-"""Keeps the orientations of moving bodies continuous, so that plots of them do not jump.
+"""Keeps the orientations of moving bodies continuous, so plots of them do not jump.
 
 A unit quaternion and its negative describe the same orientation. If the sign changes from one
-time to the next, a plot of the quaternion jumps although the body moves smoothly, and an
-interpolation between the two is wrong. `BodyTurns` chooses the signs. It is used for the bodies
-of a simulated environment, whose poses are published many times per second.
+time to the next, a plot of the quaternion jumps although the body moves smoothly, and
+interpolating between the two gives wrong results. `BodyTurns` chooses consistent signs for the
+bodies of a plant, whose poses are published many times per second.
 """
 
 from collections.abc import Sequence
@@ -15,29 +15,24 @@ from trilat_net.log import QUATERNION_AXES, QuaternionSigns
 
 
 class BodyTurns:
-    """Chooses the signs of the quaternions of a plant's bodies in one stream of frames.
+    """Chooses the signs of the quaternions of a plant's bodies in a stream of frames.
 
-    A plant is a simulated environment with bodies, whose poses are published in frames. Two
-    quaternions of opposite sign describe the same orientation. Of the two, the one nearer to
-    the quaternion of the previous frame is chosen, so that a plot or an interpolation sees no
-    jump.
+    Of the two quaternions that describe an orientation, the one closer to the quaternion in the
+    previous frame is chosen, so a plot or an interpolation has no jump.
     """
 
     def __init__(self) -> None:
         self._signs: dict[int, QuaternionSigns] = {}
 
     def align(self, bodies: Sequence[float]) -> Array:
-        """Returns the poses of all bodies at one time, with quaternions that do not jump.
-
-        The sign of each quaternion is chosen so that it is near the body's quaternion in the
-        previous call.
+        """Returns the poses of all bodies with quaternion signs that match the previous call.
 
         Args:
             bodies: Seven values for each of the b bodies: position x, y, z in m, and unit
                 quaternion w, x, y, z.
 
         Returns:
-            The same values, with the signs of some quaternions reversed, shape (7 b,).
+            The same values, with the signs of some quaternions flipped, shape (7 b,).
         """
         pose_length = POSITION + len(QUATERNION_AXES)
         numbers = np.array(bodies, dtype=np.float64)
