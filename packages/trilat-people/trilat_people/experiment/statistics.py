@@ -765,8 +765,7 @@ def _list_rows(values: Array, means: Mapping[str, float]) -> list[Row]:
 
 
 def _count_significant(runs: Sequence[Comparison], d_z: float, alpha: float) -> SimulatedPower:
-    """Returns the estimated power: the fraction of simulated experiments that find a
-    difference.
+    """Estimates the power: the fraction of simulated experiments that find a difference.
 
     Args:
         runs: Comparison of the same two conditions in each simulated experiment.
