@@ -448,8 +448,7 @@ class Stage:
         return fields
 
     def _describe_users(self, step: Step, done_sites: Collection[str]) -> list[Json]:
-        """Describes the users for all pages: their pseudonym, and whether they are present or
-        done.
+        """Describes the users for all pages: pseudonym, and whether present or done.
 
         Shows the experimenter which users the experiment is waiting for.
 
@@ -469,8 +468,7 @@ class Stage:
         return users
 
     def _describe_for_experimenter(self, step: Step) -> Json:
-        """Returns details of the current step shown only to experimenters, such as the
-        condition.
+        """Returns what only experimenters see of the current step, such as the condition.
 
         Participants who knew the condition might expect an effect.
 

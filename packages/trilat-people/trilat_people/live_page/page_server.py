@@ -1023,8 +1023,7 @@ class PageServer:
         return {"hello": fields}
 
     def _describe_stage(self, page: _Page, t_s: float | None = None) -> dict[str, Any]:
-        """Describes the current step of an experiment for a page. Empty if there is no
-        experiment.
+        """Describes the current step of an experiment, if there is one, for a page.
 
         Args:
             page: The page.
@@ -1078,7 +1077,7 @@ class PageServer:
         }
 
     def _list_requests(self, page: _Page) -> list[int]:
-        """Returns the numbers of the pages that wait for this page's permission to take part."""
+        """Returns the numbers of the pages that wait for this page's permission."""
         numbers: list[int] = []
         for other in self._pages:
             if other.asks is not None:

@@ -51,8 +51,7 @@ from trilat_net.scenario import (
 )
 
 LATE_S = 3.0
-"""An observer joined late if the first record that it receives is later than this time, in s.
-"""
+"""An observer joined late if the first record that it receives is later than this, in s."""
 MIN_SILENCE_NS = 2 * NS_PER_S
 """Silence after which a running site is reported as silent, in ns."""
 EVENTS_KEPT = 400
