@@ -35,7 +35,7 @@ MAX_ABSENCE_NS = 8 * NS_PER_S
 END_DELAY_NS = NS_PER_S // 2
 """Time between the end of a trial and the end of its session, in ns.
 
-This gives the mark of the trial's end time to reach the log.
+During this time, the mark of the trial's end reaches the log.
 """
 
 Json = dict[str, Any]
