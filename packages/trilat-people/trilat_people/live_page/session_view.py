@@ -405,7 +405,7 @@ class SessionView:
 
     @property
     def complete_ticks(self) -> dict[str, int]:
-        """Mapping from site to the last tick whose records have all arrived or been lost."""
+        """Mapping from site to the tick up to which all records have arrived or been lost."""
         return {name: site.complete for name, site in self.sites.items()}
 
     def find_peer_ticks(
