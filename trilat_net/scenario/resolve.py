@@ -125,7 +125,7 @@ def _complete_timeline(
 ) -> list[TomlTable]:
     """Returns the planned changes of a scenario, each complete in itself.
 
-    An author may state only those link settings that change. In the result, each change
+    An author may write only those link settings that change. In the result, each change
     contains all settings, with unchanged settings carried over from earlier changes.
 
     Args:

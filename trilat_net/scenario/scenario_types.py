@@ -217,7 +217,7 @@ class Scenario(Frozen, frozen=True, dict=True):
         return periods_s.pop() if len(periods_s) == 1 else math.nan
 
     def describe_law_conditions(self, *, ticks_grow: bool = False) -> list[str]:
-        """Returns lines of text that say whether the stability conditions of the laws hold.
+        """Returns one line per stability condition, stating whether it holds.
 
         Every control law has its own conditions, for example on its gains and on the delays.
         Sites with the same law and the same condition share one line.

@@ -37,8 +37,10 @@ from .link_inertia import LinkInertia, balance_tensor, fill_tensor
 MAX_CHARACTERS = 1_000_000
 """Maximum length of a file, in characters."""
 MAX_NUMBER_LENGTH = 100
-"""Maximum number of characters in a number. If the text is not a number, the time taken by the
-regular expression grows quadratically with the length.
+"""Maximum number of characters in a number.
+
+If the text is not a number, the time taken by the regular expression grows quadratically with
+its length.
 """
 MAX_OFFSET_M = 100.0
 """Largest coordinate of an origin, in m. Larger ones indicate an error, or millimetres."""

@@ -619,9 +619,9 @@ def _check_actors(
 def _check_hands(site: SiteSpec, path: str) -> None:
     """Raises ScenarioError if an operator cannot move the arm as the scenario specifies.
 
-    An arm has at most one live operator (a person or a program in the session), and must be
-    simulated by the program. A user's program acts in every n-th control period, so its rate
-    must divide the rate of the control loop.
+    An arm has at most one live operator, and only if it is simulated by the program itself. A
+    user's program acts in every n-th control period, so its rate must divide the rate of the
+    control loop.
 
     Args:
         site: The site.

@@ -79,8 +79,9 @@ for _kind in _LINK_TABLES.values():
     # at once.
     msgspec.convert({}, _kind)
 _USER_LAW = "own"
-"""Name shared by all users' laws. Since their arguments differ, messages about misplaced keys
-do not mention them.
+"""Name shared by all users' laws.
+
+Since their arguments differ, messages about misplaced keys do not mention these laws.
 """
 
 

@@ -96,16 +96,16 @@ def hand_command(
 def _lead_by_device(
     device: str, name: str, session: str | None, reach: options.Reach, timeout_s: float
 ) -> None:
-    """Lets the user lead an arm of a running session with an input device.
+    """Lets the user move an arm of a running session with an input device.
 
-    The function returns when the session ends, or at Ctrl-C.
+    Returns when the session ends, or on Ctrl-C.
 
     Args:
-        device: Name of the device, and its address if needed, as in NAME=ADDRESS.
-        name: Name of the site whose arm is led.
+        device: Name of the device, with its address if needed, as NAME=ADDRESS.
+        name: Name of the site of the arm.
         session: Name of the session.
-        reach: The options by which the command reaches the session.
-        timeout_s: Longest wait for the site, in s.
+        reach: Command-line options for connecting to the session.
+        timeout_s: Maximum time to wait for the site, in s.
     """
     from trilat_net.app import RunningSession
 

@@ -48,32 +48,32 @@ from trilat_net.results import Result
 from trilat_net.scenario import Scenario
 
 MIN_SEGMENTS = 5
-"""Smallest number of segments for confidence intervals."""
+"""Minimum number of segments for computing confidence intervals."""
 MIN_KNOWN_SHARE = 0.98
-"""Smallest fraction of a segment's records that must be in the log."""
+"""Minimum fraction of a segment's records that must be in the log."""
 NEIGHBOUR_CORRELATION = 1.0 / 6.0
-"""Correlation of white noise in two segments with a Hann window that overlap by half."""
+"""Correlation of white noise in two Hann-windowed segments that overlap by half."""
 MAX_CONDITION = 1e3
-"""Largest condition number of the motions with which the axes can be distinguished."""
+"""Largest condition number of the motions at which the axes can be distinguished."""
 _TINY = 1e-300
-"""Smallest divisor, which makes 0 / 0 give 0."""
+"""Smallest divisor, which makes 0 / 0 evaluate to 0."""
 UNITS = {"M": "kg", "B": "N s/m", "K": "N/m"}
-"""Unit of each matrix."""
+"""Mapping from each matrix to its unit."""
 
 
 class _SineResponse(NamedTuple):
-    """Response of the hand and the arm to one of the sines that excite the arm.
+    """Response of the hand and the arm to one of the excitation sines.
 
-    To identify the hand that holds an arm, small forces of several frequencies act on the arm.
-    The run is divided into segments, whose spectra are compared.
+    To identify the hand that holds an arm, the arm is excited with small forces at several
+    frequencies. The run is divided into segments, whose spectra are compared.
 
     Attributes:
-        hz: The frequency, in Hz.
+        hz: Frequency, in Hz.
         motion_mm: Amplitude of the motion over all axes, in mm.
         force_n: Amplitude of the force over all axes, in N.
-        coherence: Fraction of the motion or of the force, whichever is smaller, that repeats
-            from segment to segment. It is 1 if all segments are equal.
-        unexplained: Fraction of the force that M, B and K do not explain.
+        coherence: Fraction of the motion or of the force, whichever is smaller, that is
+            repeatable between segments; 1 if all segments are equal.
+        unexplained: Fraction of the force not explained by M, B and K.
     """
 
     hz: float
@@ -174,10 +174,10 @@ class HandImpedance(Result):
         yield f"in a scenario, without the mass of the hand: hands = [{{ {table_text} }}]"
 
     def _tabulate_matrices(self) -> TextTable:
-        """Returns a table of the identified mass M, damping B and stiffness K of a hand.
+        """Returns a table of the identified mass M, damping B and stiffness K.
 
-        There is a row for each matrix, and a column for each entry, named by its axes, as in
-        "xy". Each cell has the value and half the width of its confidence interval.
+        Has one row per matrix, and one column per entry, named by its axes, as in "xy". Each
+        cell contains the value and the half-width of its confidence interval.
         """
         axes = "xyz"[: len(self.K)]
         entries = list(product(range(len(axes)), repeat=2))
@@ -196,15 +196,15 @@ class HandImpedance(Result):
 
 
 def _format_response(response: _SineResponse) -> tuple[str, ...]:
-    """Returns the numbers of a response to one sine as table cells with three digits."""
+    """Formats the response to one sine as table cells with three digits."""
     return tuple(f"{value:.3g}" for value in response)
 
 
 def _round_diagonal(matrix: Array) -> list[float]:
-    """Returns the diagonal of a matrix with four digits, for a scenario that models the hand.
+    """Returns the diagonal of a matrix, rounded to four digits, for use in a scenario.
 
-    A negative entry is a measurement error, because mass, damping and stiffness are not
-    negative. It is replaced with 0.
+    Mass, damping and stiffness are not negative, so a negative entry is a measurement error and
+    is replaced with 0.
 
     Args:
         matrix: Identified mass, damping or stiffness, shape (D, D).
@@ -290,16 +290,16 @@ def identify_hand(log: Log | str | Path, site: str = "m1") -> HandImpedance:
 def _list_responses(
     F: Complex, X: Complex, hz: Array, unexplained: Array
 ) -> tuple[_SineResponse, ...]:
-    """Returns the response of hand and arm at each frequency, averaged over the segments.
+    """Computes the response of hand and arm at each frequency, averaged over segments.
 
-    The responses show how well a frequency determines the hand. They contain the amplitudes,
-    their repeatability (coherence), and the part of the force that the fit does not explain.
+    The responses show how informative each frequency is. They contain the amplitudes, their
+    repeatability (coherence), and the fraction of the force not explained by the fit.
 
     Args:
-        F: Phasors (complex amplitudes) of the force, shape (segments, F, n), in N.
-        X: Phasors of the position, shape (segments, F, n), in m.
+        F: Phasors (complex amplitudes) of the force, in N, shape (segments, F, n).
+        X: Phasors of the position, in m, shape (segments, F, n).
         hz: The F frequencies, in Hz.
-        unexplained: Fraction of the force that the fit does not explain, shape (F,).
+        unexplained: Fraction of the force not explained by the fit, shape (F,).
     """
     force_coherence = _compute_coherence(F)
     motion_coherence = _compute_coherence(X)
@@ -324,12 +324,12 @@ def _list_responses(
 
 
 class _Sines(NamedTuple):
-    """Sinusoidal forces that excite an arm, to identify a person's hand by its response.
+    """Sinusoidal excitation of an arm, used to identify a person's hand.
 
     Attributes:
-        hz: Frequencies of all sines in rising order, in Hz.
-        start_s: Time from which all sines act, in s.
-        end_s: Time until which all sines act, in s.
+        hz: Frequencies of all sines in ascending order, in Hz.
+        start_s: Time at which all sines have started, in s.
+        end_s: Time at which the first sine ends, in s.
     """
 
     hz: Array
@@ -338,13 +338,11 @@ class _Sines(NamedTuple):
 
 
 def _find_sines(scenario: Scenario) -> _Sines:
-    """Finds the sines with which simulated operators excite the arms, at any site.
-
-    The hand is identified by its response to these sines.
+    """Returns the sines with which simulated operators excite the arms, at any site.
 
     Raises:
         UsageError: No operator of the scenario is of the kind `multisine`. The error explains
-            why the hand cannot be identified without it.
+            why the hand cannot be identified without one.
     """
     multisines: list[TorqueSource] = []
     for site_settings in scenario.sites.values():
@@ -369,18 +367,17 @@ def _find_sines(scenario: Scenario) -> _Sines:
 
 
 def _compute_hand_force(records: AlignedRecords, scenario: Scenario) -> tuple[Array, Array]:
-    """Returns the force of the hand ON the end effector, and the end effector's position.
+    """Returns the force of the hand ON the end effector, and the end effector position.
 
-    The recorded torque of the operators contains the hand and the simulated operators of the
-    same arm. The torques of operators that follow a script, such as sines, are subtracted from
-    it.
+    The recorded operator torque includes both the hand and the simulated operators of the same
+    arm. The torques of scripted operators, such as sines, are subtracted from it.
 
     Args:
         records: Records of the arm.
         scenario: Scenario of the run.
 
     Returns:
-        The force in N and the position in m, shape (K, n) each for K records.
+        The force in N and the position in m, each of shape (K, n) for K records.
     """
     split = TorqueSplit.of_records(records, scenario)
     end_effector = split.end_effector
@@ -401,22 +398,21 @@ def _compute_phasors(
 ) -> list[Complex]:
     """Computes the phasors of signals at the frequencies of the sines, segment by segment.
 
-    A phasor is the complex amplitude of a signal at one frequency. Segments have a Hann window
-    and overlap by half. The spectrum of the window is zero at the other sines, which are two or
-    more multiples of 1 / segment_s away. The spectrum falls with the third power of the
-    frequency. Therefore transients and drift, which are slower than the sines, hardly
-    contribute. The first half segment is left out. Segments with too many missing records
-    (results of control periods) are skipped.
+    A phasor is the complex amplitude of a signal at one frequency. Segments overlap by half and
+    are weighted with a Hann window. The spectrum of the window is zero at the other sines,
+    which are at least two multiples of 1 / segment_s away. It falls with the third power of the
+    frequency, so transients and drift, which are slower than the sines, hardly contribute. The
+    first half-segment is discarded, and segments with too many missing records are skipped.
 
     Args:
         records: Records of the site.
-        signals: The signals, shape (K, signals).
+        signals: Signals, shape (K, signals).
         hz: The F frequencies, in Hz.
-        start_s: Time from which all sines act, in s.
+        start_s: Time at which all sines have started, in s.
         segment_s: Duration of a segment, in s.
 
     Returns:
-        For each segment, phasors of shape (F, signals).
+        One array of phasors per segment, shape (F, signals).
     """
     segment_size = round(segment_s * records.rate_hz)
     half_s = 0.5 * segment_s
@@ -447,11 +443,11 @@ def _compute_phasors(
 
 
 def _compute_coherence(phasors: Complex) -> Array:
-    """Returns the coherence of phasors over segments and all axes, shape (F,).
+    """Computes the coherence of phasors over segments and all axes, shape (F,).
 
-    If z is the phasor of a segment, the coherence is |mean of z|^2 / mean of |z|^2, where the
-    means are taken over the segments. The coherence is 1 if all segments are equal, and near 0
-    if the phasors are random.
+    The coherence is |mean of z|^2 / mean of |z|^2, where z is the phasor of a segment and the
+    means are over segments. It is 1 if all segments are equal, and close to 0 for random
+    phasors.
 
     Args:
         phasors: The phasors, shape (segments, F, n).
@@ -468,15 +464,13 @@ def _compute_coherence(phasors: Complex) -> Array:
 class _HandFit(NamedTuple):
     """Mass, damping and stiffness of a hand, fitted to measured forces and motions.
 
-    The fit finds the matrices M, B and K for which force = M acceleration + B velocity + K
-    displacement holds best.
-
-    Shapes use n axes and F frequencies.
+    The matrices M, B and K are the best fit to force = M acceleration + B velocity + K
+    displacement. Shapes are for n axes and F frequencies.
 
     Attributes:
         matrices: M, B and K, shape (3, n, n).
-        halves: Half the width of their 95 % intervals, shape (3, n, n).
-        unexplained: Fraction of the force that the fit does not explain, shape (F,).
+        halves: Half-widths of their 95 % confidence intervals, shape (3, n, n).
+        unexplained: Fraction of the force not explained by the fit, shape (F,).
     """
 
     matrices: Array
@@ -485,16 +479,17 @@ class _HandFit(NamedTuple):
 
 
 def _fit_with_intervals(site: str, F: Complex, X: Complex, w: Array) -> _HandFit:
-    """Fits M, B and K to phasors, and estimates their confidence intervals by the jackknife.
+    """Fits M, B and K to phasors and estimates their confidence intervals with the jackknife.
 
     Args:
         site: Name of the site, for the error message.
-        F: Phasors of the force, shape (segments, F, n), in N.
-        X: Phasors of the position, shape (segments, F, n), in m.
-        w: Angular frequencies, shape (F,), in rad/s.
+        F: Phasors of the force, in N, shape (segments, F, n).
+        X: Phasors of the position, in m, shape (segments, F, n).
+        w: Angular frequencies, in rad/s, shape (F,).
 
     Raises:
-        UsageError: The motions do not distinguish the axes, or mass, damping and stiffness.
+        UsageError: The motions do not allow the axes, or mass, damping and stiffness, to be
+            distinguished.
     """
     segment_count, _, axis_count = X.shape
     # Each derivative multiplies a phasor by j w.
@@ -546,8 +541,8 @@ def _fit_with_intervals(site: str, F: Complex, X: Complex, w: Array) -> _HandFit
 def _fit_all_axes(forces: Complex, motions: Complex, segments: NDArray[np.int64]) -> Array:
     """Fits the mass M, damping B and stiffness K of a hand to its motion, axis by axis.
 
-    For n axes, the result has the rows of all three matrices, shape (n, 3 n), see
-    `_fit_impedance`.
+    For n axes, the result contains the rows of all three matrices, shape (n, 3 n) (see
+    `_fit_impedance`).
 
     Args:
         forces: Phasors of the force along each axis, shape (n, segments, F).
@@ -561,9 +556,9 @@ def _fit_all_axes(forces: Complex, motions: Complex, segments: NDArray[np.int64]
 def _can_distinguish(motions: Complex) -> bool:
     """Returns True if the motions determine mass, damping and stiffness along all axes.
 
-    Otherwise the fit would return arbitrary numbers. There must be enough frequencies, and the
-    motions along the axes and their derivatives must be linearly independent, up to the
-    condition number `MAX_CONDITION`.
+    Otherwise, the result of the fit would be arbitrary. There must be enough frequencies, and
+    the motions along the axes and their derivatives must be linearly independent, with a
+    condition number of at most `MAX_CONDITION`.
 
     Args:
         motions: Phasors of -(acceleration, velocity, position), shape (segments, F, 3 n).
@@ -582,25 +577,24 @@ def _can_distinguish(motions: Complex) -> bool:
 
 
 def _stack_real_and_imaginary(phasors: Complex) -> Array:
-    """Returns the real parts of complex numbers followed by their imaginary parts.
+    """Concatenates the real parts of complex numbers and their imaginary parts.
 
-    This turns K complex equations into 2 K real equations, whose unknowns stay real.
+    This converts K complex equations to 2 K real equations with real unknowns.
 
     Args:
-        phasors: Array of the shape (K, ...).
+        phasors: Array of shape (K, ...).
     """
     return np.concatenate((phasors.real, phasors.imag))
 
 
 def _fit_impedance(force: Complex, motions: Complex, segments: NDArray[np.int64]) -> Array:
-    """Estimates mass, damping and stiffness of a hand for the force along one axis.
+    """Estimates the mass, damping and stiffness of a hand for the force along one axis.
 
-    The model is force = motions @ impedance. It is solved by weighted least squares: at each
-    frequency, the residual averaged over the segments is divided by the standard deviation of
-    the residuals over the segments, so that noisy frequencies count less. The standard
-    deviation itself depends on the impedance, because the person's own movements also make the
-    measured motion noisy. The problem is therefore nonlinear and needs an initial guess, which
-    is computed by ordinary least squares.
+    The model is force = motions @ impedance, solved by weighted least squares. At each
+    frequency, the mean residual over the segments is divided by the standard deviation of the
+    residuals, so noisy frequencies have less weight. Since the person's own movements also add
+    noise to the measured motion, the standard deviation depends on the impedance. The problem
+    is therefore nonlinear, and its initial guess is computed by ordinary least squares.
 
     Args:
         force: Phasors of the force along the axis, shape (segments, F).

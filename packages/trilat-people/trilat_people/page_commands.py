@@ -26,7 +26,7 @@ _START_OPTIONS = {
     "--json",
     "scenario",
 }
-"""Options of `trilat live` that only concern a session that it starts."""
+"""Options of `trilat live` that apply only to a session that it starts."""
 
 
 @options.command("play", "--session paper", page="docs/sessions/live-page.md")

@@ -103,7 +103,7 @@ class LinkBase(Frozen, frozen=True, tag_field="model", omit_defaults=True):
             separately.
         outages_s: Intervals of send time, in s, in which every sample is lost.
         order: "newest" to discard a sample that arrives after a newer one, or "in_order" to
-            hold back a sample until the earlier ones have arrived.
+            prevent a sample from overtaking an earlier one.
         playout_ms: Play-out delay, in ms. Every sample is held until at least this long after
             it was sent, which removes the jitter of all shorter delays.
     """

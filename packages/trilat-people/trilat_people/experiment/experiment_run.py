@@ -79,12 +79,12 @@ class Note(msgspec.Struct, frozen=True):
 
 
 class _ExperimentStatus(NamedTuple):
-    """Progress of an experiment: the number of finished trials, and the next trial.
+    """Progress of an experiment: the number of finished trials and the next trial.
 
     Attributes:
         done: Number of trials in the journal.
-        total: Number of trials of the plan.
-        next: The first unfinished trial. `None` if all trials are finished.
+        total: Number of trials in the plan.
+        next: First unfinished trial, or `None` if all trials are finished.
     """
 
     done: int
@@ -188,16 +188,16 @@ class Experiment(Result):
     def _draw_choices(self, staircase: Staircase) -> None:
         """Records the choices of synthetic participants for all pairs of a staircase.
 
-        A staircase is a perception test with pairs of trials. A quantity has its standard value
-        in one trial of a pair, and a larger value in the other trial, the comparison trial.
-        After the second trial, the participant chooses the trial with the larger value. The
-        difference of a pair depends on whether the earlier choices of the block were right.
+        A staircase is a perception test with pairs of trials: a quantity has its standard value
+        in one trial of a pair and a larger value in the other (the comparison trial). After the
+        second trial, the participant chooses the one with the larger value. The difference in a
+        pair depends on whether the earlier choices in the block were right.
 
-        The choices depend only on the plan, and can therefore be drawn before any trial is run.
+        The choices depend only on the plan, so they can be drawn before any trial is run.
 
         Args:
-            staircase: Settings of the test. It also contains the model of the participant's
-                perception, which sometimes errs.
+            staircase: Settings of the test, including the model of the participant's imperfect
+                perception.
         """
         # Chosen trial, 1 or 2, by the number of the second trial.
         choices: dict[int, float] = {}
@@ -300,12 +300,12 @@ class Experiment(Result):
     def _describe_trial(
         self, planned: PlannedTrial, entry: TrialEntry, choices: Choices
     ) -> dict[str, Any]:
-        """Returns the row of a finished trial in the table trials.csv, which is analysed later.
+        """Returns the row of a finished trial in the table trials.csv.
 
         Args:
             planned: The trial in the plan: number, participants, condition, block.
             entry: Its result from the journal: success, measures, and the digest of its log.
-            choices: Choices of the participants in a staircase, see `list_choices`.
+            choices: Choices of the participants in a staircase (see `list_choices`).
         """
         row: dict[str, Any] = {
             "trial_number": planned.number,
@@ -333,12 +333,12 @@ class Experiment(Result):
         """Returns two additional columns for a trial in a perception test (staircase).
 
         Such trials come in pairs that differ in one quantity, and the participant chooses the
-        trial in which the quantity was larger.
+        trial in which it was larger.
 
         Returns:
-            "difference", between the two trials of the pair, and "right", 1 if the choice was
-            right and 0 if not. Both are `None` for practice trials, and "right" is `None`
-            before the choice.
+            "difference" between the two trials of the pair, and "right", which is 1 for a right
+            choice and 0 for a wrong one. Both are `None` for practice trials, and "right" is
+            `None` before the choice.
         """
         if planned.practice:
             return {"difference": None, "right": None}
@@ -379,10 +379,10 @@ class Experiment(Result):
         return rows
 
     def _read_answer_notes(self) -> Iterator[tuple[dict[str, Any], Note]]:
-        """Yields the notes with answers to a questionnaire, each with columns that identify it.
+        """Yields the notes with answers to a questionnaire, each with identifying columns.
 
-        These columns identify the participant, the block and the condition of the block.
-        Choices in a perception test are also such notes.
+        The columns identify the participant, the block and the condition of the block. Choices
+        in a perception test are also notes of this kind.
         """
         conditions: dict[tuple[tuple[str, ...], int], str] = {}
         for trial in self.plan.trials:
@@ -527,11 +527,11 @@ class Experiment(Result):
 
 
 _SHOWN_MEASURES = ("error_end_mm", "error_rms_mm", "path_m", "sparc")
-"""Measures whose means the text of the status shows."""
+"""Measures whose means are shown in the progress report."""
 
 
 def _describe_mean(rows: list[dict[str, Any]], measure: str) -> str:
-    """Returns the mean of a measure over trials as text, with three digits.
+    """Formats the mean of a measure over trials with three digits.
 
     Args:
         rows: Rows of finished trials, at least one.
@@ -542,10 +542,10 @@ def _describe_mean(rows: list[dict[str, Any]], measure: str) -> str:
 
 
 def _describe_median(rows: list[dict[str, Any]]) -> str:
-    """Returns the median completion time of trials as text, in s.
+    """Formats the median completion time of trials, in s.
 
-    A trial that was not completed counts as longer than any other. If the median is such a
-    time, the text is "not reached".
+    A trial that was not completed counts as longer than all others. "not reached" if the median
+    is such a time.
     """
     times_s = [row[COMPLETION] if is_completed(row) else math.inf for row in rows]
     median_s = find_median(times_s)

@@ -28,21 +28,21 @@ from trilat_net.core import Array
 from trilat_net.errors import UsageError, count_nouns
 
 ONSET_SHARE = 0.05
-"""Share of the peak speed at which a movement starts and ends."""
+"""Fraction of the peak speed at which a movement starts and ends."""
 
 
 def _read(name: str, values: ArrayLike, dimensions: int) -> Array:
-    """Converts a recorded movement to an array of finite numbers, shape (K,) or (K, D).
+    """Converts samples of a movement to an array of finite numbers, shape (K,) or (K, D).
 
-    K is the number of recorded times, and D the number of coordinates.
+    K is the number of samples, and D is the number of coordinates.
 
     Args:
-        name: Name of the samples in error messages.
+        name: Name of the samples, for error messages.
         values: The samples.
         dimensions: 1 for shape (K,), 2 for shape (K, D).
 
     Raises:
-        UsageError: The array has another shape, or a sample is not finite.
+        UsageError: The array has a different shape, or a sample is not finite.
     """
     samples = np.asarray(values, dtype=np.float64)
     if samples.ndim != dimensions or not samples.size:
@@ -59,10 +59,10 @@ def _read(name: str, values: ArrayLike, dimensions: int) -> Array:
 
 
 def _read_same_shape(**values: ArrayLike) -> list[Array]:
-    """Converts several recorded series to arrays of floats, and checks their equal length.
+    """Converts several time series to arrays of floats with the same shape.
 
     Args:
-        **values: Arrays of K samples with D axes, shape (K, D), by their names in messages.
+        **values: Arrays of K samples with D axes, shape (K, D), named as in error messages.
 
     Raises:
         UsageError: The shapes differ, or a sample is not finite.
@@ -78,11 +78,11 @@ def _read_same_shape(**values: ArrayLike) -> list[Array]:
 
 
 def _integrate(values: Array, rate_hz: float) -> float:
-    """Returns the integral over time of K equally spaced values, by the trapezoidal rule.
+    """Integrates K equally spaced samples over time with the trapezoidal rule.
 
     Args:
         values: The samples, at a constant rate.
-        rate_hz: Rate of the samples, 1/s.
+        rate_hz: Sample rate, in Hz.
 
     Returns:
         The integral, in the unit of the samples times s.
@@ -91,7 +91,7 @@ def _integrate(values: Array, rate_hz: float) -> float:
 
 
 def _compute_rms(values: Array) -> float:
-    """Returns the root mean square of all numbers in an array."""
+    """Returns the root mean square of all entries of an array."""
     return float(np.sqrt(np.mean(values**2)))
 
 
@@ -216,7 +216,7 @@ def energy_j(force: ArrayLike, velocity: ArrayLike, rate_hz: float) -> float:
 EFFECTIVE_WIDTH = float(np.sqrt(2.0 * np.pi * np.e))
 """Effective width in standard deviations: sqrt(2 pi e) = 4.133.
 
-A range of this width holds 96 % of normally distributed end points.
+A range of this width contains 96 % of normally distributed end points.
 """
 
 
@@ -433,14 +433,14 @@ def measure_pair(
 # --- questionnaires ---------------------------------------------------------------------------
 
 TLX_SCALES = ("mental", "physical", "temporal", "performance", "effort", "frustration")
-"""Scales of the NASA Task Load Index. `performance` runs from good, 0, to poor, 100."""
+"""Scales of the NASA Task Load Index. `performance` ranges from 0 (good) to 100 (poor)."""
 
 
 def _list_ratings(ratings: Mapping[str, float]) -> list[float]:
     """Returns the six ratings of NASA-TLX in the order of `TLX_SCALES`.
 
     Args:
-        ratings: Rating from 0 to 100 by the name of the scale.
+        ratings: Mapping from the name of each scale to a rating from 0 to 100.
 
     Raises:
         UsageError: A scale is missing or unknown, or a rating is not between 0 and 100.

@@ -55,15 +55,15 @@ Feedback = Literal[
 
 
 class _CatchTrials(Frozen, frozen=True):
-    """Trials of an unexpected condition that are mixed into a block of another condition.
+    """Trials of an unexpected condition, mixed into a block of another condition.
 
-    They keep participants from anticipating the condition of the next trial, and are left out
-    of the analysis.
+    They prevent participants from anticipating the condition of the next trial, and are
+    excluded from the analysis.
 
     Attributes:
         condition: Condition of the catch trials. Blocks of this condition have no catch trials.
-        share: Number of catch trials in a block, as a fraction of the counted trials of the
-            block. The number is rounded.
+        share: Number of catch trials in a block, as a fraction of the block's counted trials.
+            The resulting number is rounded.
     """
 
     condition: Name
@@ -71,16 +71,17 @@ class _CatchTrials(Frozen, frozen=True):
 
 
 class _Training(Frozen, frozen=True):
-    """Training in which the authority over the slave arm moves from an expert to a learner.
+    """Training in which authority over the slave arm passes from an expert to a learner.
 
-    The first user is the expert, the second user the learner.
+    The first user is the expert, and the second user is the learner.
 
     Attributes:
-        lead: For each condition, the expert's share of the users' authority in the first and in
-            the last trial of the training, from 0 to 1.
-        before: Number of trials of the learner alone before the training.
-        after: Number of trials of the learner alone right after the training (transfer).
-        retention: Number of trials of the learner alone after a rest (retention).
+        lead: Mapping from condition to the expert's share of the users' authority in the first
+            and last trial of the training, between 0 and 1.
+        before: Number of trials in which the learner acts alone before the training.
+        after: Number of trials in which the learner acts alone directly after the training
+            (transfer).
+        retention: Number of trials in which the learner acts alone after a rest (retention).
         rest_s: Rest before the retention trials, in s.
     """
 
@@ -408,7 +409,7 @@ class PlannedTrial(NamedTuple):
 
 
 Choices = Mapping[int, float]
-"""Chosen trial, 1 or 2, of each staircase pair, by the number of the pair's second trial."""
+"""Mapping from the second trial of each staircase pair to the chosen trial, 1 or 2."""
 
 
 class Step(NamedTuple):
@@ -704,13 +705,13 @@ class ExperimentPlan(Result):
 
 
 def _list_keys(table: Mapping[str, Any], path: str = "") -> dict[str, Any]:
-    """Returns the dotted keys of a table of scenario settings with their values.
+    """Flattens a table of scenario settings into dotted keys and their values.
 
-    Tables of sites, links and dominance factors are expanded. Other tables are kept as values.
+    Tables of sites, links and dominance factors are expanded; other tables are kept as values.
 
     Args:
         table: The table.
-        path: Dotted key of the table. Empty for the top level.
+        path: Dotted key of the table. Empty at the top level.
     """
     keys = dict[str, Any]()
     for name, value in table.items():
@@ -725,10 +726,10 @@ def _list_keys(table: Mapping[str, Any], path: str = "") -> dict[str, Any]:
 
 
 def _find_problems(protocol: ExperimentProtocol) -> Iterator[str]:
-    """Yields the problems of a protocol that are visible without its scenario.
+    """Yields all problems of a protocol that can be found without its scenario.
 
-    Each problem is a sentence that names the key. The author sees all problems at once.
-    `_check_scenario` finds the problems with the scenario.
+    Each problem is a sentence that names the key. See `_check_scenario` for problems with the
+    scenario.
     """
     shortest_s, longest_s = protocol.foreperiod_s
     if shortest_s > longest_s:
@@ -746,9 +747,9 @@ def _list_pseudonyms(protocol: ExperimentProtocol) -> list[str]:
 
 
 def _find_pseudonym_problems(protocol: ExperimentProtocol) -> Iterator[str]:
-    """Yields a sentence for each mistake in the pseudonyms of an experiment's participants.
+    """Yields a sentence for each mistake in the participants' pseudonyms.
 
-    A mistake is a pseudonym that two participants share, or a force limit for a pseudonym that
+    A mistake is a pseudonym shared by two participants, or a force limit for a pseudonym that
     no participant has.
     """
     names = _list_pseudonyms(protocol)
@@ -762,8 +763,8 @@ def _find_pseudonym_problems(protocol: ExperimentProtocol) -> Iterator[str]:
 def _find_table_problems(protocol: ExperimentProtocol) -> Iterator[str]:
     """Yields a sentence for each contradiction in the optional tables of a protocol.
 
-    These are [catch] (trials that check attention), [training] and [staircase] (a perception
-    test), of which some exclude each other.
+    These are [catch], [training] and [staircase] (a perception test), some of which are
+    mutually exclusive.
     """
     catch = protocol.catch
     training = protocol.training
@@ -787,7 +788,7 @@ def _find_table_problems(protocol: ExperimentProtocol) -> Iterator[str]:
 
 
 def _find_form_problems(protocol: ExperimentProtocol) -> Iterator[str]:
-    """Yields a sentence for each questionnaire that is unknown or has a name twice."""
+    """Yields a sentence for each questionnaire that is unknown or listed twice."""
     names = [form.name for form in protocol.forms]
     if len(set(names)) < len(names):
         yield "two questionnaires have the same name"
@@ -799,10 +800,10 @@ def _find_form_problems(protocol: ExperimentProtocol) -> Iterator[str]:
 
 
 def _find_group_problems(protocol: ExperimentProtocol) -> Iterator[str]:
-    """Yields a sentence for each mistake in the number of participants of an experiment.
+    """Yields a sentence for each mistake in the number of participants or users.
 
-    Some designs balance the orders of conditions only if the number of groups is a multiple of
-    the number of orders. The users that a task needs are checked, too.
+    Some designs balance the order of conditions only if the number of groups is a multiple of
+    the number of orders. The number of users must be that required by the task.
     """
     users = protocol.users
     name_count = len(_list_pseudonyms(protocol))
@@ -828,9 +829,9 @@ def _find_group_problems(protocol: ExperimentProtocol) -> Iterator[str]:
 def _find_staircase_problems(
     protocol: ExperimentProtocol, staircase: Staircase
 ) -> Iterator[str]:
-    """Yields a sentence for each rule of a perception test that the protocol breaks.
+    """Yields a sentence for each rule of the perception test that the protocol violates.
 
-    A staircase needs exactly one user, an even number of trials, and a key that no condition
+    A staircase requires exactly one user, an even number of trials, and a key that no condition
     sets.
 
     Args:
@@ -851,13 +852,14 @@ def _find_staircase_problems(
 
 
 def _check_scenario(scenario: Scenario, protocol: ExperimentProtocol) -> Scenario:
-    """Returns the scenario of a condition if the experiment can be run with it.
+    """Raises ScenarioError if the experiment cannot be run with the scenario of a condition.
 
-    For example, each user needs a site at which a person can move the arm.
+    For example, each user needs a site at which a person can move the arm. Returns the scenario
+    otherwise.
 
     Raises:
         ScenarioError: A user's site is missing or cannot be held by a person, or a wall, a
-            dominance factor, a force limit or a key of the staircase does not fit.
+            dominance factor, a force limit or a key of the staircase is unsuitable.
     """
     for user in protocol.users:
         if user not in scenario.names:
@@ -895,19 +897,19 @@ def _check_scenario(scenario: Scenario, protocol: ExperimentProtocol) -> Scenari
 
 
 def _list_trials(protocol: ExperimentProtocol) -> Iterator[PlannedTrial]:
-    """Yields all trials of an experiment in their order.
+    """Yields all trials of an experiment in the order in which they are run.
 
-    Each group of participants does one block of trials per condition. The order of the
-    conditions is the next order that `ExperimentProtocol.list_orders` returns. A block begins
-    with practice trials. The further trials are those of `ExperimentProtocol.list_phases`: a
-    trial has a phase (of a training or of a staircase, otherwise empty), and a lead, the first
-    user's share of the authority over the slave arm. The condition of a catch trial differs
-    from that of its block. Numbers start at 1, and indices at 0.
+    Each group of participants does one block of trials per condition. The conditions follow the
+    next order from `ExperimentProtocol.list_orders`. A block begins with practice trials,
+    followed by the trials of `ExperimentProtocol.list_phases`, each of which has a phase (of a
+    training or staircase, otherwise empty) and a lead (the first user's share of the authority
+    over the slave arm). The condition of a catch trial differs from that of its block. Numbers
+    start at 1, and indices at 0.
 
-    Each random quantity has a generator of its own, whose seed contains the seed of the
-    protocol, the group and the block. A last number distinguishes the quantities: none for the
-    first target, 1 for catch trials, and 2 for phases. Therefore a change of one quantity does
-    not change the others.
+    Each random quantity has its own generator, whose seed consists of the seed of the protocol,
+    the group, the block and a number that distinguishes the quantities: none for the first
+    target, 1 for catch trials, and 2 for phases. A change in one quantity therefore does not
+    affect the others.
 
     Args:
         protocol: Design of the experiment: conditions, task and participants.
@@ -958,10 +960,11 @@ def _list_trials(protocol: ExperimentProtocol) -> Iterator[PlannedTrial]:
 def _draw_catches(
     protocol: ExperimentProtocol, condition: str, group: int, block: int
 ) -> set[int]:
-    """Draws which trials of a block are catch trials, which have an unexpected condition.
+    """Draws which trials of a block are catch trials.
 
-    Because of these trials, participants cannot rely on the condition of the block. If they
-    behave differently in a catch trial, they have adapted to the condition.
+    Catch trials have an unexpected condition, so participants cannot rely on the condition of
+    the block. Different behaviour in a catch trial shows that they have adapted to that
+    condition.
 
     Args:
         protocol: Design of the experiment: conditions, task and participants.
@@ -970,7 +973,7 @@ def _draw_catches(
         block: Index of the block.
 
     Returns:
-        Indices of the catch trials in the block, counted from 0 and including practice trials.
+        Indices of the catch trials in the block, starting at 0 and including practice trials.
     """
     catch = protocol.catch
     if catch is None or catch.condition == condition:

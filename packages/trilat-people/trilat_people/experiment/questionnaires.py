@@ -31,9 +31,9 @@ Name = Annotated[str, Meta(pattern=r"^[a-z][a-z0-9_]{0,39}$")]
 Text = Annotated[str, Meta(max_length=300)]
 
 CHOICE = "choice"
-"""Name of the form after a pair of trials of a staircase, which must be answered."""
+"""Name of the form shown after a pair of staircase trials, which must be answered."""
 Answers = Mapping[str, float | None]
-"""Answers by item. A missing answer is `None`."""
+"""Mapping from item to answer; `None` for a missing answer."""
 
 
 class Questionnaire(Frozen, frozen=True):
@@ -98,7 +98,7 @@ class Questionnaire(Frozen, frozen=True):
         return dict(zip(self.items, values, strict=True))
 
     def _is_valid(self, value: float | None) -> bool:
-        """Returns True if an answer is on the scale, or if it is missing but not required.
+        """Returns True if an answer is on the scale, or is missing but not required.
 
         A scale of 0 to 100 in steps of 5 has the values 0, 5, 10 and so on. A missing answer is
         `None`.
@@ -163,7 +163,7 @@ class Questionnaire(Frozen, frozen=True):
 
 @cache
 def _read_shipped() -> dict[str, Any]:
-    """Returns the questionnaires of this package as TOML tables, by name, such as "tlx"."""
+    """Returns the built-in questionnaires as TOML tables, keyed by name, such as "tlx"."""
     source = resources.files(__package__) / "questionnaires.txt"
     tables: dict[str, Any] = tomllib.loads(source.read_text(encoding="utf-8"))
     return tables

@@ -28,7 +28,7 @@ STANDARD = "standard"
 COMPARISON = "comparison"
 """Phase of a trial with the larger value."""
 SKIPPED_REVERSALS = 2
-"""Number of reversals before the difference is near its final value."""
+"""Number of initial reversals, during which the difference is far from its final value."""
 
 
 class Staircase(Frozen, frozen=True):
@@ -85,16 +85,16 @@ class Staircase(Frozen, frozen=True):
         )
 
     def _list_directions(self, right: Sequence[bool]) -> list[int]:
-        """Returns the direction in which the tested difference changes after each answer.
+        """Returns the direction in which the difference changes after each answer.
 
-        The difference decreases after `down` right answers in a row, and increases after a
+        The difference decreases after `down` consecutive right answers, and increases after a
         wrong answer.
 
         Args:
-            right: For each answer, True if it was right.
+            right: One entry per answer: True if the answer was right.
 
         Returns:
-            For each answer, -1 for down, 1 for up, or 0 for no change.
+            One entry per answer: -1 for a decrease, 1 for an increase, 0 for no change.
         """
         directions: list[int] = []
         right_in_row = 0

@@ -30,20 +30,20 @@ from trilat_net.files import import_extra
 from trilat_net.work import MeanInterval, wilson_interval
 
 Row = Mapping[str, Any]
-"""A trial: its participant, pair and condition, and its measures by name."""
+"""A trial: its participant, pair and condition, and one key per measure."""
 CONFIDENCE = 0.95
 """Confidence level of all intervals."""
 RESAMPLES = 5000
 """Number of resamples of the bootstrap."""
 _ROUNDING = 1e-12
-"""Spread, relative to the largest value, below which values count as equal."""
+"""Spread, relative to the largest value, below which values are considered equal."""
 
 
 def _import_scipy_stats() -> Any:
-    """Imports the module `scipy.stats` when statistics are needed, and returns it.
+    """Imports `scipy.stats` on demand and returns the module.
 
-    The import takes longer than all other imports of an experiment together, and trials do not
-    need this module.
+    The import takes longer than all other imports of an experiment together, and is not needed
+    to run trials.
     """
     # The import takes half a second, and most commands do not need it.
     from scipy import stats
@@ -187,18 +187,15 @@ def summarise_conditions(
 
 
 def _summarise(condition: str, values: list[float], seed: int) -> ConditionMean:
-    """Returns mean, deviation and confidence intervals of one condition.
-
-    A condition is a variant of the experiment, such as a network delay. Its values are one mean
-    per participant.
+    """Computes the mean, deviation and confidence intervals for one condition.
 
     Args:
         condition: Name of the condition.
         values: Mean over trials of each participant or pair, at least one.
-        seed: Seed of the bootstrap, which resamples the participants.
+        seed: Random seed of the bootstrap, which resamples the participants.
 
     Returns:
-        The summary. With a single participant, it has no deviation and no interval.
+        The summary, with no deviation or intervals for a single participant.
     """
     mean = MeanInterval.of_values(values)
     if mean is None:  # a single value
@@ -332,10 +329,10 @@ def compare_conditions(
 def _compare(
     measure: str, first: str, second: str, means: Mapping[str, Mapping[str, float]]
 ) -> Comparison:
-    """Compares two conditions by paired tests over the units that have values for both.
+    """Compares two conditions with paired tests over the units that have values for both.
 
-    A unit is a participant or a pair. A test needs at least two units whose differences are not
-    all equal up to rounding.
+    A unit is a participant or a pair. A test requires at least two units whose differences are
+    not all equal up to rounding.
 
     Args:
         measure: Name of the measure.
@@ -344,7 +341,7 @@ def _compare(
         means: Means over trials by condition and unit.
 
     Returns:
-        The difference second minus first, with its interval and the tests that are possible.
+        The difference second minus first, with its interval and those tests that are possible.
     """
     common_units = [unit for unit in means[first] if unit in means[second]]
     first_means = np.array([means[first][unit] for unit in common_units])
@@ -524,15 +521,15 @@ def fit_mixed_model(rows: Sequence[Row], measure: str) -> MixedModel:
 
 
 def _fit(formulas: Any, frame: Any, measure: str) -> Any:
-    """Fits a mixed model with two optimizers, and returns the fit with the larger likelihood.
+    """Fits a mixed model with two optimizers and returns the fit with the higher likelihood.
 
     Args:
         formulas: The module `statsmodels.formula.api`.
-        frame: Data frame with a row for each mean.
+        frame: Data frame with one row per mean.
         measure: Name of the measure, for the error message.
 
     Raises:
-        UsageError: Neither optimizer gives finite values.
+        UsageError: Neither optimizer returns finite values.
     """
     variance_components = {"participant": "0 + C(participant)"}
     model = formulas.mixedlm(
@@ -562,9 +559,10 @@ def _fit(formulas: Any, frame: Any, measure: str) -> Any:
 
 
 def _find_pairs(rows: Sequence[Row]) -> dict[str, str]:
-    """Returns the pair to which each participant belongs, by the participant's pseudonym.
+    """Returns a mapping from each participant to their pair.
 
-    A mixed model needs participants who are nested in pairs: each belongs to exactly one pair.
+    A mixed model requires participants who are nested in pairs: each belongs to exactly one
+    pair.
 
     Raises:
         UsageError: A participant is in two pairs, or no pair has two participants.
@@ -589,12 +587,12 @@ def _find_pairs(rows: Sequence[Row]) -> dict[str, str]:
 
 
 def _read_effect(fit: Any, condition: str, freedom: int) -> MixedEffect:
-    """Returns the effect of a condition from a fitted mixed model, with its interval and test.
+    """Extracts the effect of a condition from a fitted mixed model, with interval and test.
 
     The effect is the difference from the reference condition.
 
     Args:
-        fit: The fit of statsmodels.
+        fit: Fit returned by statsmodels.
         condition: Name of the condition.
         freedom: Degrees of freedom of the t statistic.
     """
@@ -751,13 +749,11 @@ def simulate_power(
 
 
 def _list_rows(values: Array, means: Mapping[str, float]) -> list[Row]:
-    """Returns simulated measurements as table rows, as a real experiment would have them.
-
-    The rows are analysed to find the power of a statistical test.
+    """Converts simulated measurements to table rows like those of a real experiment.
 
     Args:
         values: Deviations from the means, by participant, condition and trial.
-        means: Expected mean of each condition.
+        means: Mapping from condition to expected mean.
     """
     rows: list[Row] = []
     for index, (condition, mean) in enumerate(means.items()):
@@ -769,15 +765,13 @@ def _list_rows(values: Array, means: Mapping[str, float]) -> list[Row]:
 
 
 def _count_significant(runs: Sequence[Comparison], d_z: float, alpha: float) -> SimulatedPower:
-    """Returns the power: the share of simulated experiments that find a difference.
-
-    The number of participants of a study is planned so that the power is, for example, 80 %.
+    """Estimates the power: the fraction of simulated experiments that find a difference.
 
     Args:
         runs: Comparison of the same two conditions in each simulated experiment.
-        d_z: Size of the simulated effect, the mean difference over its deviation.
-        alpha: Significance level. A difference with a smaller p, or corrected p, counts as
-            found.
+        d_z: Effect size in the simulation: mean difference divided by its standard deviation.
+        alpha: Significance level. A difference counts as found if its p (or corrected p) is
+            smaller.
     """
     significant_count = sum(run.p is not None and run.p < alpha for run in runs)
     significant_count_holm = sum(run.p_holm is not None and run.p_holm < alpha for run in runs)

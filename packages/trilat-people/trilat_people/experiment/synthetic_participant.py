@@ -30,11 +30,11 @@ from .tasks import TrialGoal, place_slave
 Share = Annotated[float, Meta(ge=0.0, le=1.0)]
 
 MOVED_SHARE = 0.02
-"""The slave counts as moving if it moves by more than this share of the target's width."""
+"""Fraction of the target width by which the slave must move to count as moving."""
 OFF_TARGET_SHARE = 0.35
-"""A correction is made if the slave is off by more than this share of the target's width."""
+"""Fraction of the target width by which the slave must be off to be corrected."""
 DELAY_MARGIN = 0.7
-"""Largest product of the rate at which a target is followed and the delay of the loop."""
+"""Maximum product of the target following rate and the loop delay."""
 
 
 class ParticipantModel(Frozen, frozen=True):
@@ -176,17 +176,17 @@ class SyntheticParticipant:
     def _see_slave(self, now: HandView, slave: PeerView) -> Array:
         """Observes the slave arm, and stores its position and the time of its last motion.
 
-        A step of the slave counts as a motion if it is longer than the share `MOVED_SHARE` of
-        the diameter of the target. Before the first observation, the participant's own hand
-        rests at its present position.
+        A step of the slave counts as motion if it is longer than the fraction `MOVED_SHARE` of
+        the target diameter. On the first observation, the participant's hand is initialised at
+        rest at its current position.
 
         Args:
-            now: The participant's view and felt force at its site, with the pose of the hand.
+            now: What the participant sees and feels at its site, including the pose of the
+                hand.
             slave: The participant's view of the slave arm, delayed by the network.
 
         Returns:
-            The position of the slave's end effector in m, shape (axes,), with two or three
-            axes.
+            Position of the slave's end effector, in m, shape (axes,), with two or three axes.
         """
         position_m = place_slave(self._arm, slave.q)
         slave_m = position_m[: self._axes]
@@ -206,15 +206,15 @@ class SyntheticParticipant:
     def _find_next_start_s(self, slave: PeerView) -> float:
         """Returns the earliest time at which the participant starts the next movement, in s.
 
-        The hand and the slave must have come to rest. Then the participant reacts. If the
-        movement corrects an earlier movement, the participant also waits until the delayed view
-        shows the end of the slave's motion.
+        The participant reacts after the hand and the slave have come to rest. For a correction
+        of an earlier movement, the participant also waits until the delayed view shows the end
+        of the slave's motion.
 
         Args:
-            slave: The participant's view of the slave arm, with the age of this view.
+            slave: The participant's view of the slave arm, including its age.
 
         Returns:
-            The time since the start of the trial.
+            Time since the start of the trial.
         """
         hand_rests_from_s = self._begins_s + self._duration_s  # -infinity before any movement
         slave_moved_last_s = self._moved_s
@@ -228,20 +228,19 @@ class SyntheticParticipant:
         return max(rest_s, 0.0) + wait_s  # a rest starts at the beginning of the trial
 
     def _find_press_step(self, slave: PeerView, t_s: float) -> Array:
-        """Decides how far the hand moves to press the slave arm against a wall.
+        """Determines how far the hand moves to press the slave arm against a wall.
 
         The step points from the slave's start position to the target in the wall. Its length is
-        proportional to the share of the required force that is still missing: it would be the
-        width of the target without any force, and is 0 with the required force. If the force is
-        too large, the hand moves back.
+        proportional to the missing fraction of the required force: the target width at zero
+        force, and 0 at the required force. If the force is too large, the hand moves back.
 
         Args:
             slave: The participant's view of the slave arm.
-            t_s: Present time in the trial, in s.
+            t_s: Current time in the trial, in s.
 
         Returns:
-            The step of the hand in m, shape (axes,). It is 0 if there is no force, because the
-            slave has not reached the wall yet.
+            Step of the hand, in m, shape (axes,). 0 if there is no force, since the slave has
+            not reached the wall yet.
         """
         goal = self._goal
         force_n = self._find_force_n(slave.q, slave.tau_x)
@@ -257,14 +256,14 @@ class SyntheticParticipant:
         return full_step_m * missing_share
 
     def _start_movement(self, t_s: float, step_m: Array) -> None:
-        """Starts a movement of minimum jerk to the target, as a person would.
+        """Starts a minimum-jerk movement to the target, as a person would.
 
-        The end point of the movement scatters in proportion to the length of the step. The
-        duration depends on Fitts' law and on the practice so far.
+        The end point scatters in proportion to the length of the step. The duration depends on
+        Fitts' law and on practice so far.
 
         Args:
-            t_s: Present time, in s.
-            step_m: The intended step of the slave, in m.
+            t_s: Current time, in s.
+            step_m: Intended step of the slave, in m.
         """
         model = self._model
         length_m = float(np.linalg.norm(step_m))
@@ -288,10 +287,10 @@ class SyntheticParticipant:
         self._duration_s = slowness * practised_duration_s
 
     def _interpolate_movement(self, t_s: float) -> Array:
-        """Returns the position of the present movement of minimum jerk, in m.
+        """Returns the position along the current minimum-jerk movement, in m.
 
-        With s from 0 to 1 over the movement, the position is
-        start + (end - start) (10 s^3 - 15 s^4 + 6 s^5).
+        With s from 0 to 1 over the movement, the position is start + (end - start) (10 s^3 - 15
+        s^4 + 6 s^5).
         """
         s = 1.0  # before the first movement, start and end are equal
         if self._duration_s:
@@ -305,25 +304,25 @@ class SyntheticParticipant:
     def _follow(self, now: HandView, error_m: Array, age_s: float) -> Array:
         """Moves the hand so that the slave follows a moving target, despite the delay.
 
-        This is the crossover model of a person (McRuer and Jex): the hand moves with a velocity
-        that is proportional to the error,
+        Implements the crossover model of a person (McRuer and Jex): the velocity of the hand is
+        proportional to the error,
 
             velocity = rate * error.
 
         The rate is `crossover_rad_s`, but at most `DELAY_MARGIN` / (reaction time + 2 age of
-        the slave's sample), since a person corrects more slowly over a delay. In one call, the
-        hand corrects the share rate * (time since the last call) of the error, but at most the
-        whole error. The perceived error has noise in proportion to its size.
+        the slave's sample), since a person corrects more slowly under delay. In each call, the
+        hand corrects the fraction rate * (time since the last call) of the error, up to the
+        entire error. The perceived error has noise in proportion to its size.
 
         The time of the call and the position of the hand are stored for the next call.
 
         Args:
-            now: The participant's view and felt force at its site, with the present time.
+            now: What the participant sees and feels at its site, including the current time.
             error_m: Vector from the slave to the target, in m, shape (axes,).
             age_s: Age of the slave's sample, in s.
 
         Returns:
-            The target position of the hand, in m, shape (axes,).
+            Target position of the hand, in m, shape (axes,).
         """
         model = self._model
         # The age is the delay of one direction; a correction is seen after both directions.

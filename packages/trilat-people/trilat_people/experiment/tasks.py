@@ -29,15 +29,15 @@ Seconds = Annotated[float, Meta(gt=0.0, le=600.0)]
 
 
 class _TrialTask(Frozen, frozen=True, tag_field="kind"):
-    """A task for the participants, as a protocol defines it: reach, press or follow.
+    """A task for the participants, as defined in a protocol: reach, press or follow.
 
     The task is the same for all trials. `make_goal` creates the goal of a single trial.
 
     Attributes:
-        description: The task in a phrase, for texts and plans.
-        instructions: Template of the text for participants.
+        description: Short phrase for the task, used in reports and plans.
+        instructions: Template of the instructions for participants.
         learning_measure: Name of the measure that decreases with practice.
-        needs_wall: True if the task is judged by the force on the slave, which needs a wall.
+        needs_wall: True if the task is judged by the force on the slave, which requires a wall.
     """
 
     description: ClassVar[str] = ""
@@ -202,22 +202,22 @@ class TrialGoal:
         return {}
 
     def _find_target_m(self, after_s: float, user: int | None) -> Array:
-        """Returns the target position after the target has appeared. Each task implements it.
+        """Returns the target position after the target has appeared. Implemented by each task.
 
         Args:
-            after_s: Time since the target's appearance, in s.
-            user: Index of the user, or `None`, see `find_target_m`.
+            after_s: Time since the appearance of the target, in s.
+            user: Index of the user, or `None` (see `find_target_m`).
 
         Returns:
-            The position, shape (2,) or (3,), in m.
+            The position, in m, shape (2,) or (3,).
         """
         raise NotImplementedError
 
     def _judge(self, t_s: float, position_m: Array, force_n: float) -> "Outcome | None":
         """Decides in each control period whether the trial succeeds, fails or continues.
 
-        Each task implements this method, which is called after the target has appeared. For the
-        arguments and the result see `judge`.
+        Implemented by each task, and called after the target has appeared. See `judge` for the
+        arguments and the result.
         """
         raise NotImplementedError
 
@@ -330,8 +330,8 @@ class ReachTrial(_TrialTask, frozen=True, tag="reach"):
 
         Args:
             start_m: Centre of the ring, in m.
-            number: Number of the target, from 0. Numbers beyond the last target start again
-                with the first target.
+            number: Index of the target, starting at 0. Indices beyond the last target wrap
+                around to the first.
         """
         # Targets with even numbers advance around the ring. Those with odd numbers are half a
         # ring further.
@@ -351,8 +351,8 @@ class ReachTrial(_TrialTask, frozen=True, tag="reach"):
 class _DwellGoal(TrialGoal):
     """A goal that is reached once a condition has held for some time without interruption.
 
-    A user who only passes through the target has not reached it. Subclasses define the
-    condition by `_is_inside`, for example that the end effector is in the target.
+    Merely passing through the target is not enough. Subclasses define the condition in
+    `_is_inside`, for example that the end effector is in the target.
     """
 
     def __init__(self, task: "ReachTrial | ContactTrial", start_m: Array) -> None:
@@ -363,20 +363,20 @@ class _DwellGoal(TrialGoal):
         self._inside_since_s = math.inf
 
     def _is_inside(self, after_s: float, position_m: Array, force_n: float) -> bool:
-        """Returns True if the condition that must hold for some time holds now.
+        """Returns True if the condition that must be held is currently satisfied.
 
         Args:
-            after_s: Time since the target's appearance, in s.
+            after_s: Time since the appearance of the target, in s.
             position_m: Position of the slave's end effector, in m.
             force_n: Magnitude of the force on the end effector, in N.
         """
         raise NotImplementedError
 
     def _judge(self, t_s: float, position_m: Array, force_n: float) -> Outcome | None:
-        """Ends the trial with success after the dwell time, or as failed after the time limit.
+        """Ends the trial as succeeded after the dwell time, or as failed after the time limit.
 
-        The dwell time is the time for which the end effector must stay in the target. It starts
-        again whenever the end effector leaves the target.
+        The dwell time is how long the condition must be held without interruption. It restarts
+        whenever the condition is violated, for example when the end effector leaves the target.
         """
         after_s = t_s - self.appears_s
         if self._is_inside(after_s, position_m, force_n):
@@ -395,9 +395,9 @@ class _DwellGoal(TrialGoal):
 
 
 class _ReachGoal(_DwellGoal):
-    """Goal of a trial of `ReachTrial`: to bring the end effector to a target and stay there.
+    """Goal of a `ReachTrial`: to bring the end effector to a target and stay there.
 
-    With a handover, there is a second target for the user who receives the slave. Without a
+    In a handover, there is a second target for the user who receives the slave. If there is no
     handover, `_handover_s` and `_second_appears_s` are -1.
     """
 
@@ -454,14 +454,13 @@ class _ReachGoal(_DwellGoal):
         return start_m, self._corridor_m
 
     def _find_segment(self, after_s: float) -> Sequence[Array]:
-        """Returns the start and the end of the present movement, in m.
+        """Returns the start and end of the current movement, in m.
 
-        Usually this is the movement from the start to the target. After a handover between two
-        users, a second target follows, and the movement goes from the first to the second
-        target.
+        Usually, the movement goes from the start position to the target. After a handover
+        between two users, it goes from the first to the second target.
 
         Args:
-            after_s: Time since the first target's appearance, in s.
+            after_s: Time since the appearance of the first target, in s.
         """
         has_second_appeared = 0.0 <= self._second_appears_s <= after_s
         if has_second_appeared:
@@ -469,15 +468,15 @@ class _ReachGoal(_DwellGoal):
         return self._waypoints_m[:2]
 
     def _find_target_m(self, after_s: float, user: int | None) -> Array:  # noqa: ARG002 - all users see the same
-        """Returns the end of the present movement, which is the same for all users, in m."""
+        """Returns the end of the current movement, which is the same for all users, in m."""
         _, end_m = self._find_segment(after_s)
         return end_m
 
     def _is_inside(self, after_s: float, position_m: Array, force_n: float) -> bool:  # noqa: ARG002 - no force
         """Returns True if the end effector is in the target at which the trial can succeed.
 
-        In a task with a handover, this is the second target: until it has appeared, the result
-        is False even in the first target.
+        In a handover, this is the second target: until it has appeared, the result is False
+        even in the first target.
         """
         target_m = self._find_target_m(after_s, None)
         error_m = float(np.linalg.norm(position_m - target_m))
@@ -488,7 +487,7 @@ class _ReachGoal(_DwellGoal):
     def _judge(self, t_s: float, position_m: Array, force_n: float) -> Outcome | None:
         """Ends the trial as failed if the end effector has left the corridor to the target.
 
-        Otherwise, and in a task without a corridor, the rule of `_DwellGoal` decides: the end
+        Otherwise, and in tasks with no corridor, the rule of `_DwellGoal` applies: the end
         effector must stay in the target for some time.
         """
         if self._corridor_m is not None:
@@ -556,9 +555,9 @@ class ContactTrial(_TrialTask, frozen=True, tag="contact"):
 
 
 class _ContactGoal(_DwellGoal):
-    """Decides when a trial has succeeded whose task is to press a wall with a given force.
+    """Goal of a `ContactTrial`: to press against a wall with a given force.
 
-    Only the force is judged, not the position. See `ContactTrial`.
+    Only the force is judged, not the position.
     """
 
     def __init__(self, task: ContactTrial, start_m: Array) -> None:
@@ -597,7 +596,7 @@ class _ContactGoal(_DwellGoal):
         }
 
     def _is_inside(self, after_s: float, position_m: Array, force_n: float) -> bool:  # noqa: ARG002 - only the force counts
-        """Returns True if the force differs from the required one by at most the tolerance."""
+        """Returns True if the force is within the tolerance of the required force."""
         error_n = abs(force_n - self.force_n)
         return error_n <= self._tolerance_n
 
@@ -663,7 +662,7 @@ class TrackTrial(_TrialTask, frozen=True, tag="track"):
 
 
 class _TrackGoal(TrialGoal):
-    """Goal of a trial of `TrackTrial`: to follow a moving target until the time is over."""
+    """Goal of a `TrackTrial`: to follow a moving target until the time is up."""
 
     is_moving = True
 
@@ -709,9 +708,10 @@ class _TrackGoal(TrialGoal):
         """Returns the target on its moving path, in m.
 
         Args:
-            after_s: Time since the target's appearance, in s.
-            user: Index of a user, whose target is half of `apart_m` away from the path: the
-                first user's on the positive side. If `None`, the path itself is returned.
+            after_s: Time since the appearance of the target, in s.
+            user: Index of a user. The user's target is offset from the path by half of
+                `apart_m`, in the positive direction for the first user. If `None`, the path
+                itself is returned.
         """
         task = self._task
         rates_rad_s = 2.0 * math.pi * np.array(task.frequencies_hz)
@@ -732,7 +732,7 @@ class _TrackGoal(TrialGoal):
         return target_m
 
     def _judge(self, t_s: float, position_m: Array, force_n: float) -> Outcome | None:  # noqa: ARG002 - by its time
-        """Ends the trial as completed when its duration is over. It cannot fail."""
+        """Ends the trial as succeeded when its duration is over. It cannot fail."""
         ends_s = self.appears_s + self._task.duration_s
         if t_s >= ends_s:
             return Outcome(True, t_s)

@@ -41,13 +41,13 @@ from .synthetic_participant import ParticipantModel, SyntheticParticipant
 from .tasks import Outcome, TrialGoal
 
 RECORD_STEP = 5
-"""Number of the slave's records per record that is measured."""
+"""Measures use every n-th record of the slave, where n is this number."""
 HAND_HZ = 50
-"""Rate at which a synthetic participant acts, in 1/s."""
+"""Rate at which a synthetic participant acts, in Hz."""
 HAND_DELAY_S = 0.02
-"""Time from the decision of a synthetic participant to the effect on the arm, in s."""
+"""Time from a synthetic participant's decision until it affects the arm, in s."""
 REST_S = 0.1
-"""Time for which the log of a trial continues after the trial's end, in s."""
+"""Time for which the log continues after the end of the trial, in s."""
 
 
 class TrialEntry(msgspec.Struct, frozen=True):
@@ -112,16 +112,16 @@ class TrialJudge:
 
 
 class _MotionSamples(NamedTuple):
-    """Motion of the slave's end effector in a trial, from which its measures are computed.
+    """Motion of the slave's end effector during a trial, used to compute measures.
 
-    There are K samples at a constant rate.
+    Contains K samples at a constant rate.
 
     Attributes:
         indices: Indices of the records, shape (K,).
-        t_s: Times of the records, shape (K,), in s.
-        positions_m: Positions, shape (K, 2) or (K, 3), in m.
-        velocities_m_s: Velocities, of the same shape, in m/s.
-        rate_hz: Rate of the samples, in 1/s.
+        t_s: Times of the records, in s, shape (K,).
+        positions_m: Positions, in m, shape (K, 2) or (K, 3).
+        velocities_m_s: Velocities, in m/s, same shape as the positions.
+        rate_hz: Sample rate, in Hz.
     """
 
     indices: Ints
@@ -201,11 +201,10 @@ class ExperimentTrial:
         self._rows = build_arm_rows(self.scenario, self.slave)
 
     def _set_authority(self, scenario: Scenario) -> Scenario:
-        """Returns the scenario with the users' authority over the slave arm in this trial.
+        """Sets the users' dominance factors over the slave arm for this trial.
 
-        The slave follows the users' arms with weights, the dominance factors. The protocol
-        determines how two users share the sum of their factors. A handover exchanges their
-        shares during the trial.
+        The protocol determines how two users share the sum of their dominance factors. In a
+        handover, their shares are exchanged during the trial.
         """
         goal = self.make_goal()
         if goal.lead is None:
@@ -260,13 +259,13 @@ class ExperimentTrial:
         return float(forces_n[0])
 
     def _find_forces_n(self, q: Array, tau_x: Array) -> Array:
-        """Returns the magnitude of the external force on the slave's end effector, in N.
+        """Computes the magnitude of the external force on the slave's end effector, in N.
 
-        An example is the force with which the arm touches a wall.
+        An example is the force of contact with a wall.
 
         Args:
-            q: Joint positions in K records, shape (K, n), in rad or m.
-            tau_x: Minus the external torques on the joints, same shape, in N m or N.
+            q: Joint positions in K records, in rad or m, shape (K, n).
+            tau_x: Minus the external torques ON the joints, in N m or N, same shape as `q`.
 
         Returns:
             The magnitudes, shape (K,).
@@ -321,13 +320,13 @@ class ExperimentTrial:
         )
 
     def _judge_log(self, log: Log) -> Outcome | None:
-        """Decides from the recorded log when a trial succeeded or failed.
+        """Determines from the recorded log when the trial succeeded or failed.
 
-        The trial is judged record by record, as a trial in progress is judged. A trial in which
-        an arm left its limits has failed at that time.
+        The trial is judged record by record, in the same way as while it runs. If an arm
+        exceeded its limits, the trial failed at that time.
 
         Returns:
-            The outcome. `None` if the log ends before the trial does.
+            The outcome, or `None` if the log ends before the trial does.
         """
         judge = TrialJudge(self)
         records = log[self.slave]
@@ -344,10 +343,10 @@ class ExperimentTrial:
         return None
 
     def _measure(self, log: Log, outcome: Outcome) -> dict[str, float]:
-        """Computes the measures of a trial, with units in the names.
+        """Computes the measures of a trial, whose names include the unit.
 
-        The measures cover the slave's motion, the forces and the work of each user, and the
-        mean age of the first user's samples (sent states) at the slave.
+        Covers the motion of the slave, the forces and work of each user, and the mean age of
+        the first user's samples at the slave.
         """
         measures = self._measure_motion(log, outcome.ended_s)
         aligned = AlignedRecords.by_site(log)
@@ -387,9 +386,9 @@ class ExperimentTrial:
     def _sample_motion(
         self, records: SiteLog | AlignedRecords, start_s: float, end_s: float
     ) -> _MotionSamples:
-        """Returns the motion of the slave's end effector between two times, for its measures.
+        """Returns the motion of the slave's end effector between two times.
 
-        Only every `RECORD_STEP`-th record is used. Velocities are computed from differences
+        Uses only every `RECORD_STEP`-th record. Velocities are computed from differences
         between positions.
 
         Args:
@@ -418,7 +417,7 @@ class ExperimentTrial:
     def _measure_pair(
         self, aligned: Mapping[str, AlignedRecords], forces: Sequence[Array], ended_s: float
     ) -> dict[str, float]:
-        """Computes the cooperation measures of two users, such as the force that cancels out.
+        """Computes cooperation measures of two users, such as the force that cancels out.
 
         The forces are treated as if each user pushed the slave's end effector.
 
@@ -446,14 +445,15 @@ class ExperimentTrial:
     def _measure_motion(self, log: Log, ended_s: float) -> dict[str, float]:
         """Computes the measures of the slave's motion after the target has appeared.
 
-        Examples: "completion_s", "path_m", "error_end_mm". The task adds its own measures.
+        Examples are "completion_s", "path_m" and "error_end_mm". The task adds its own
+        measures.
 
         Args:
             log: Log of the trial.
             ended_s: End of the trial, in s.
 
         Returns:
-            The measures by name, with the unit at the end of the name.
+            Mapping from the name of each measure, which ends in the unit, to its value.
         """
         goal = self.make_goal()
         records = log[self.slave]
@@ -516,9 +516,9 @@ class SyntheticTrial(ExperimentTrial):
     people = False
 
     def _make_players(self, scenario: Scenario) -> dict[str, HandPlayer]:
-        """Creates models of the participants of a trial, by the sites whose arms they move.
+        """Creates a model of a participant for each site whose arm is held.
 
-        Each call creates new models, because a model keeps a state during a trial.
+        Each call creates new models, since a model keeps state during a trial.
 
         Args:
             scenario: Scenario of the trial.
@@ -551,10 +551,10 @@ class SyntheticTrial(ExperimentTrial):
         return players
 
     def _draw_model(self, participant: str) -> ParticipantModel:
-        """Returns the model of a participant: reaction time, speed, noise, and so on.
+        """Draws the model of a participant: reaction time, speed, noise, and so on.
 
-        The parameters are drawn with the protocol's seed and the pseudonym, so that a
-        participant has the same parameters in all trials.
+        The parameters depend on the seed of the protocol and the pseudonym, so a participant
+        has the same parameters in all trials.
 
         Args:
             participant: Pseudonym of the participant.

@@ -36,22 +36,22 @@ from .experiment_stage import Stage, TrialWatch
 from .page_server import PageOptions, PageServer
 
 ATTEMPTS = "tries"
-"""Name of the folder of the attempts at trials, in the folder of the experiment."""
+"""Name of the folder of trial attempts, inside the folder of the experiment."""
 POLL_NS = 20_000_000
 """Time between two checks for the replies of participants, in ns."""
 FAREWELL_NS = NS_PER_S
-"""Time between the last step and the end of the server, in ns.
+"""Time between the last step and the shutdown of the server, in ns.
 
-During this time, every page is told that the experiment has ended.
+During this time, every page is notified that the experiment has ended.
 """
 EARLY_FAILURE_NS = 60 * NS_PER_S
-"""A session that fails within this time, before it begins, would fail again. In ns."""
+"""Time within which a session that fails before starting would fail again, in ns."""
 
 SessionRunner = Callable[[TrialWatch, Path, Callable[[], bool]], SessionResult]
 """Function that runs the session of a trial until the trial is over or people end it.
 
-Its arguments are the watch of the trial, the folder of the attempt, and a function that returns
-True once the session may begin.
+Takes the watch of the trial, the folder of the attempt, and a function that returns True once
+the session may start.
 """
 
 
@@ -108,20 +108,20 @@ class ExperimentSessions:
         return True
 
     def _request_step(self, step: Step, rest_s: float = 0.0) -> bool:
-        """Waits until every user has completed a step, and records consents and answers.
+        """Waits until every user has completed a step, and records their consents and answers.
 
-        A step is a consent, a questionnaire, or the readiness for a trial. The users complete
-        it on their web pages, which the stage controls. A note is an entry of the experiment's
-        journal, which survives a restart of this program. It records the consent or the answers
-        of one user.
+        A step is a consent, a questionnaire, or confirming readiness for a trial. The users
+        complete it on their web pages, which are controlled by the stage. The consent or the
+        answers of each user are stored as a note in the journal of the experiment, which
+        survives a restart of this program.
 
         Args:
             step: The step.
             rest_s: Rest before the step, in s.
 
         Returns:
-            True if every user has completed the step. False if the experiment was ended
-            earlier.
+            True if every user has completed the step, False if the experiment was interrupted
+            first.
         """
         pseudonyms = dict(zip(self.stage.users, step.planned.group, strict=True))  # by site
         note_keys = {site: f"{step.key} {who}" for site, who in pseudonyms.items()}
@@ -170,11 +170,11 @@ class ExperimentSessions:
 
         Args:
             cell: Key of the note.
-            kind: Kind of the note, such as "consent" or "aborted".
+            kind: Kind of note, such as "consent" or "aborted".
             who: Pseudonym of the participant, or of all participants of the trial.
             number: Number of the trial.
             text: Name of the questionnaire, or a reason.
-            answers: Answers to a questionnaire. A missing answer is `None`.
+            answers: Answers to a questionnaire; `None` for a missing answer.
         """
         unix_s = round(self.clock.unix_ns() / NS_PER_S, 3)
         note = Note(
@@ -191,15 +191,15 @@ class ExperimentSessions:
     def _run_trial(self, step: Step) -> bool:
         """Runs attempts at a trial until one is valid.
 
-        An attempt is one session of the trial, with a folder of its own. If an earlier run of
-        this program was ended during the trial, it may have left a finished log, which is
-        counted now, or an unfinished attempt, which is recorded as aborted.
+        An attempt is one session of the trial, with its own folder. If this program was
+        previously terminated during the trial, it may have left behind a finished log, which is
+        now counted, or an unfinished attempt, which is recorded as aborted.
 
         Args:
             step: The step of the trial.
 
         Returns:
-            True if an attempt counts. False if the experiment was ended earlier.
+            True if an attempt counts, False if the experiment was interrupted first.
         """
         plan = self.experiment.plan
         planned = step.planned
@@ -232,10 +232,10 @@ class ExperimentSessions:
             rest_s = 0.0  # the users have rested before the first attempt
 
     def _list_attempts(self, planned: PlannedTrial) -> list[Path]:
-        """Returns the folders of all attempts at a trial, the oldest first.
+        """Returns the folders of all attempts at a trial, oldest first.
 
-        A trial is attempted again if its session was aborted or its log is not valid. The name
-        of a folder begins with the number of the trial.
+        A trial is attempted again if its session was aborted or its log is not valid. Folder
+        names begin with the number of the trial.
         """
         attempts = self.experiment.folder / ATTEMPTS
         return sorted(attempts.glob(f"{planned.number:05d}-*"))
@@ -243,8 +243,8 @@ class ExperimentSessions:
     def _record_aborted(self, planned: PlannedTrial, reason: str) -> None:
         """Records in the journal why the newest attempt at a trial does not count.
 
-        The trial is then repeated. If the reason for this attempt is already recorded, nothing
-        changes.
+        The trial is then repeated. Does nothing if a reason for this attempt has already been
+        recorded.
 
         Args:
             planned: The trial.
@@ -276,8 +276,8 @@ class ExperimentSessions:
             True if the trial counts.
 
         Raises:
-            LogRefused: The log could not be written to the disk.
-            RunFailed: The session failed before it began, and would fail again.
+            LogRefused: The log could not be written to disk.
+            RunFailed: The session failed before it started, and would fail again.
         """
         number = len(self._list_attempts(step.planned)) + 1
         begun_ns = self.clock.monotonic_ns()
@@ -327,10 +327,10 @@ class ExperimentSessions:
         return not reason
 
     def _count_trial(self, trial: ExperimentTrial, path: Path) -> str:
-        """Judges a trial by its log, and writes the result to the journal of the experiment.
+        """Judges a trial by its log and adds the result to the journal of the experiment.
 
-        A log that cannot be judged is moved back to the folder of its attempt, so that the
-        trial is repeated.
+        A log that cannot be judged is moved back to the folder of its attempt, and the trial is
+        repeated.
 
         Args:
             trial: The trial.
@@ -365,9 +365,9 @@ class ExperimentSessions:
 
 
 def _find_repeat_reason(watch: TrialWatch, result: SessionResult) -> str:
-    """Returns the reason why a trial must be repeated, or an empty text if it counts.
+    """Returns the reason why a trial must be repeated, or an empty string.
 
-    A trial in which an arm has left its limits is not repeated: it counts as failed.
+    A trial in which an arm exceeded its limits is not repeated but counts as failed.
     """
     if result.interrupted:
         return "the experiment was interrupted"
@@ -465,11 +465,11 @@ def _show_session(
     endpoints: Sequence[str],
     _say: Callable[[str], None],
 ) -> Iterator[Callable[[], bool]]:
-    """Shows the session of a trial on the pages of the experiment while it runs.
+    """Context manager that shows the session of a trial on the pages of the experiment.
 
-    The function has the signature of a `SessionAttendant`, and is a context manager. After the
-    session, the pages observe the experiment's own network connection, on which no messages are
-    sent, so that the connection to the session can be closed.
+    Has the signature of a `SessionAttendant`. After the session, the pages observe the
+    experiment's own network connection, which carries no messages, so the connection to the
+    session can be closed.
 
     Args:
         page: Server of the pages.

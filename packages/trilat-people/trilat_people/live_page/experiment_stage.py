@@ -31,11 +31,11 @@ from .page_orders import AbortTrial, StageMessage
 from .session_view import SessionView
 
 MAX_ABSENCE_NS = 8 * NS_PER_S
-"""Absence of a user's page after which a trial is aborted, in ns; a reload takes less time."""
+"""Absence of a user's page after which a trial is aborted, in ns. Reloading is faster."""
 END_DELAY_NS = NS_PER_S // 2
 """Time between the end of a trial and the end of its session, in ns.
 
-In this time the mark of the trial's end reaches the log.
+During this time, the mark of the trial's end reaches the log.
 """
 
 Json = dict[str, Any]
@@ -110,16 +110,16 @@ class TrialWatch:
         return self._judge_records(view)
 
     def _judge_records(self, view: SessionView) -> list[str]:
-        """Judges the slave's new records in order, up to the outcome of the trial.
+        """Judges the new records of the slave in order, up to the outcome of the trial.
 
-        A record is judged only when no earlier record can still arrive. The evaluation of the
-        log then gives the same outcome. Records that are permanently lost are skipped.
+        A record is judged only once no earlier record can still arrive, so that the evaluation
+        of the log gives the same outcome. Records that are permanently lost are skipped.
 
         Args:
             view: State of the session.
 
         Returns:
-            Texts that mark this moment in the log, such as "trial 3 begins".
+            Messages that mark this moment in the log, such as "trial 3 begins".
         """
         slave = view.sites[self.trial.slave]
         number = self.trial.planned.number
@@ -189,14 +189,14 @@ class TrialWatch:
 
 @dataclass
 class _StepRequest:
-    """A step that the users are asked to complete now, such as a questionnaire.
+    """A step that the users are currently asked to complete, such as a questionnaire.
 
     Attributes:
         step: The step.
         from_ns: Earliest time at which replies are accepted, in ns on the monotonic clock. The
             users rest until then.
-        replies: For each user who has completed the step, by name of the site, the answers and
-            the number of the page that sent them.
+        replies: Mapping from the site of each user who has completed the step to the answers
+            and the number of the page that sent them.
     """
 
     step: Step
@@ -376,13 +376,13 @@ class Stage:
         return True
 
     def _abort_trial(self, site: str, why: str) -> bool:
-        """Aborts the running trial, which is repeated later. Returns False if no trial runs.
+        """Aborts the running trial, to be repeated later. Returns False if no trial is running.
 
-        An example is an experimenter who sees that a participant has misunderstood the task.
+        For example, the experimenter may notice that a participant has misunderstood the task.
 
         Args:
-            site: Site of the user who aborts it. Empty for the experimenter.
-            why: The reason, for the journal; it may be empty.
+            site: Site of the user who aborts the trial. Empty for the experimenter.
+            why: Reason, for the journal. May be empty.
         """
         watch = self._watch
         if watch is None or watch.over:
@@ -448,16 +448,16 @@ class Stage:
         return fields
 
     def _describe_users(self, step: Step, done_sites: Collection[str]) -> list[Json]:
-        """Describes the users for all pages: pseudonym, and whether they are present or done.
+        """Describes the users for all pages: pseudonym, and whether present or done.
 
-        The description tells the experimenter for whom the experiment waits.
+        Shows the experimenter which users the experiment is waiting for.
 
         Args:
             step: The step that the users have to complete.
             done_sites: Sites of the users who have completed the step.
 
         Returns:
-            An entry per user, whose "state" is "done", "here" or empty.
+            One entry per user, whose "state" is "done", "here" or empty.
         """
         users: list[Json] = []
         for site, pseudonym in zip(self.users, step.planned.group, strict=True):
@@ -468,12 +468,12 @@ class Stage:
         return users
 
     def _describe_for_experimenter(self, step: Step) -> Json:
-        """Returns facts of the present step that only experimenters see, such as the condition.
+        """Returns what only experimenters see of the current step, such as the condition.
 
         Participants who knew the condition might expect an effect.
 
         Args:
-            step: The present step.
+            step: The current step.
         """
         planned = step.planned
         condition = planned.condition
@@ -488,13 +488,13 @@ class Stage:
         }
 
     def _describe_for_user(self, step: Step, site: str, page: int) -> Json:
-        """Returns the content that only a participant's page shows, such as a questionnaire.
+        """Returns the content shown only on a participant's page, such as a questionnaire.
 
         Args:
-            step: The present step.
+            step: The current step.
             site: Site of the participant's arm.
-            page: Number of the page. If a site has several pages, only the first counts, and
-                the field "second" is true for the others.
+            page: Number of the page. If a site has several pages, only the first one counts,
+                and the field "second" is true for the others.
         """
         pseudonyms = dict(zip(self.users, step.planned.group, strict=True))
         fields: Json = {

@@ -23,9 +23,9 @@ from websockets.asyncio.server import ServerConnection
 from .page_orders import Role
 
 MAX_STRANGERS = 64
-"""Largest number of open connections without a role."""
+"""Maximum number of open connections with no role."""
 MAX_PAGES = {"experimenter": 4, "user": 2, "watcher": 12}
-"""Largest number of open pages of a role; for users, at each site."""
+"""Maximum number of open pages per role (for users, per site)."""
 
 
 class Strangers:
@@ -69,13 +69,13 @@ class Strangers:
 
 
 class _SeatedPage(Protocol):
-    """Describes the fields of an open web page that are needed to limit the number of pages.
+    """Interface of an open web page, as needed to limit the number of pages.
 
-    The class `page_server._Page` has these fields.
+    Implemented by `page_server._Page`.
 
     Attributes:
         role: Role of the person at the page: experimenter, user of one arm, or watcher.
-        number: Number of the page. A page that was opened later has a larger number.
+        number: Number of the page, which is higher for pages opened later.
         takes_part: True if the person may move arms and change settings of the session.
     """
 
@@ -115,9 +115,9 @@ def choose_page_to_close(pages: Iterable[Page], role: Role) -> Page | None:
 
 
 def _list_pages_of_role(pages: Iterable[Page], role: Role) -> list[Page]:
-    """Lists the open web pages that a new page of a role may have to replace.
+    """Lists the open pages that a new page of a role may have to replace.
 
-    Only a limited number of pages per role may be open.
+    The number of open pages per role is limited.
 
     Args:
         pages: The open pages.

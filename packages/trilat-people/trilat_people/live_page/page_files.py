@@ -25,20 +25,20 @@ _KINDS = {
     "svg": "image/svg+xml",
     "LICENSE": "text/plain; charset=utf-8",
 }
-"""Media types of files, by the end of their names."""
+"""Mapping from file suffix to media type."""
 _REPORT_POLICY = (
     "sandbox allow-scripts allow-downloads allow-popups; default-src 'none'; "
     "script-src 'unsafe-inline'; style-src 'unsafe-inline'; img-src data: blob:"
 )
-"""Content security policy of a report and a log."""
+"""Content security policy for reports and logs."""
 MAX_FILE_BYTES = 256 << 20
-"""Largest size of a log that is sent to a page. Users open a larger log in its folder."""
+"""Maximum size of a log sent to a page. Users open larger logs from their folder."""
 _POLICY = (
     "default-src 'none'; script-src 'self'; style-src 'self' 'unsafe-inline'; "
     "img-src 'self' data: blob:; connect-src 'self'; base-uri 'none'; "
     "form-action 'none'; frame-ancestors 'none'"
 )
-"""Content security policy of the page's own files."""
+"""Content security policy for the page's own files."""
 
 
 class PageFiles:
@@ -94,12 +94,12 @@ class PageFiles:
 
 
 def _list_assets() -> dict[str, tuple[str, bytes]]:
-    """Returns the page's own files by their addresses, such as "/main.js".
+    """Returns a mapping from address, such as "/main.js", to each of the page's own files.
 
-    They come from this package and from the package of the report, whose plots the page uses.
+    The files come from this package and from that of the report, whose plots the page uses.
 
     Returns:
-        The media type and the content of each file.
+        Media type and content of each file.
     """
     plot_assets = (resources.files("trilat_net.presentation") / "assets").iterdir()
     page_assets = (resources.files(__package__) / "assets").iterdir()
@@ -118,13 +118,13 @@ def _list_assets() -> dict[str, tuple[str, bytes]]:
 
 
 def _make_response(kind: str, content: bytes, policy: str, cache: str) -> Response:
-    """Returns the response that sends a file.
+    """Returns the HTTP response with the content of a file.
 
     Args:
         kind: Media type of the file.
-        content: Bytes of the file.
+        content: Content of the file.
         policy: Content security policy of the file.
-        cache: Whether browsers may store the file, as in the header `Cache-Control`.
+        cache: Value of the header `Cache-Control`.
     """
     headers = {
         "Content-Type": kind,

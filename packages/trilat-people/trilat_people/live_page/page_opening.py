@@ -76,7 +76,7 @@ class BrowserOpening:
 
 
 def _make_template() -> Template:
-    """Returns the template of the file that redirects to the link, with HTML escaping."""
+    """Returns the HTML-escaping template of the file that redirects to the link."""
     environment = Environment(
         loader=PackageLoader(__package__, "templates"),
         autoescape=True,

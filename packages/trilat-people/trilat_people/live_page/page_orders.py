@@ -44,22 +44,22 @@ from trilat_net.net import (
 )
 
 MAX_MESSAGE_BYTES = 4_096
-"""Largest size of a page's message."""
+"""Maximum size of a message from a page."""
 REPLY_TIMEOUT_NS = 3_000_000_000
-"""Longest wait for a site's reply to an order, in ns."""
+"""Maximum time to wait for a site's reply to an order, in ns."""
 MAX_PENDING = 256
-"""Largest number of orders that wait to be sent."""
+"""Maximum number of orders waiting to be sent."""
 TOKEN_BYTES = 16
-"""Size of a link's token."""
+"""Size of the token in a link."""
 RELEASE = "release"
-"""Subject of waiting orders that let an arm follow again or clear its fault."""
+"""Subject of waiting orders that release a stopped arm or clear its fault."""
 MIN_RAMP_S = 0.25
-"""Duration of a change of dominance factors that a user drags with the mouse, in s."""
+"""Duration of a dominance change that a user makes by dragging with the mouse, in s."""
 
 Name = Annotated[str, Meta(max_length=64)]
 Numbers = Annotated[list[float], Meta(max_length=12)]
 Count = Annotated[int, Meta(ge=0, lt=2**53)]
-"""A number of a frame or page: JavaScript counts exactly up to 2^53."""
+"""Number of a frame or page; JavaScript represents integers exactly up to 2^53."""
 
 
 class PageMessage(
@@ -139,12 +139,12 @@ class StopArms(PageMessage, frozen=True, kw_only=True, tag="stop"):
 
 
 class _ReleaseArms(PageMessage, frozen=True, kw_only=True, tag="release"):
-    """Request of a web page to let stopped arms move again, or to reset arms after a fault.
+    """Request of a page to release stopped arms, or to reset arms after a fault.
 
     Attributes:
         order: "enable" to let stopped arms follow the other arms again, "reset" to clear
             faults.
-        sites: Names of the processes ("sites") that control these arms.
+        sites: Names of the sites of these arms.
     """
 
     order: Literal["enable", "reset"]
@@ -154,12 +154,11 @@ class _ReleaseArms(PageMessage, frozen=True, kw_only=True, tag="release"):
 class _SetLink(PageMessage, frozen=True, kw_only=True, tag="link"):
     """Request of a page to change the delay or other settings of a network link.
 
-    A link is the connection in one direction between two sites, the processes that each control
-    one arm. The command `trilat set` changes the same settings.
+    The command `trilat set` changes the same settings.
 
     Attributes:
         link: Name of the link, such as "m1->s" from site m1 to site s.
-        to: New value of each setting, by the name of the setting.
+        to: Mapping from the name of each setting to its new value.
     """
 
     link: Name
@@ -167,13 +166,11 @@ class _SetLink(PageMessage, frozen=True, kw_only=True, tag="link"):
 
 
 class _SetShares(PageMessage, frozen=True, kw_only=True, tag="shares"):
-    """Request of a page to change the weights with which an arm follows the other arms.
-
-    These weights are called dominance factors.
+    """Request of a page to change the dominance factors of a site.
 
     Attributes:
-        site: Name of the process ("site") that controls the arm.
-        to: New weight of each other site (peer), by its name.
+        site: Name of the site.
+        to: Mapping from peer name to new dominance factor.
     """
 
     site: Name
@@ -181,10 +178,10 @@ class _SetShares(PageMessage, frozen=True, kw_only=True, tag="shares"):
 
 
 class _MarkMoment(PageMessage, frozen=True, kw_only=True, tag="mark"):
-    """Request of a web page to mark the present moment in the log, by an event with a text.
+    """Request of a page to mark the current moment in the log with an event.
 
     Attributes:
-        text: The text, for example "contact".
+        text: Label of the mark, for example "contact".
     """
 
     text: Annotated[str, Meta(min_length=1, max_length=80)]
@@ -250,7 +247,7 @@ class AbortTrial(PageMessage, frozen=True, kw_only=True, tag="abort"):
 
 
 SiteOrder = _SetLink | _SetShares | _ReleaseArms | _MarkMoment
-"""Request of a page that `OrderDesk.accept` passes on to sites."""
+"""Request of a page that `OrderDesk.accept` forwards to sites."""
 StageMessage = DoStep | AbortTrial
 _ANY_MESSAGE = reduce(or_, PageMessage.__subclasses__())
 _DECODER = msgspec.json.Decoder(_ANY_MESSAGE)
@@ -265,7 +262,7 @@ _RATES: dict[type[PageMessage], tuple[float, int]] = {
     DoStep: (2.0, 5),
     AbortTrial: (1.0, 3),
 }
-"""Largest mean rate of a page's messages of each kind, in 1/s, and largest burst.
+"""Maximum mean rate, in 1/s, and maximum burst of a page's messages, by kind.
 
 The entry of `PageMessage` applies to all kinds together.
 """
@@ -273,14 +270,14 @@ The entry of `PageMessage` applies to all kinds together.
 
 @dataclass(slots=True)
 class _TokenBucket:
-    """State of a limit on a message rate, by the method of the token bucket.
+    """State of a token bucket, which limits a message rate.
 
-    Tokens are added at the allowed rate, up to the largest burst. Each message removes one
-    token. If there is no token, the message exceeds the limit.
+    Tokens are replenished at the permitted rate, up to the maximum burst, and each message
+    takes one token. A message exceeds the limit if there is no token left.
 
     Attributes:
         tokens: Number of tokens in the bucket.
-        filled_ns: Time of the last message, in ns. 0 before the first message.
+        filled_ns: Time of the last message, in ns; 0 before the first one.
     """
 
     tokens: float
@@ -441,20 +438,19 @@ class RoleLinks:
         return None
 
     def _make_token(self, role: Role) -> str:
-        """Returns the secret text (token) in a link, which grants the rights of one role.
+        """Returns the secret token that grants the rights of a role.
 
-        The token is a keyed digest of the role. Nobody without the server's secret can guess
-        it.
+        The token is a keyed digest of the role, and cannot be guessed without the server's
+        secret.
         """
         text = f"{role.kind} {role.site}".encode()
         digest = hmac.digest(self._secret, text, "sha256")
         return digest[:TOKEN_BYTES].hex()
 
     def _is_token(self, token: str, role: Role) -> bool:
-        """Returns True if a secret text from a link (token) gives the rights of a role.
+        """Returns True if a token from a link grants the rights of a role.
 
-        The comparison takes the same time for any token, so that no token can be guessed by
-        timing.
+        The comparison takes the same time for any token, which prevents timing attacks.
         """
         role_token = self._make_token(role)
         # The time of this comparison does not reveal how many characters are right.
@@ -537,12 +533,13 @@ class PageHands:
 
 
 class _OpenQuery(NamedTuple):
-    """A request that was sent to an arm controller (site) and has not been answered yet.
+    """A request that was sent to a site and has not been answered yet.
 
     Attributes:
         inbox: Inbox that receives the reply.
-        sent_ns: Time of sending on the monotonic clock, in ns.
-        request: The request, which is repeated in another form if an older site rejects it.
+        sent_ns: Send time on the monotonic clock, in ns.
+        request: The request, which is resent in an older form if a site with an older version
+            rejects it.
     """
 
     inbox: Inbox
@@ -608,18 +605,16 @@ class OrderDesk:
         links: Collection[str],
         source: str,
     ) -> None:
-        """Queues a request to change the settings of a link, or the weights of a site.
+        """Queues a request to change the settings of a link or the dominance factors of a site.
 
-        A slider of a page sends many values. Therefore, a request replaces a waiting request
-        about the same link or site. A request about an unknown link or site is refused and
-        counted.
+        A slider on a page sends many values, so a request replaces any waiting request for the
+        same link or site. A request for an unknown link or site is refused and counted.
 
         Args:
-            order: New settings of a link, or new dominance factors, which are the weights with
-                which a site follows the other sites.
+            order: New settings of a link, or new dominance factors of a site.
             sites: Names of the sites of the session.
             links: Names of the links of the session.
-            source: Sender of the request, for the site's event.
+            source: Sender of the request, as recorded in the site's event.
         """
         if isinstance(order, _SetLink):
             if order.link not in links:
@@ -657,14 +652,14 @@ class OrderDesk:
             self._send_request(site, topics.STOP, request)
 
     def _release(self, order: _ReleaseArms, sites: Collection[str], source: str) -> None:
-        """Queues requests to let stopped arms move again, or to reset arms after a fault.
+        """Queues requests to release stopped arms, or to reset arms after a fault.
 
         A request that names a site outside the session is refused and counted.
 
         Args:
             order: The request, with the names of the sites of these arms.
-            sites: Names of all sites (processes, one per arm) of the session.
-            source: Name of the person or program that requests it, for the events in the log.
+            sites: Names of all sites of the session.
+            source: Person or program that sent the request, as recorded in log events.
         """
         release = ChangeRequest(order=order.order)
         request = _add_source(release, source)
@@ -675,10 +670,10 @@ class OrderDesk:
                 self.refused["no such site"] += 1
 
     def _enqueue(self, site: str, subject: str, request: ChangeRequest) -> None:
-        """Queues a request, which replaces a waiting request about the same subject.
+        """Queues a request, replacing any waiting request on the same subject.
 
-        A slider of a page sends many values, of which only the latest matters. A request about
-        a new subject is dropped if too many requests wait.
+        A slider on a page sends many values, of which only the latest matters. A request on a
+        new subject is dropped if too many requests are waiting.
 
         Args:
             site: Name of the site.
@@ -690,10 +685,10 @@ class OrderDesk:
             self._pending[site, subject] = request
 
     def _send_request(self, site: str, channel: str, request: ChangeRequest) -> None:
-        """Sends a request to a site. `poll` receives the reply.
+        """Sends a request to a site. The reply is received by `poll`.
 
-        For example, the request changes a link's delay or stops an arm. Only one request waits
-        for its reply at a time.
+        For example, a request may change the delay of a link or stop an arm. Only one request
+        at a time waits for its reply.
 
         Args:
             site: Name of the site.
@@ -747,11 +742,11 @@ class OrderDesk:
     def _handle_reply(
         self, site: str, channel: str, request: ChangeRequest, payload: bytes
     ) -> None:
-        """Stores the reply of a site to a request, so that web pages can show it.
+        """Stores the reply of a site to a request, to be shown on web pages.
 
-        A refused stop is repeated in an older form: a site that runs an older program does not
-        know the field `source` and rejects the whole request, but its arm must also stop. A
-        reply that cannot be decoded is counted.
+        A rejected stop is resent in an older form: a site that runs an older version does not
+        know the field `source` and rejects the entire request, but its arm must stop too.
+        Replies that cannot be decoded are counted.
         """
         try:
             reply = decode(payload, ChangeReply)
@@ -769,17 +764,18 @@ class OrderDesk:
 
 
 def _add_source(request: ChangeRequest, source: str) -> ChangeRequest:
-    """Returns a request that names its sender, or the same request if the source is empty."""
+    """Adds the name of the sender to a request, unless the name is empty."""
     if not source:
         return request
     return msgspec.structs.replace(request, source=source)
 
 
 def _make_link_request(order: _SetLink) -> ChangeRequest:
-    """Returns the request that changes the settings of a link as requested by a page.
+    """Returns the request that changes the settings of a link as ordered by a page.
 
-    The page sets a delay and its standard deviation. Unless the page names a preset, a delay
-    with a deviation becomes a gamma distribution, and a delay without a deviation is constant.
+    The page sets a delay and its standard deviation. Unless the page names a preset, a nonzero
+    deviation gives a gamma distribution, and a zero or missing deviation gives a constant
+    delay.
     """
     settings: dict[str, Any] = dict(order.to)
     sets_delay = "preset" not in settings and "delay_ms" in settings
@@ -796,5 +792,5 @@ def _make_link_request(order: _SetLink) -> ChangeRequest:
 
 
 def _is_zero(value: float | str) -> bool:
-    """Returns True if a setting is the number 0. A text, which the site will reject, is not."""
+    """Returns True if a setting is the number 0. Strings are left for the site to reject."""
     return str(value) in ("0.0", "-0.0")

@@ -85,53 +85,53 @@ if TYPE_CHECKING:
     from .experiment_stage import Stage
 
 NICE = -5
-"""Priority of the page's threads, and of the threads that deliver the page's messages.
+"""Priority of the page's threads, and of the threads that deliver its messages.
 
-The priority is above the normal priority, and below that of the sites.
+Above normal priority, but below that of the sites.
 """
 FRAMES_PER_S = 30
-"""Rate of the frames, in 1/s."""
+"""Frame rate, in 1/s."""
 FRAMES_AHEAD = 2
-"""Largest number of undrawn frames of a page: one is in transit while one is drawn."""
+"""Maximum number of undrawn frames of a page: one in transit and one being drawn."""
 MAX_EXCESS = 1_000
-"""Number of messages beyond the allowed rate after which a page is closed."""
+"""Number of messages above the permitted rate after which a page is closed."""
 REQUEST_TIMEOUT_S = 3.0
-"""Longest wait for the encryption of a connection, and again for its request, in s."""
+"""Maximum time for the TLS handshake, and again for the request, in s."""
 ANSWER_TIMEOUT_NS = 10_000_000_000
-"""Time for a page that holds an arm to answer whether another page may take part, in ns."""
+"""Time for a page that holds an arm to answer another page's request to take part, in ns."""
 RESTART_S = 1.0
 """Time between a failure of the server and its restart, in s."""
 SWITCH_POLL_NS = 10_000_000
-"""Time between two checks for a request to show another session, in ns."""
+"""Time between two checks for a request to switch sessions, in ns."""
 WAITING_FRAME_STEP = 10
-"""Number of frame periods between two frames before a session begins."""
+"""Number of frame periods between two frames before a session starts."""
 POINTS_PER_FRAME = 240
-"""Largest number of plot points in a frame. After a longer absence, the plots have a gap."""
+"""Maximum number of plot points in a frame. After a longer absence, plots have a gap."""
 _POLICY_VIOLATION = 1008
-"""Code with which the server closes a socket (RFC 6455)."""
+"""WebSocket close code sent by the server on a policy violation (RFC 6455)."""
 _BROKEN = {1002: "broken frames", 1007: "no text", 1009: "too large"}
-"""Codes with which the library closes a socket (RFC 6455), and reasons for the counts."""
+"""WebSocket close codes sent by the library (RFC 6455), with the reason to count."""
 _SILENT = logging.getLogger("trilat.page")
 _SILENT.addHandler(logging.NullHandler())
 _SILENT.propagate = False
-"""Logger of the WebSocket library. It prints nothing, because strangers could flood it."""
+"""Logger of the WebSocket library, silenced because strangers could flood it."""
 
 RESULTS_TIMEOUT_NS = 600_000_000_000
-"""Time after the session for which an open page can load the report and the log, in ns."""
+"""How long after the session an open page can load the report and the log, in ns."""
 MAX_DURATION_S = 3600.0
-"""Longest duration of a session with a page, in s, unless the user sets another duration."""
+"""Default maximum duration of a session with a page, in s."""
 
 _NO_HTTP = b"HTTP/1.1 400 Bad Request\r\nContent-Length: 0\r\nConnection: close\r\n\r\n"
 
 
 class _Visitor(ServerConnection):
-    """Connection of a browser to the server, from its beginning until it is closed.
+    """Connection of a browser to the server.
 
-    Any program can connect. Data that are not a valid request of a browser are counted, and
-    answered with the HTTP status 400.
+    Any program can connect. Data that are not a valid browser request are counted and answered
+    with HTTP status 400.
 
     Attributes:
-        refused: Numbers of refused connections and messages, by reason.
+        refused: Mapping from reason to number of refused connections and messages.
         strangers: Open connections that do not belong to a web page yet.
     """
 
@@ -189,30 +189,30 @@ class _Visitor(ServerConnection):
 
 
 class _Page:
-    """State of one page that is open in a browser: its rights, and the data sent to it.
+    """State of one open page: its rights, and the data sent to it.
 
-    The server sends frames, messages from which the page draws the session. A frame describes
-    the present state. Therefore a slow page may miss some frames.
+    Each frame sent to the page describes the complete current state, so a slow page may miss
+    some frames.
 
     Attributes:
         connection: WebSocket connection to the page.
-        number: Number of the page. Pages are counted from 1.
-        role: Rights of the page's user, and the site whose user's view the page shows.
-        hands: Connections with which the page holds and moves arms.
-        takes_part: True if the page may give orders.
-        asks: The other pages that must allow this page to take part, and the time of its
-            request in ns. `None` if the page has not asked to take part.
-        wake: Event that is set when there is a frame that the page has not received.
+        number: Number of the page, starting at 1.
+        role: Rights of the page's user, and the site whose view the page shows.
+        hands: Connections through which the page holds and moves arms.
+        takes_part: True if the page may send orders.
+        asks: The other pages that must agree before this page may take part, and the time of
+            its request in ns. `None` if the page has not asked to take part.
+        wake: Set when there is a frame that the page has not received.
         drawn: Number of the last frame that the page has drawn.
         sent: Number of the last frame that was sent to the page.
         notified: Number of the frame that was sent before the last frame.
-        unseen: Numbers of the frames that were sent but not drawn yet.
-        points: Number of points of the plots that the page has received.
-        energies: Number of points of the energy plot that the page has received.
+        unseen: Numbers of the frames that were sent but have not been drawn yet.
+        points: Number of plot points that the page has received.
+        energies: Number of energy plot points that the page has received.
         events: Number of events that the page has received.
         greeted: True if the page has received the description of the running session.
-        limits: Limits of the page's message rates.
-        excess: Number of messages that exceeded the common limit of all kinds of messages.
+        limits: Limits on the page's message rates.
+        excess: Number of messages that exceeded the common limit for all kinds of messages.
     """
 
     def __init__(
@@ -385,13 +385,13 @@ class PageServer:
         self._thread = threading.Thread(target=self._run, name="page", daemon=True)
 
     def __enter__(self) -> "PageServer":
-        """Starts the server in its thread, prints the experimenter's link, and opens a browser.
+        """Starts the server thread, prints the experimenter's link, and opens a browser.
 
         A browser is opened only if the options allow it, the output is a terminal, and the
-        machine has a screen.
+        machine has a display.
 
         Raises:
-            UsageError: The server cannot listen at its address.
+            UsageError: The server cannot listen on its address.
         """
         self._thread.start()
         self._ready.wait()
@@ -407,7 +407,7 @@ class PageServer:
         return self
 
     def __exit__(self, *_: object) -> None:
-        """Ends the web server and closes its pages. Waits at most 5 s for its thread."""
+        """Shuts down the server and closes its pages, waiting at most 5 s for its thread."""
         self._ending.set()
         if self._loop is not None and self._stop is not None:
             # The loop of the server may have ended already.
@@ -431,10 +431,10 @@ class PageServer:
             self._clock.sleep_until(self._clock.monotonic_ns() + SWITCH_POLL_NS)
 
     def _switch_session_if_requested(self) -> None:
-        """Shows the session that the last call of `show` requested.
+        """Switches to the session requested by the last call of `show`.
 
-        Only the thread of the server uses the state of a session. `show` runs in another
-        thread, and waits until this method has switched or failed.
+        Only the server thread uses the state of a session. `show` runs in another thread, and
+        waits until this method has switched sessions or failed.
         """
         if self._next_session is not None:
             bus, session = self._next_session
@@ -444,11 +444,11 @@ class PageServer:
                 self._next_session = None
 
     def _switch_session(self, bus: Bus, session: str) -> None:
-        """Observes another session, and makes all pages receive its state from the beginning.
+        """Switches to another session, and sends its state to all pages from the beginning.
 
-        For each page, the numbers of plot points and events that it has received are stored, so
-        that only new ones are sent. These numbers restart at 0 for the new session, and each
-        page is sent the constants of the new session ("greeted").
+        For each page, the server keeps track of how many plot points and events it has
+        received, so that only new ones are sent. These counts restart at 0 for the new session,
+        and each page is sent the constants of the new session ("greeted").
 
         Args:
             bus: Network connection that reaches the session.
@@ -475,10 +475,10 @@ class PageServer:
             page.greeted = False
 
     def _run(self) -> None:
-        """Runs the server in its thread until the end, and restarts it after a failure.
+        """Runs the server in its thread until shutdown, restarting it after a failure.
 
-        A failure before the server was ready is stored for `__enter__`, which raises it,
-        because the user must know that there is no page.
+        A failure before the server was ready is stored and raised by `__enter__`, because the
+        user must know that there is no page.
         """
         raise_priority(NICE)
         while not self._ending.is_set() and self._problem is None:
@@ -500,9 +500,9 @@ class PageServer:
             self._say(f"the page refused {count_nouns(count, 'message')} or requests: {reason}")
 
     def _count_failure(self, part: str, error: Exception) -> None:
-        """Counts an error of the web server, and prints the first error of each kind.
+        """Counts an error of the server, and prints the first error of each kind.
 
-        The server is not involved in the control of the arms, and continues after any error.
+        The server is not involved in controlling the arms, and continues after any error.
 
         Args:
             part: Part of the page that failed, for example "frame".
@@ -516,10 +516,10 @@ class PageServer:
                 self._say(f"the page continues, though its {reason}: {error}")
 
     async def _serve(self) -> None:
-        """Accepts connections of browsers and serves web pages until the server has to end.
+        """Accepts connections from browsers and serves pages until the server is shut down.
 
-        The method sets `address`, the link with the port that was chosen, and then reports that
-        it is ready.
+        Sets `address`, the link with the actual port, before reporting that the server is
+        ready.
         """
         self._loop = asyncio.get_running_loop()
         self._stop = asyncio.Event()
@@ -556,7 +556,7 @@ class PageServer:
 
     @property
     def _base_address(self) -> str:
-        """Address of the page without its token, for example "http://127.0.0.1:8080/"."""
+        """Address of the page, excluding its token, for example "http://127.0.0.1:8080/"."""
         host = f"[{self._host}]" if ":" in self._host else self._host
         return f"{self._scheme}://{host}:{self._port}/"
 
@@ -564,7 +564,7 @@ class PageServer:
         """Prints the links with which users and watchers can open their pages.
 
         Users are people who hold a master arm, or the participants of an experiment. The links
-        are printed once, when the scenario that names the arms is known.
+        are printed once, when the scenario, which names the arms, is known.
         """
         scenario = self.view.scenario
         are_users_known = scenario is not None or self._stage is not None
@@ -586,9 +586,9 @@ class PageServer:
             self._say(f"{name}: {self._links.link(self._base_address, role)}")
 
     async def _tick(self) -> None:
-        """Receives the session's messages and gives pages its state, 30 times a second.
+        """Receives the messages of the session and updates the pages, 30 times per second.
 
-        If one step fails, the failure is counted, and the other steps continue.
+        If one step fails, the failure is counted and the remaining steps are still executed.
         """
         while True:
             started_ns = self._clock.monotonic_ns()
@@ -614,9 +614,9 @@ class PageServer:
             await asyncio.sleep(max(0.002, remaining_s))
 
     def _poll_stage(self) -> None:
-        """Lets the experiment judge new records of the arms, and writes its marks into the log.
+        """Lets the experiment judge new records of the arms, and writes its marks to the log.
 
-        A mark is, for example, "trial 3 begins". Without an experiment nothing happens.
+        An example of a mark is "trial 3 begins". Does nothing if there is no experiment.
         """
         if self._stage is None:
             return
@@ -626,10 +626,9 @@ class PageServer:
             self._desk.mark(next(iter(self.view.sites)), moment)
 
     def _make_frame(self) -> None:
-        """Composes the next message (frame) from which web pages draw the present state.
+        """Composes the next frame, from which web pages draw the current state.
 
-        The replies of sites (arm controllers) to requests of pages are collected, too. The
-        latest 20 are kept.
+        Also collects the sites' replies to requests from pages, and keeps the latest 20.
         """
         self._frame_number += 1
         for site, channel, is_accepted, text in self._desk.replies:
@@ -648,12 +647,12 @@ class PageServer:
         self._frames_as_site.clear()
 
     def _answer_http(self, connection: ServerConnection, request: Request) -> Response | None:
-        """Returns the response to an HTTP request of a browser.
+        """Returns the response to an HTTP request from a browser.
 
-        The WebSocket library calls this function for each request, before it opens a WebSocket.
+        Called by the WebSocket library for each request, before it opens a WebSocket.
 
         Returns:
-            The response with a file or an error. `None` to open a WebSocket.
+            A response with a file or an error, or `None` to open a WebSocket.
         """
         try:
             target = urlsplit(request.path)
@@ -683,12 +682,12 @@ class PageServer:
     def _find_refusal(self, request: Request, query: str) -> str | None:
         """Returns the reason why a request must be refused, or `None` if it is accepted.
 
-        For example, requests from pages of other web sites could move an arm without its user's
-        knowledge.
+        For example, requests from pages of other web sites are refused, since they could move
+        an arm without its user's knowledge.
 
         Args:
             request: The request.
-            query: Query of its address, with the token.
+            query: Query string of its address, including the token.
         """
         host = request.headers.get("Host", "")
         name = urlsplit(f"//{host}").hostname or ""
@@ -704,10 +703,10 @@ class PageServer:
         return None
 
     async def _serve_page(self, connection: ServerConnection) -> None:
-        """Exchanges messages with one web page until its connection ends.
+        """Exchanges messages with one page until its connection is closed.
 
-        The page of a user may move the user's arm at once. The page of an experimenter controls
-        the session if no other experimenter's page does.
+        The page of a user may move the user's arm immediately. The page of an experimenter
+        controls the session unless another experimenter's page already does.
         """
         assert connection.request is not None
         role = self._links.find(urlsplit(connection.request.path).query)
@@ -744,9 +743,9 @@ class PageServer:
             self._pages.discard(page)
 
     def _close_page_for(self, role: Role) -> None:
-        """Closes an older web page of a role if the number of these pages is at its limit.
+        """Closes an older page of a role if the number of such pages is at its limit.
 
-        The arms that the person at the closed page holds are released.
+        Any arms held by the person at that page are released.
 
         Args:
             role: Role of the new page.
@@ -766,7 +765,7 @@ class PageServer:
         task.add_done_callback(self._closing.discard)
 
     def _receive(self, page: _Page, text: str | bytes) -> None:
-        """Decodes and handles a message of a web page, unless the page sends too many messages.
+        """Decodes and handles a message from a page, unless the page sends too many messages.
 
         A message that releases an arm is always handled, because continuing to hold the arm
         could be dangerous.
@@ -790,11 +789,11 @@ class PageServer:
             self._count_failure("message", error)
 
     def _handle_message(self, page: _Page, message: PageMessage) -> None:
-        """Carries out the request in a page's message if the page has the right to it.
+        """Carries out the request in a page's message if the page has the right to do so.
 
-        A request without the right is counted as refused, with the reason. The right depends on
-        the role of the person, for example a watcher. Most requests also require that the page
-        takes part, which means that it may move arms and change settings.
+        Otherwise, the request is counted as refused, with the reason. Rights depend on the role
+        of the person, for example a watcher. Most requests also require that the page takes
+        part, that is, may move arms and change settings.
 
         Args:
             page: The page.
@@ -817,13 +816,13 @@ class PageServer:
             self._control_session(page, message)
 
     def _note_drawn_frame(self, page: _Page, frame_number: int) -> None:
-        """Records that a web page has drawn a frame, and can receive newer frames.
+        """Records that a page has drawn a frame and can receive newer ones.
 
-        A slow browser is thus not flooded.
+        This prevents flooding a slow browser.
 
         Args:
             page: The page.
-            frame_number: Number of the frame, as the page states it.
+            frame_number: Number of the frame, as reported by the page.
         """
         page.drawn = min(frame_number, page.sent)  # a page may state any number
         while page.unseen and page.unseen[0] <= page.drawn:
@@ -831,14 +830,14 @@ class PageServer:
         page.wake.set()
 
     def _control_session(self, page: _Page, message: PageMessage) -> None:
-        """Carries out a request of a page that moves an arm or changes the session.
+        """Carries out a page's request to move an arm or change the session.
 
-        For example, an experimenter changes the delay of a link, or a user moves an arm with
-        the mouse.
+        For example, an experimenter may change the delay of a link, or a user may move an arm
+        with the mouse.
 
         Args:
             page: The page, which has the right to control the session.
-            message: The decoded message, which the role of the page's user permits.
+            message: The decoded message, which is permitted for the role of the page's user.
         """
         view = self.view
 
@@ -861,13 +860,13 @@ class PageServer:
             self.end_requested.set()
 
     def _request_part(self, page: _Page, want: bool) -> None:
-        """Handles a page's request for the right to control the session, or its return.
+        """Handles a page's request to obtain or give up the right to control the session.
 
-        If other pages hold an arm, the page gets the right only if they agree.
+        If other pages hold an arm, the right is granted only if they agree.
 
         Args:
             page: The page.
-            want: True to request the right, False to return it.
+            want: True to request the right, False to give it up.
         """
         if not want:
             page.takes_part = False
@@ -890,10 +889,10 @@ class PageServer:
         return {page for page in set(self._pages) if page.role.kind == "experimenter"}
 
     def _answer_request(self, page: _Page, answer: AnswerPage) -> None:
-        """Applies the answer of a page to another page's request to control the session.
+        """Applies a page's answer to another page's request to control the session.
 
-        An answer to a request that does not exist, or that was sent to other pages, is counted
-        as refused.
+        An answer to a request that does not exist or was sent to other pages is counted as
+        refused.
 
         Args:
             page: The page that answers.
@@ -912,8 +911,8 @@ class PageServer:
     def _settle_requests(self) -> None:
         """Decides on requests for control of a session that were not answered in time.
 
-        A page receives control if the asked pages were closed, or if the time is over and they
-        no longer hold an arm.
+        A page obtains control if the pages that were asked have been closed, or if the time is
+        up and they no longer hold an arm.
         """
         now_ns = self._clock.monotonic_ns()
         for page in self._pages:
@@ -928,10 +927,10 @@ class PageServer:
                 page.asks = None
 
     def _list_held_sites(self, page: _Page) -> list[str]:
-        """Lists the arms that the person at a web page holds, by the names of their sites.
+        """Lists the sites whose arms are held by the person at a page.
 
-        The holder of an arm is only known from the records of its site (arm controller). Before
-        the first record, the list is empty.
+        The holder of an arm is known only from the records of its site. Empty before the first
+        record.
         """
         sites = (self._frame or {}).get("sites", {})
         held_sites: list[str] = []
@@ -941,7 +940,7 @@ class PageServer:
         return held_sites
 
     async def _send(self, page: _Page) -> None:
-        """Sends a web page the newest frame each time the page has drawn an earlier frame.
+        """Coroutine that sends a page the newest frame each time it has drawn an earlier one.
 
         The first message is a greeting with the constants of the session. A page for a site
         that is not in the session is closed. The coroutine ends with the connection.
@@ -977,10 +976,10 @@ class PageServer:
                 await page.connection.send(payload, text=True)
 
     def _is_frame_due(self, page: _Page, *, has_begun: bool) -> bool:
-        """Returns True if the page should receive the newest frame now.
+        """Returns True if the page should now receive the newest frame.
 
-        A page that has not drawn the previous frame yet gets no new frame, so that messages do
-        not pile up.
+        A page that has not drawn the previous frame yet is not sent another, so that messages
+        do not pile up.
 
         Args:
             page: The page.
@@ -997,11 +996,11 @@ class PageServer:
         return self._frame_number - page.sent >= WAITING_FRAME_STEP
 
     def _describe_greeting(self, page: _Page) -> dict[str, Any]:
-        """Returns the first message to a page, with the constants of the session.
+        """Returns the first message to a page, which contains the constants of the session.
 
         The message has the single key "hello". Its value contains the constants, the role of
-        the page's user ("role"), the site whose user's view the page shows ("as", empty for the
-        view of all sites), the number of the present frame ("n"), whether the page may end the
+        the page's user ("role"), the site whose view the page shows ("as", empty for the view
+        of all sites), the number of the current frame ("n"), whether the page may end the
         session ("ends"), and the step of the experiment if there is one.
         """
         role = page.role
@@ -1024,13 +1023,11 @@ class PageServer:
         return {"hello": fields}
 
     def _describe_stage(self, page: _Page, t_s: float | None = None) -> dict[str, Any]:
-        """Returns the facts of the present step of an experiment that a web page shows.
-
-        The result is empty if there is no experiment.
+        """Describes the current step of an experiment, if there is one, for a page.
 
         Args:
             page: The page.
-            t_s: Time of the arms on the page, in s. `None` if the page shows no arms.
+            t_s: Time of the pose shown on the page, in s, or `None` if the page shows no arms.
         """
         if self._stage is None:
             return {}
@@ -1040,16 +1037,15 @@ class PageServer:
     def _describe_frame(self, page: _Page) -> dict[str, Any]:
         """Returns the newest frame for a page: the state of the session and of the page itself.
 
-        A frame is a message from which the page draws the session, about 30 times a second. The
-        content depends on the role of the page's user.
+        The content depends on the role of the page's user.
 
         Args:
             page: The page.
 
         Returns:
-            The frame as plain values for JSON. It consists of the time, the arms and the links
-            as the page's user sees them, the fields that are explained below, and the step of
-            the experiment if there is one.
+            The frame as JSON-compatible values: the time, the arms and links as seen by the
+            page's user, the fields that are explained below, and the step of the experiment if
+            there is one.
         """
         site = page.role.site
         # The user of a site sees the other arms delayed. Other roles see all arms at present.
@@ -1081,7 +1077,7 @@ class PageServer:
         }
 
     def _list_requests(self, page: _Page) -> list[int]:
-        """Lists the numbers of the pages that wait for this page's permission to take part."""
+        """Returns the numbers of the pages that wait for this page's permission."""
         numbers: list[int] = []
         for other in self._pages:
             if other.asks is not None:
@@ -1091,10 +1087,10 @@ class PageServer:
         return numbers
 
     def _list_notices(self, page: _Page) -> list[dict[str, Any]]:
-        """Lists the replies of sites (arm controllers) that a web page has not received yet.
+        """Returns the sites' replies that a page has not received yet.
 
-        The replies name keys and commands, which only an experimenter can use. Pages of other
-        roles are only told which sites refused to stop.
+        The replies contain keys and commands, which only an experimenter can use. Pages of
+        other roles are only told which sites refused to stop.
         """
         notices = [notice for notice in self._notices if notice["n"] > page.notified]
         if page.role.kind == "experimenter":
@@ -1111,11 +1107,11 @@ class PageServer:
     def _describe_as_site(self, site: str) -> dict[str, Any]:
         """Returns the frame for the user of one arm, in which the other arms appear delayed.
 
-        The frame has no plots and no events, which would reveal the present state. All pages of
-        the arm get the same message (frame).
+        The frame has no plots or events, which would reveal the current state. All pages of the
+        arm receive the same frame.
 
         Args:
-            site: Name of the site that controls the arm.
+            site: Name of the site of the arm.
         """
         if site not in self._frames_as_site:
             assert self._frame is not None
@@ -1126,10 +1122,10 @@ class PageServer:
         return {**self._frames_as_site[site], **hidden_fields}
 
     def _describe_all(self, page: _Page) -> dict[str, Any]:
-        """Returns the frame for a web page that sees everything, with new points and events.
+        """Returns the frame for a page that sees everything, with new points and events.
 
-        The numbers of points and events that were sent to the page are stored. The first
-        message contains all stored points and events.
+        Updates how many points and events the page has received. The first message contains all
+        stored points and events.
 
         Args:
             page: The page of an experimenter or watcher.
@@ -1150,9 +1146,9 @@ class PageServer:
 
 
 def _has_screen() -> bool:
-    """Returns True if this machine can show a browser.
+    """Returns True if this machine can display a browser.
 
-    On Linux, this is read from the variables DISPLAY and WAYLAND_DISPLAY.
+    On Linux, this is determined from the variables DISPLAY and WAYLAND_DISPLAY.
     """
     if not sys.platform.startswith("linux"):
         return True

@@ -39,17 +39,17 @@ from .body_turns import BodyTurns
 from .session_view import SessionView, SiteView, Tail
 
 POINTS_KEPT = 1200
-"""Number of points of a plot that a new page receives. They cover 40 s."""
+"""Number of points of a plot sent to a new page, equivalent to 40 s."""
 ENERGY_PERIOD_S = 0.025
-"""Smallest time between two points of the energies, in s."""
+"""Minimum time between two points of the energy plot, in s."""
 COLOURS = 6
 """Number of colours for sites in `theme.css`."""
 MAX_FRAME_S = 0.5
-"""Longest time interval whose records are evaluated for a frame, in s."""
+"""Longest interval whose records are evaluated for a frame, in s."""
 _MIN_SINGULAR_SHARE = 0.05
-"""Smallest singular value of the Jacobian that is inverted, as a fraction of the largest.
+"""Smallest singular value of the Jacobian that is inverted, relative to the largest.
 
-Along directions in which the end effector moves less, the force counts as zero.
+Along directions in which the end effector moves less, the force is taken as zero.
 """
 
 Json = dict[str, Any]
@@ -57,17 +57,17 @@ Json = dict[str, Any]
 
 
 def _round(values: Array, digits: int = 5) -> list[Any]:
-    """Returns an array as nested lists of rounded numbers, which keep the JSON text short."""
+    """Converts an array to nested lists of rounded numbers, to keep the JSON short."""
     rounded: list[Any] = np.round(values, digits).tolist()
     return rounded
 
 
 class _ArmFrames:
-    """Composes the parts of messages to a web page that describe one arm: shape, pose, forces.
+    """Composes the parts of page messages that describe one arm: shape, pose, forces.
 
     Args:
         scenario: Scenario of the session.
-        site: Name of the site that runs the arm.
+        site: Name of the site of the arm.
     """
 
     def __init__(self, scenario: Scenario, site: str) -> None:
@@ -132,8 +132,7 @@ class _ArmFrames:
     def _describe_hand(self) -> Json | None:
         """Describes how people can hold the arm: by force or position, and within which limits.
 
-        The result is `None` if the scenario (the settings of the session) does not let people
-        hold this arm.
+        `None` if the scenario does not let people hold this arm.
         """
         hand = self._hand
         if hand is None:
@@ -241,17 +240,16 @@ class _ArmFrames:
     def _place_reference(self, records: AlignedRecords) -> Array:
         """Returns the position of the arm's reference, so that a page can draw it.
 
-        The control law makes the arm follow the reference `q_des`. It consists of joint
-        positions, or of a pose of the end effector if the sites exchange such poses. A pose
-        begins with the position x, y, z, multiplied by the scale of the site's task.
+        The reference `q_des`, which the control law makes the arm follow, consists of joint
+        positions, or of an end effector pose if the sites exchange poses. A pose begins with
+        the position x, y, z, multiplied by the scale of the site's task.
 
         Args:
             records: Records since the previous frame. The reference in the last record is used.
 
         Returns:
-            Points in m. If the reference consists of joint positions, they are the points
-            between the links of an arm in the reference pose. If it is a pose of the end
-            effector, there is one point, shape (1, 3).
+            Points in m: for joint positions, the points between the links of an arm in the
+                reference pose; for an end effector pose, a single point, shape (1, 3).
         """
         points_m: Array
         if self._model.shares_pose:
@@ -264,9 +262,9 @@ class _ArmFrames:
         return points_m
 
     def _describe_grip(self, records: AlignedRecords, force: Array) -> Json:
-        """Describes who holds the arm at present, how firmly, and the target of the arm.
+        """Describes who currently holds the arm, how firmly, and the target of the arm.
 
-        The result is empty if nobody can hold the arm.
+        Empty if nobody can hold the arm.
 
         Args:
             records: Records since the previous frame.
@@ -296,14 +294,13 @@ class _ArmFrames:
         }
 
     def _compute_hand_force(self, records: AlignedRecords, split: TorqueSplit) -> Array:
-        """Returns the force of people at the end effector, shape (K, 2) or (K, 3), in N.
+        """Computes the force of people at the end effector, in N, shape (K, 2) or (K, 3).
 
-        It is zero for an arm that nobody can hold, where a tiny torque is only a rounding
-        error.
+        Zero for an arm that nobody can hold, where a tiny torque is only a rounding error.
 
         Args:
             records: K records of the site.
-            split: Parts of the external torque in these records.
+            split: Components of the external torque in these records.
         """
         torque = split.operator
         if not self._spec.hands:
@@ -316,12 +313,12 @@ class _ArmFrames:
         return split.end_effector.find_force(torque, _MIN_SINGULAR_SHARE)
 
     def _compute_pull(self, records: AlignedRecords, split: TorqueSplit) -> list[float]:
-        """Returns the force of the remote arms that a user feels at present, in N.
+        """Computes the force of the remote arms that a user currently feels, in N.
 
-        It is computed from the torque of the control law without gravity compensation.
+        Derived from the torque of the control law, excluding gravity compensation.
 
         Returns:
-            The components of the force. Empty if the masses of the arm are not known.
+            The components of the force. Empty if the masses of the arm are unknown.
         """
         if not self._spec.arm.known:
             return []
@@ -335,11 +332,11 @@ class _ArmFrames:
         return _round(last_force, 3)
 
     def _compute_wall_force(self, records: AlignedRecords, split: TorqueSplit) -> Array:
-        """Returns the force of all walls on the end effector, shape (K, 2) or (K, 3), in N.
+        """Computes the force of all walls on the end effector, in N, shape (K, 2) or (K, 3).
 
         Args:
             records: K records of the site.
-            split: Parts of the external torque in these records, with the end effector.
+            split: Components of the external torque in these records, with the end effector.
         """
         total = np.zeros_like(split.end_effector.position)
         for wall in self._walls:
@@ -436,10 +433,10 @@ class SessionFrames:
         return [_render_event(event) for event in self._view.events.since(first, most)]
 
     def _describe_waiting(self, scenario: Scenario | None) -> Json:
-        """Describes for a web page the processes for which a session that has not begun waits.
+        """Describes for a page which members a session that has not started is waiting for.
 
         Args:
-            scenario: Scenario of the session. `None` until a member has sent it.
+            scenario: Scenario of the session, or `None` until a member has sent it.
         """
         members = self._view.members
         names = [] if scenario is None else scenario.names
@@ -508,8 +505,8 @@ class SessionFrames:
 
         Args:
             t_s: Time of the point, in s.
-            values: The value of each curve: extremes of each site, then the age of each link's
-                samples in ms. `None` leaves a gap.
+            values: Value of each curve: the extremes of each site, followed by the age of each
+                link's samples in ms. `None` leaves a gap.
         """
         point: list[float | None] = [round(t_s, 4)]
         for value in values:
@@ -518,9 +515,9 @@ class SessionFrames:
         self.points.add(point)
 
     def _add_energies(self) -> None:
-        """Adds new values of the stored and the supplied energy to the plot on the web page.
+        """Adds new values of the stored and supplied energy to the plot.
 
-        There is a value for each complete control period. At most one value per
+        There is one value per complete control period, of which at most one per
         `ENERGY_PERIOD_S` becomes a point.
         """
         energy = self._view.energy
@@ -599,15 +596,15 @@ class SessionFrames:
     def _compute_age_ms(self, site: str, tick: int, t_s: float) -> float | None:
         """Returns the age of the displayed pose of an arm at a given time, in ms.
 
-        The age shows the users of an experiment or a demonstration the delay of a remote arm.
+        The age shows users the delay of a remote arm.
 
         Args:
             site: Name of the site.
-            tick: Tick of the record. It is -1 before the first record.
+            tick: Tick of the record, or -1 before the first record.
             t_s: The time, in s.
 
         Returns:
-            The age. `None` before the first record.
+            The age, or `None` before the first record.
         """
         if tick < 0:
             return None
@@ -619,18 +616,18 @@ class SessionFrames:
     def _describe_peer(self, site: str, peer: str, tick: int) -> Json:
         """Returns the pose in which the user of a site sees the arm of a peer.
 
-        The pose is stored for the next frame: if the record of a tick is missing, the user sees
-        the pose of the previous frame again. Users of different sites see different poses,
-        because their delays differ. Therefore a pose is stored per site and peer.
+        If the record of a tick is missing, the user sees the pose of the previous frame again,
+        so each pose is stored for the next frame. Since delays differ between users, a pose is
+        stored per site and peer.
 
         Args:
             site: Name of the user's site.
             peer: Name of the site whose arm is described.
-            tick: Tick of the peer (period of its control loop) that the user sees.
+            tick: Tick of the peer that the user sees.
 
         Returns:
-            The pose as `_ArmFrames.describe_pose` returns it, its tick, and the poses of the
-            bodies that the arm can touch. Before the first record, it is the start pose.
+            The pose in the format of `_ArmFrames.describe_pose`, its tick, and the poses of the
+            bodies that the arm can touch. Before the first record, the start pose.
         """
         arm = self._arms[peer]
         pose = self._peer_poses.get((site, peer)) or arm.describe_start()
@@ -650,16 +647,16 @@ class SessionFrames:
         return pose
 
     def _describe_site(self, name: str, site: SiteView) -> tuple[Json, list[float]]:
-        """Describes the present state of one arm and its controller (site) for web pages.
+        """Describes the current state of one site for web pages.
 
         Args:
             name: Name of the site.
             site: View of the site, which must have published a record.
 
         Returns:
-            The state as plain values for JSON, with the fields of `_ArmFrames.describe_now` and
-            those that are explained below; and the four largest values since the previous
-            frame, as `_ArmFrames.describe_now` returns them.
+            The state as JSON-compatible values, with the fields of `_ArmFrames.describe_now`
+            and those that are explained below; and the four largest values since the previous
+            frame, as returned by `_ArmFrames.describe_now`.
         """
         record = site.record
         stats = site.stats
@@ -717,7 +714,7 @@ class SessionFrames:
     ) -> tuple[Json, list[float], bool]:
         """Describes the newest state of an arm, with the extremes since the last description.
 
-        If there are no new records, the newest record is evaluated again.
+        If there are no new records, the newest one is evaluated again.
 
         Returns:
             The state of the arm, the extremes, and True if there are new records.
@@ -739,16 +736,13 @@ class SessionFrames:
         return state, extremes, has_new_records
 
     def _describe_link(self, name: str) -> Json:
-        """Returns the present state of a link: age of samples in use, settings and counts.
-
-        A link is the connection from one site to another, over which the sites send the states
-        of their arms.
+        """Returns the current state of a link: age of samples in use, settings and counts.
 
         Args:
             name: Name of the link, for example "m1->s".
 
         Returns:
-            Plain values. The age is `None` before the first sample comes into use.
+            Plain values. The age is `None` until the first sample is used.
         """
         view = self._view
         peer, _, receiver = name.partition("->")
@@ -788,17 +782,14 @@ class SessionFrames:
 
 
 def _count_samples(receiving: SiteView, peer: str) -> Json:
-    """Returns the number of a peer's messages that have arrived at a site, and their delay.
-
-    A message (sample) is the state that a peer, another site, publishes in a control period.
-    The receiving site counts them in its statistics.
+    """Returns the number of a peer's samples that have arrived at a site, and their delay.
 
     Args:
-        receiving: View of the receiving site.
+        receiving: View of the receiving site, whose statistics contain the counts.
         peer: Name of the peer.
 
     Returns:
-        Delay in us, and numbers of accepted, late and lost samples. Empty before the first
+        Delay in us, and number of accepted, late and lost samples. Empty before the first
         statistics.
     """
     stats = receiving.stats
@@ -815,8 +806,8 @@ def _count_samples(receiving: SiteView, peer: str) -> Json:
 def _describe_alarm(alarm: LifeAlarm) -> Json:
     """Returns an alarm, for example about a stopped arm, in the format of a web page.
 
-    The page has a button for the command that ends the alarm. Therefore the advice does not
-    name a shell command.
+    The page has a button for the command that clears the alarm, so the advice does not mention
+    a shell command.
     """
     advice = alarm.before if alarm.order else alarm.advice
     return {
@@ -834,7 +825,7 @@ def _render_event(event: Event) -> Json:
         event: The event.
 
     Returns:
-        The parts of its line, as plain values for JSON.
+        The parts of its line, as JSON-compatible values.
     """
     t_s = None if event.t_ns < 0 else event.t_ns / NS_PER_S
     text = Change.describe_event(event.kind, event.text, event.command)

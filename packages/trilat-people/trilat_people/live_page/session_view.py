@@ -51,11 +51,11 @@ from trilat_net.scenario import (
 )
 
 LATE_S = 3.0
-"""An observer has joined late if the first record that it receives has a later time, in s."""
+"""An observer joined late if the first record that it receives is later than this, in s."""
 MIN_SILENCE_NS = 2 * NS_PER_S
 """Silence after which a running site is reported as silent, in ns."""
 EVENTS_KEPT = 400
-"""Number of events that are kept for new pages."""
+"""Number of events kept for new pages."""
 
 T = TypeVar("T")
 
@@ -383,13 +383,13 @@ class SessionView:
         self.links.advance_to(newest_ns)
 
     def _note_presence(self, now_ns: int) -> None:
-        """Records which sites have appeared on the network or disappeared, for `has_left`.
+        """Tracks which sites have appeared on the network or disappeared, for `has_left`.
 
         Each member of a session has a liveliness token, which the network removes when the
-        member disappears. Recorders do not count.
+        member disappears. Recorders are ignored.
 
         Args:
-            now_ns: Present time on the monotonic clock, in ns.
+            now_ns: Current time on the monotonic clock, in ns.
         """
         while (change := self._presence.poll()) is not None:
             key, is_alive = change
@@ -405,7 +405,7 @@ class SessionView:
 
     @property
     def complete_ticks(self) -> dict[str, int]:
-        """Mapping from site to the last tick whose records have all arrived or been lost."""
+        """Mapping from site to the tick up to which all records have arrived or been lost."""
         return {name: site.complete for name, site in self.sites.items()}
 
     def find_peer_ticks(
@@ -437,10 +437,9 @@ class SessionView:
         return peer_ticks
 
     def _connect_to_sites(self) -> None:
-        """Receives the replies of a session's processes, and observes its sites once they run.
+        """Receives replies from the members of a session, and observes its sites once they run.
 
-        A site is the controller of one arm. The scenario (settings of the session) comes with
-        the first reply. An invalid scenario is counted as dropped.
+        The scenario is part of the first reply. An invalid scenario is counted as dropped.
         """
         for info in self._query.poll():
             self.members[info.member] = info
@@ -459,13 +458,13 @@ class SessionView:
             self._create_sites(self.scenario)
 
     def _create_sites(self, scenario: Scenario) -> None:
-        """Creates the view of each site, the tables of the links and the energy of the session.
+        """Creates the views of the sites, the link tables and the energy of the session.
 
-        This is possible only when all sites run, because the energy is computed for all arms
-        together.
+        Requires that all sites run, since the energy is computed for all arms together.
 
         Args:
-            scenario: Scenario of the session. All of its sites must have replied and run.
+            scenario: Scenario of the session. All of its sites must have replied that they are
+                running.
         """
         self.links = LinkTables(scenario.links, scenario.timeline)
         self.dominance = {site: dict(scenario.dominance[site]) for site in scenario.names}
@@ -481,15 +480,15 @@ class SessionView:
             )
 
     def _receive(self, key: str, block: bytes, mono_ns: int) -> None:
-        """Decodes a message of a site, and stores each record, statistic or event in it.
+        """Decodes a message from a site, and stores each record, statistic or event in it.
 
-        Messages of other members are ignored. The first record or statistics of a site show
-        whether this observer has joined late. If so, earlier ones are not requested.
+        Messages from other members are ignored. The first record or statistics of a site show
+        whether this observer joined late, in which case earlier ones are not requested.
 
         Args:
-            key: Key of the message in the network.
-            block: Bytes of the message, on the channel of records those of several records.
-            mono_ns: Time of the arrival on the monotonic clock, in ns.
+            key: Key of the message on the network.
+            block: Bytes of the message, which contains several records on the record channel.
+            mono_ns: Arrival time on the monotonic clock, in ns.
 
         Raises:
             WireError: The message cannot be decoded.
@@ -523,17 +522,18 @@ class SessionView:
                 self._store(parts.member, site, channel, message.content)
 
     def _accept_new_boot(self, name: str, payload: bytes) -> bool:
-        """Follows a site that was started again, if an event announces the new start.
+        """Switches to a restarted site, if an event announces the restart.
 
-        Each start of a site has a random number, its boot. Messages of an unknown boot are
-        dropped until an event states that the new process has joined the session.
+        Each start of a site is identified by a random number, its boot. Messages with an
+        unknown boot are dropped until an event announces that the new process has joined the
+        session.
 
         Args:
             name: Name of the site.
             payload: The event.
 
         Returns:
-            True if the event belongs to a new start of the site that may join.
+            True if the event belongs to a restarted site that may join.
         """
         event = decode(payload, Event)
         site = self.sites[name]
@@ -549,13 +549,13 @@ class SessionView:
         return True
 
     def _skip_records_before(self, site: SiteView, content: State | LinkStats | Event) -> None:
-        """Gives up requesting records that a site sent before a late observer joined.
+        """Stops requesting records that a site sent before a late observer joined.
 
-        All events of the site (arm controller) are still requested.
+        All events of the site are still requested.
 
         Args:
             site: The site.
-            content: The first message of the site.
+            content: The first message from the site.
         """
         tick = 0
         if isinstance(content, State | LinkStats):
@@ -574,13 +574,10 @@ class SessionView:
     def _store(
         self, name: str, site: SiteView, channel: str, content: State | LinkStats | Event
     ) -> None:
-        """Stores the content of a new message, from where pages read it.
-
-        A record is the result of one control period of an arm, and an event reports something
-        rare, such as the end of the run.
+        """Stores the content of a new message, to be shown on pages.
 
         Args:
-            name: Name of the site that sent it.
+            name: Name of the site that sent the message.
             site: View of this site.
             channel: Channel of the message.
             content: A record, statistics, or an event.
@@ -593,10 +590,10 @@ class SessionView:
             self._store_event(name, site, content)
 
     def _store_record(self, name: str, site: SiteView, record: State) -> None:
-        """Stores a received record of an arm, and applies the changes of settings in it.
+        """Stores a received record, and applies any changes of settings in it.
 
-        Records that were sent again may come late. Only a newer record becomes the site's
-        `record`.
+        Resent records may arrive late, so `record` of the site is updated only if the record is
+        newer.
 
         Args:
             name: Name of the site.
@@ -618,11 +615,11 @@ class SessionView:
             self._apply_change(name, change)
 
     def _store_event(self, name: str, site: SiteView, event: Event) -> None:
-        """Stores an event for the pages, and the news about an arm that it contains.
+        """Stores an event for the pages, and updates the state of the site from it.
 
         An event of the kind "hand" names the person or program that took hold of the arm. An
-        event of the kind "change" names the sender of a request to stop, and may contain a
-        change of links or weights.
+        event of the kind "change" names who requested a stop, and may contain a change of links
+        or dominance factors.
 
         Args:
             name: Name of the site.
@@ -643,7 +640,7 @@ class SessionView:
     def _apply_change(self, site: str, text: str) -> None:
         """Applies a change of the session to the displayed links, weights and energies.
 
-        A change is in a record and in an event of its site. It is applied only once.
+        A change appears both in a record and in an event of its site, but is applied only once.
 
         Args:
             site: Name of the site that carried out the change.

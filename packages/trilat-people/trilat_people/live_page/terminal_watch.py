@@ -33,11 +33,10 @@ STOP_KEYS = frozenset(" sS")
 SessionOnlooker = Callable[
     [Bus], AbstractContextManager[tuple[SessionView, Callable[[], None]]]
 ]
-"""Function that shows a session, given a network connection that reaches the session.
+"""Function that shows a session, given a network connection that reaches it.
 
-The function returns a context manager. The session is shown within the `with` statement. The
-context manager yields the state of the session, and a function that must be called often to
-update the display.
+Returns a context manager that shows the session while active. It yields the state of the
+session and a function that must be called often to update the display.
 """
 
 
@@ -281,11 +280,11 @@ def show_in_terminal(
 
 @contextmanager
 def _read_keys() -> Iterator[Callable[[], str] | None]:
-    """Yields a function that returns the keys pressed since its last call, without waiting.
+    """Context manager that yields a non-blocking function to read the keys just pressed.
 
-    In the `with` block, the terminal passes on each key at once and does not show it. Its
-    settings are restored at the end. If this process does not own a terminal, `None` is
-    yielded, and keys cannot stop the arms.
+    While it is active, the terminal passes on each key immediately and does not echo it. The
+    terminal settings are restored on exit. If this process does not own a terminal, yields
+    `None`, and keys cannot stop the arms.
     """
     try:
         import termios
