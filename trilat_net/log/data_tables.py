@@ -1,19 +1,18 @@
-"""Converts a log to tables of numbers, which are exported to CSV, Parquet and data frames.
+"""Converts a log to tables that can be exported to CSV, Parquet and data frames.
 
-There are four kinds of tables for an arm or a run: the states of an arm (a row for each period
-of its control loop), the states that it received from other arms, the statistics of its network
-connections, and the events of the run. For example, a column of the first kind is `q1_rad`, the
-angle of joint 1.
+There are four kinds of tables: the states of an arm (one row per tick), the states that it
+received from other arms, the statistics of its network links, and the events of the run. For
+example, the column `q1_rad` of the first kind is the angle of joint 1 in rad.
 
 Invariant:
-    - Every number is taken from the log, or follows exactly from numbers of the log (an age is
-      a difference between time stamps). The only exceptions are orientations, which the table
-      contains as unit quaternions that do not jump (see `orientations`).
+    - Every value is taken from the log, or follows exactly from values in the log (an age is a
+      difference of two time stamps). The only exceptions are orientations, which are given as
+      unit quaternions that do not jump (see `orientations`).
     - The name of a column ends in its unit. A missing value is null, never a number.
     - Units, names and meanings come from the message types and from the declarations of control
-      laws. Thus nothing is described in two places.
-    - A number that is out of range, or a state from an arm that the receiver does not follow,
-      raises a `LogError` that names the file.
+      laws, so nothing is described in two places.
+    - A number out of range, or a state from an arm that the receiver does not follow, raises a
+      `LogError` that names the file.
 """
 
 import dataclasses
@@ -83,14 +82,14 @@ _STEADY_QUATERNION = "a unit quaternion w, x, y, z, each nearest to the one befo
 
 
 class Column(NamedTuple):
-    """One column of a table that is exported from a log, with K rows.
+    """One column of a table exported from a log, with K rows.
 
     Attributes:
         name: Name of the column, which ends in its unit, such as "t_s".
-        values: The values, shape (K,): numbers, or texts as objects.
-        unit: Unit of the values. Empty for texts and counts.
-        meaning: Description of the values for the reader of the table.
-        source: Field of the message from which the values are taken.
+        values: The values, shape (K,): numbers, or strings as objects.
+        unit: Unit of the values. Empty for strings and counts.
+        meaning: Description of the values for readers of the table.
+        source: Message field that the values are taken from.
         known: True for the rows that have a value, shape (K,). None if all rows have one.
     """
 
@@ -103,35 +102,34 @@ class Column(NamedTuple):
 
     @property
     def is_text(self) -> bool:
-        """True if the values of the column are strings, and False if they are numbers."""
+        """True if the column holds strings, False if it holds numbers."""
         return self.values.dtype == np.object_
 
     def numbers(self) -> NDArray[Any]:
-        """Returns the values of a numeric column as an array, with NaN for missing values.
+        """Returns a numeric column as an array of shape (K,), with NaN for missing values.
 
-        The shape is (K,). Exports to formats without missing values, such as NumPy files, use
-        this array.
+        Used for export to formats that cannot represent missing values, such as NumPy files.
         """
         if self.known is None or self.known.all():
             return self.values
         return np.where(self.known, self.values, np.nan)
 
     def texts(self) -> NDArray[Any]:
-        """Returns the values of a column of texts as NumPy strings, shape (K,).
+        """Returns a string column as an array of NumPy strings, shape (K,).
 
-        Formats for numbers, such as .npz, store texts in this way.
+        Array formats such as .npz store strings in this form.
         """
         return np.array(self.values.tolist(), dtype=np.str_)
 
     def rows(self, first: int, last: int) -> list[Any]:
-        """Returns some consecutive values of the column as plain Python values, as for CSV.
+        """Returns a slice of the column as plain Python values, as needed for CSV.
 
         Args:
             first: Index of the first row.
             last: Index after the last row.
 
         Returns:
-            The values. None for a row without a value.
+            The values, with None for rows without a value.
         """
         values: list[Any] = self.values[first:last].tolist()
         if self.known is None:
@@ -144,14 +142,14 @@ class Column(NamedTuple):
 
 @dataclass(frozen=True)
 class Table:
-    """A table that is exported from a log, such as the joint angles of an arm over time.
+    """A table exported from a log, such as the joint angles of an arm over time.
 
-    All its columns have the same length.
+    All columns have the same length.
 
     Attributes:
-        name: Name of the site (arm controller) whose messages the table contains, or "events".
+        name: Name of the site whose messages the table contains, or "events".
         kind: Kind of a site's table, one of `SITE_TABLE_KINDS`. Empty for other tables.
-        about: Description of a row for the reader of the table.
+        about: Explains to readers of the table what one row contains.
         columns: The columns.
     """
 
@@ -176,16 +174,17 @@ class Table:
 
     @property
     def label(self) -> str:
-        """Name of the table for file names, such as "m1_link" for the links of the site "m1".
+        """Name of the table for use in file names, such as "m1_link" for the links of site
+        "m1".
 
-        A table about all sites has a name without a site, such as "events".
+        The name of a table about all sites contains no site, for example "events".
         """
         return f"{self.name}_{self.kind}" if self.kind else self.name
 
     def to_data_frame(self) -> "polars.DataFrame":
-        """Converts a table of a log to a polars data frame with the same columns.
+        """Converts the table to a polars data frame with the same columns.
 
-        A missing value becomes null.
+        Missing values become null.
 
         Raises:
             UsageError: polars is not installed.
@@ -204,9 +203,9 @@ class Table:
         return cast("polars.DataFrame", pl.DataFrame(all_series))
 
     def to_pandas(self) -> "pandas.DataFrame":
-        """Converts a table of a log to a pandas data frame with the same columns.
+        """Converts the table to a pandas data frame with the same columns.
 
-        Missing values become None in a column of texts, and NaN in a column of numbers.
+        Missing values become None in string columns and NaN in numeric columns.
 
         Raises:
             UsageError: pandas is not installed.
@@ -221,14 +220,15 @@ class Table:
 
     @classmethod
     def of_states(cls, site: SiteLog, scenario: Scenario) -> "Table":
-        """Creates a table of an arm's angles, torques and other values, a row per tick.
+        """Creates a table of an arm's angles, torques and other quantities, with one row per
+        tick.
 
         Args:
-            site: Records (results of control periods) of the site (arm controller).
+            site: Records of the site.
             scenario: Scenario of the session, which names the joints and parameters.
 
         Returns:
-            The table, in the order of the ticks.
+            The table, in tick order.
         """
         docs = read_field_docs(State)
         arm = scenario.arms[site.name]
@@ -267,19 +267,19 @@ class Table:
 
     @classmethod
     def of_arrivals(cls, site: SiteLog, source: str, *, live: bool) -> "Table":
-        """Creates a table of the messages that a site received, with their delays.
+        """Creates a table of the samples that a site received from its peers, with their
+        delays.
 
-        A message (sample) is the state that a peer, another site (arm controller), publishes in
-        one tick (control period). The table has one row per message, in the order of arrival.
+        The table has one row per sample, in order of arrival.
 
         Args:
             site: Records of the receiving site, which list the arrivals.
             source: Name of the file for error messages.
-            live: True if the session was live. The delays were then measured. In virtual time
-                the delays are the ages of the samples.
+            live: True if the session was live, in which case the delays were measured. In
+                virtual time the delays are the ages of the samples.
 
         Raises:
-            LogError: A record contains an arrival from a peer that the site does not have.
+            LogError: A record lists an arrival from a peer that the site does not have.
         """
         counts, entries = site.arrivals
         index = entries[:, 0]
@@ -331,17 +331,17 @@ class Table:
     def of_link_stats(
         cls, site: SiteLog, timed: TimedMessages[LinkStats], source: str
     ) -> "Table":
-        """Creates the table of a site's statistics about its network links, a row per message.
+        """Creates a table of a site's network link statistics, with one row per message.
 
-        A field that contains a number per peer (other site) becomes a column per peer.
+        A field with one value per peer becomes one column per peer.
 
         Args:
-            site: Records of the site (arm controller).
-            timed: The statistics messages, with their times of arrival and sending.
+            site: Records of the site.
+            timed: The statistics messages, with their arrival and sending times.
             source: Name of the file for error messages.
 
         Returns:
-            The table, in the order of the ticks (control periods).
+            The table, in tick order.
 
         Raises:
             LogError: A number is out of range.
@@ -376,16 +376,15 @@ class Table:
     def of_events(cls, timed: TimedMessages[Event], source: str) -> "Table":
         """Creates a table of the events of a session, with one row per event.
 
-        An event is a message about something that happened once, for example that a site (arm
-        controller) has joined. The rows have the order in which the events arrived at the
-        recorder.
+        An event is a message about something that happened once, for example that a site
+        joined. Rows are in the order in which the events arrived at the recorder.
 
         Args:
-            timed: The events, with their times of sending and of arrival.
+            timed: The events, with their sending and arrival times.
             source: Name of the file for error messages.
 
         Raises:
-            LogError: An integer of an event is too large for 64 bits.
+            LogError: An integer of an event does not fit in 64 bits.
         """
         events = timed.messages
         t_ns = _to_int_array((event.t_ns for event in events), source, "t_ns")
@@ -447,13 +446,13 @@ class _FieldDoc(NamedTuple):
 def read_field_docs(kind: type[msgspec.Struct]) -> dict[str, _FieldDoc]:
     """Collects the documentation of the fields of a message type.
 
-    The meanings are taken from the docstring of the type, and the units from its JSON Schema.
+    The meanings come from the docstring of the type, and the units from its JSON Schema.
 
     Args:
         kind: Type of the messages, such as `State`.
 
     Returns:
-        The documentation by name of the field, in the order of definition.
+        Maps the name of each field to its documentation, in order of definition.
     """
     docstring = inspect.getdoc(kind) or ""
     texts = dict(_FIELD.findall(docstring))
