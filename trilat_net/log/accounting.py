@@ -301,8 +301,7 @@ class Account:
         self.unpublished -= last + 1 - first
 
     def abandon_below(self, number: int) -> None:
-        """Gives up on the missing messages below a number, which no process can resend any
-        more.
+        """Gives up on missing messages below a number, which no process can resend.
 
         They are no longer requested but still count as missing. If such a message arrives after
         all, it counts as received.

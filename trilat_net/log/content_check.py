@@ -237,8 +237,7 @@ class ContentCheck:
         payload: bytes,
         span_ns: tuple[int, int],
     ) -> None:
-        """Raises UnreadableRecord unless the content shows that a message is its channel's
-        next.
+        """Raises UnreadableRecord unless a message is provably the next of its channel.
 
         Used for messages that no checksum covers. A message that passes is stored for later
         comparison, as `accept` does.

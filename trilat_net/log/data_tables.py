@@ -174,8 +174,7 @@ class Table:
 
     @property
     def label(self) -> str:
-        """Name of the table for use in file names, such as "m1_link" for the links of site
-        "m1".
+        """Name of the table for file names, such as "m1_link" for the links of site "m1".
 
         The name of a table about all sites contains no site, for example "events".
         """
@@ -220,8 +219,7 @@ class Table:
 
     @classmethod
     def of_states(cls, site: SiteLog, scenario: Scenario) -> "Table":
-        """Creates a table of an arm's angles, torques and other quantities, with one row per
-        tick.
+        """Creates a table of an arm's angles, torques and other values, one row per tick.
 
         Args:
             site: Records of the site.
@@ -267,8 +265,7 @@ class Table:
 
     @classmethod
     def of_arrivals(cls, site: SiteLog, source: str, *, live: bool) -> "Table":
-        """Creates a table of the samples that a site received from its peers, with their
-        delays.
+        """Creates a table of the samples that a site received, with their delays.
 
         The table has one row per sample, in order of arrival.
 
