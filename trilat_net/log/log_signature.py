@@ -1,14 +1,14 @@
-"""Signs logs, so that anybody can check later that a log was not changed.
+"""Signs logs, so that anyone can later verify that a log has not been changed.
 
 A log contains digests of its contents (`running_digest`). The owner of a private key signs
-these digests with the method Ed25519, and stores the signature in a separate file beside the
-log. Anybody with the public key can check that the log is the one that was signed. A signature
-covers all messages and everything that describes them, but not the compression. It is therefore
-also valid for a copy of the log that was compressed differently.
+these digests with Ed25519 and stores the signature in a separate file next to the log. Anyone
+who has the public key can verify that the log is the one that was signed. A signature covers
+all messages and everything that describes them, but not the compression, so it also holds for a
+copy of the log that was compressed differently.
 
 Invariant:
-    - A log is only read, and never changed.
-    - Only a log that agrees with its digests is signed.
+    - A log is only read, never changed.
+    - Only a log that matches its digests is signed.
 """
 
 import base64
@@ -65,19 +65,19 @@ class _LogSignature(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 def create_signing_keys(path: str | Path) -> tuple[Path, Path]:
-    """Creates a pair of keys for signing logs, as `trilat keys pair` does.
+    """Creates a key pair for signing logs, like `trilat keys pair`.
 
-    The private key is written to PATH.key, which only the user may read. The public key is
-    written to PATH.pub.
+    The private key is written to PATH.key, which only the user may read, and the public key to
+    PATH.pub.
 
     >>> [file.name for file in tn.create_signing_keys("lab")]
     ['lab.key', 'lab.pub']
 
     Args:
-        path: Name of the files without their suffixes.
+        path: Path of the files without the suffix.
 
     Returns:
-        The files of the private and of the public key.
+        Paths of the private and the public key file.
 
     Raises:
         UsageError: One of the files exists, or cannot be written.
@@ -108,25 +108,25 @@ def sign_log(
     force: bool = False,
     progress: Progress | None = None,
 ) -> Path:
-    """Signs a finished log, as `trilat log sign` does.
+    """Signs a finished log, like `trilat log sign`.
 
     >>> path = tn.simulate("two_sites", duration_s=0.1).save("signed.mcap")
     >>> tn.sign_log(path, tn.create_signing_keys("mine")[0]).name
     'signed.mcap.sig'
 
     Args:
-        path: The log.
-        key_file: File of the private key.
-        force: True if an existing signature may be replaced.
+        path: Path of the log.
+        key_file: Path of the private key file.
+        force: True to allow replacing an existing signature.
         progress: Function that is called after every record of the log.
 
     Returns:
-        The file of the signature.
+        Path of the signature file.
 
     Raises:
-        LogError: The log cannot be read, has no digests, or does not agree with its digests.
-        UsageError: The key file is not a private key, other users can read it, or there is a
-            signature already.
+        LogError: The log cannot be read, has no digests, or does not match its digests.
+        UsageError: The key file is not a private key, other users can read it, or a signature
+            already exists.
     """
     path = Path(path)
     key_file = Path(key_file)
@@ -168,19 +168,18 @@ def sign_log(
 def check_signatures(
     paths: Sequence[Path], key_file: Path, progress: Progress | None = None
 ) -> Finding:
-    """Checks that logs are exactly those that the owner of a public key has signed.
+    """Checks that logs are exactly those signed by the owner of a public key.
 
-    A digest reveals only accidental changes, because anybody can compute it again. A signature
-    shows who vouches for the log.
+    A digest reveals only accidental changes, because anyone can recompute it. A signature shows
+    who vouches for the log.
 
     Args:
-        paths: The logs. The signature of a log is in a file beside it.
-        key_file: File of the public key of a signer whom the user trusts.
-        progress: Function that is called after every record (result of a control period) of a
-            log.
+        paths: Paths of the logs. The signature of each log is in a file next to it.
+        key_file: Path of the public key file of a signer whom the user trusts.
+        progress: Function that is called after every record of a log.
 
     Returns:
-        The result, with a problem for each log whose signature is missing or invalid.
+        A finding with one problem for each log whose signature is missing or invalid.
 
     Raises:
         LogError: A log cannot be read.

@@ -1,16 +1,16 @@
-"""Writes the log of a session into one MCAP file or into several parts.
+"""Writes the log of a session to a single MCAP file or to several parts.
 
 The parts of run.mcap are called run-001.mcap, run-002.mcap and so on. A part ends when it
-reaches the size or the duration that the user has set.
+reaches the size or the duration set by the user.
 
 Invariant (L5):
-    - Every file can be understood without other files: the session, the scenario and the
-      schemas precede the first message.
-    - The messages are stored byte for byte as they were published.
-    - The numbers of received and missing messages (the accounts) are at the end of the file.
+    - Every file can be understood on its own: the session, the scenario and the schemas precede
+      the first message.
+    - Messages are stored byte for byte as they were published.
+    - The accounts (counts of received and missing messages) are at the end of the file.
     - Each part repeats the session, the scenario and the schemas, and names the previous part.
-    - Each message is in exactly one part, because the writing thread begins a new part between
-      two messages.
+    - Each message is in exactly one part, because the writing thread starts a new part only
+      between two messages.
 """
 
 import glob
@@ -65,7 +65,7 @@ class _LogViews(Protocol):
 
     @property
     def most_bytes(self) -> int:
-        """Upper limit for the size of messages for viewers that are not written yet, in bytes.
+        """Upper bound on the size of viewer messages that are still to be written, in bytes.
 
         A writer adds this size when it decides whether the next message still fits into the
         file.
@@ -77,14 +77,14 @@ class _LogViews(Protocol):
         A channel is registered in the file only when its first message is written.
 
         Args:
-            file: The file.
+            file: Writer of the MCAP file.
         """
 
     def finish(self, log_ns: int) -> None:
-        """Writes the remaining messages for viewers such as Foxglove, at the end of the log.
+        """Writes the remaining messages for viewers such as Foxglove at the end of the log.
 
         Args:
-            log_ns: Arrival time of the last message of the session, in Unix time, in ns.
+            log_ns: Arrival time of the last message of the session in Unix time, in ns.
         """
 
 
@@ -99,27 +99,27 @@ writes a message.
 class LogWriter:
     """Writes the messages of a session, and everything that describes them, to one log file.
 
-    In addition to the messages as they were published, it can write messages for viewers, which
-    are derived from them.
+    Besides the messages as published, it can write messages for viewers that are derived from
+    them.
 
     Args:
-        stream: File or buffer that receives the bytes.
+        stream: File or buffer to write to.
         scenario: Scenario of the session.
         session: Name of the session.
         driver: Kind of time in the session: "live" or "virtual".
-        epoch_unix_ns: Unix time of tick 0, in ns. It is 0 in virtual time.
+        epoch_unix_ns: Unix time of tick 0, in ns; 0 in virtual time.
         provenance: Facts about the program that writes the log, see `provenance`.
         facts: Further metadata of the session.
-        part: Metadata of the part, if the log has several files.
-        choice: Filter of the channels that the log contains.
+        part: Metadata of the part, if the log consists of several files.
+        choice: Filter that selects the channels to store in the log.
         make_views: Creates the messages for viewers. If None, the log contains no such
             messages.
 
     Attributes:
-        records_digest: Digest of the messages of a finished log. Empty before the end.
+        records_digest: Digest of the messages of a finished log. Empty until then.
 
     Raises:
-        LogRefused: The disk refused the data.
+        LogRefused: Writing to the disk failed.
     """
 
     def __init__(
@@ -214,9 +214,9 @@ class LogWriter:
 
     @property
     def ended(self) -> bool:
-        """True if no message can be added: the log is finished, or the disk refused data.
+        """True if no more messages can be added: the log is finished, or a write has failed.
 
-        Messages that arrive later are then missing in this file.
+        Messages that arrive later will be missing from this file.
         """
         return bool(self._end_reason)
 
@@ -227,15 +227,15 @@ class LogWriter:
 
     @property
     def written_bytes(self) -> int:
-        """Number of bytes of the log file that have been written so far."""
+        """Number of bytes of the log file written so far."""
         return self._file.position
 
     @property
     def most_bytes(self) -> int:
-        """Largest size of the file if it were finished now, in bytes.
+        """Upper bound on the size of the file if it were finished now, in bytes.
 
-        It shows whether a further message still fits into a part of limited size. The numbers
-        of received and missing messages, which `finish` also writes, are not included.
+        Used to decide whether another message still fits into a part of limited size. The
+        message counts, which `finish` also writes, are not included.
         """
         views = self._views.most_bytes if self._views is not None else 0
         return self._file.position + self._file.open_chunk_bytes + self._file.end_bytes + views
@@ -249,18 +249,19 @@ class LogWriter:
         number: int,
         message: Decoded = None,
     ) -> None:
-        """Adds one network message to the log, unless the user has excluded its channel.
+        """Adds a network message to the log, unless the user's filter excludes its channel.
 
         Args:
             key: Key of the channel.
             payload: Bytes of the message.
-            t_ns: Sending time after the start of the session, in ns.
-            log_time_ns: Arrival time, in Unix time, in ns.
+            t_ns: Sending time since the start of the session, in ns.
+            log_time_ns: Arrival time in Unix time, in ns.
             number: Sequence number.
             message: The decoded message, if the log contains messages for viewers.
 
         Raises:
-            LogRefused: The disk refused these or earlier data, or the log is finished.
+            LogRefused: Writing to the disk failed, in this call or an earlier one, or the log
+                is already finished.
         """
         if self._end_reason:
             raise LogRefused(self._end_reason)
@@ -299,23 +300,24 @@ class LogWriter:
         """Passes all messages so far to the operating system, so that a crash cannot lose them.
 
         Raises:
-            LogRefused: The disk refused the data.
+            LogRefused: Writing to the disk failed.
         """
         with self._translate_disk_errors():
             self._file.flush()
 
     def finish(self, accounts: Mapping[str, str]) -> None:
-        """Completes the file, so that other programs can read it.
+        """Completes the file so that other programs can read it.
 
-        The numbers of received and missing messages, the index and the end mark are written.
-        The stream stays open. Further calls have no effect.
+        Writes the message counts, the index and the end mark. The stream stays open. Further
+        calls have no effect.
 
         Args:
-            accounts: For each topic a text with its numbers of received and missing messages,
-                and further counts by name. Topics that the log does not record are left out.
+            accounts: Maps each topic to a string with its numbers of received and missing
+                messages, and the names of other counts to their values. Topics that the log
+                does not record are left out.
 
         Raises:
-            LogRefused: The disk refused the data.
+            LogRefused: Writing to the disk failed.
         """
         if self._end_reason == _FINISHED:
             return
@@ -363,18 +365,18 @@ It is used for the accounts, and for the messages for viewers that follow from o
 
 @dataclass(frozen=True, slots=True)
 class LogStorage:
-    """Path of a log, and the size or duration at which a new file of the log begins.
+    """Path of a log, and the size or duration at which the log continues in a new file.
 
     Attributes:
-        path: Name of the log. The name of a part also contains its number.
-        force: True if the log may replace an existing one.
-        durable: True if the file is forced onto the disk at every flush, so that a loss of
-            power does not damage the log.
-        split_bytes: Largest size of a part, in bytes. None if it is not limited.
-        split_ns: Longest duration of a part, in ns. None if it is not limited.
-        carry_on: True to continue an existing log of this name with a new part. The existing
-            log may be finished or not.
-        choice: Filter of the channels that the log contains.
+        path: Name of the log. The names of its parts also contain a number.
+        force: True to allow replacing an existing log.
+        durable: True to sync the file to the disk at every flush, so that a power failure does
+            not damage the log.
+        split_bytes: Maximum size of a part, in bytes. If None, unlimited.
+        split_ns: Maximum duration of a part, in ns. If None, unlimited.
+        carry_on: True to continue an existing log of this name, finished or not, with a new
+            part.
+        choice: Filter that selects the channels to store in the log.
     """
 
     path: Path
@@ -387,20 +389,20 @@ class LogStorage:
 
     @property
     def splits(self) -> bool:
-        """True if a limit of size or duration divides a log into several files.
+        """True if the log is split into several files by a limit on size or duration.
 
         Without a limit, a log has several files only if an existing log was continued.
         """
         return self.split_bytes is not None or self.split_ns is not None
 
     def find_parts(self) -> dict[int, Path]:
-        """Finds the existing files of the log, which may be divided into parts.
+        """Finds the existing files of the log, which may be split into parts.
 
-        Finished files and files that are still being recorded both count.
+        Both finished files and files that are still being recorded are included.
 
         Returns:
-            The files, by the number of the part. A file with the name of the log counts as part
-            1. Empty if there are none.
+            Maps the number of each part to its file. A file with the name of the log counts as
+            part 1. Empty if there are no files.
         """
         parts: dict[int, Path] = {}
         for file in (self.path, log_layout.active_path(self.path)):
@@ -414,14 +416,14 @@ class LogStorage:
         return parts
 
     def find_first_part(self) -> tuple[int, str]:
-        """Decides with which file the writing begins, and checks that its name is free.
+        """Determines which file to write first, and checks that its name is free.
 
         A log may consist of several numbered files, its parts. If an existing log is continued,
-        the new part gets the number after the last part.
+        the new part is numbered after the last one.
 
         Returns:
-            The number of the part, and the name of the previous part. The number is 0 if the
-            log is a single file. The name is empty if there is no previous part.
+            The number of the part (0 if the log is a single file), and the name of the previous
+            part (empty if there is none).
 
         Raises:
             UsageError: A log of this name exists, and neither `force` nor `carry_on` is set.
@@ -449,23 +451,21 @@ class LogStorage:
 
 
 class LogParts:
-    """Writes a log to as many files as its limits of size and duration require.
-
-    It is a context manager.
+    """Context manager that writes a log, split into files according to its limits.
 
     Args:
-        storage: Place of the log, and its division into parts.
-        begin: Function that creates the `LogWriter` of a file, with the metadata of the part.
+        storage: Path of the log and limits on the size and duration of its parts.
+        begin: Function that creates the `LogWriter` of a file, given the metadata of the part.
             The metadata are empty for a log in a single file.
-        opened: Function that opens a file by its path. If None, `LogFile` is used.
+        opened: Function that opens a file, given its path. If None, `LogFile` is used.
 
     Attributes:
-        current_accounts: Function that returns the accounts, which are the numbers of received
-            and missing messages of each topic. They are written at the end of a full part.
+        current_accounts: Function that returns the accounts (counts of received and missing
+            messages of each topic) to write at the end of a full part.
 
     Raises:
         UsageError: The name is in use, or the file cannot be created.
-        LogRefused: The disk refused the data.
+        LogRefused: Writing to the disk failed.
     """
 
     def __init__(
@@ -564,13 +564,13 @@ class LogParts:
     def path(self) -> Path:
         """Final name of the file that is being written, such as run-002.mcap for part 2.
 
-        While it is written, the file has another name, which ends with ".active".
+        Until it is complete, the file has another name that ends in ".active".
         """
         return self._file.path
 
     @property
     def written_bytes(self) -> int:
-        """Number of bytes that have been written to all files of a divided log so far."""
+        """Number of bytes written to all files of the log so far."""
         return self._previous_bytes + self._writer.written_bytes
 
     def add(
@@ -582,20 +582,21 @@ class LogParts:
         number: int,
         message: Decoded = None,
     ) -> None:
-        """Adds one message to the log.
+        """Adds a message to the log.
 
-        If the current part has reached its largest size or duration, a new part is begun first.
+        If the current part has reached its maximum size or duration, a new part is started
+        first.
 
         Args:
             key: Key of the channel.
             payload: Bytes of the message.
-            t_ns: Sending time after the start of the session, in ns.
-            log_time_ns: Arrival time, in Unix time, in ns.
+            t_ns: Sending time since the start of the session, in ns.
+            log_time_ns: Arrival time in Unix time, in ns.
             number: Sequence number of the message.
             message: The decoded message, if the log contains messages for viewers.
 
         Raises:
-            LogRefused: The disk refused these or earlier data.
+            LogRefused: Writing to the disk failed, in this call or an earlier one.
         """
         if self._storage.splits and not self._writer.ended:
             if self._part_start_ns is None:
@@ -609,23 +610,23 @@ class LogParts:
     def flush(self) -> None:
         """Passes all messages so far to the operating system, so that a crash cannot lose them.
 
-        A loss of power can still lose messages, because the operating system writes to the disk
+        A power failure can still lose messages, because the operating system writes to the disk
         later.
 
         Raises:
-            LogRefused: The disk refused the data.
+            LogRefused: Writing to the disk failed.
         """
         self._writer.flush()
 
     def finish(self, accounts: Mapping[str, str]) -> None:
-        """Completes the last file of the log, which then gets its final name.
+        """Completes the last file of the log and gives it its final name.
 
         Args:
-            accounts: Numbers of received and missing messages as a string, by topic, and other
-                counts by name.
+            accounts: Maps each topic to a string with its numbers of received and missing
+                messages, and the names of other counts to their values.
 
         Raises:
-            LogRefused: The disk refused the data.
+            LogRefused: Writing to the disk failed.
         """
         self._writer.finish(accounts)
 

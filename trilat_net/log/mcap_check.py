@@ -1,16 +1,16 @@
 """Checks the bytes of an MCAP file: its checksums, its records and its index.
 
-An MCAP file consists of records. Messages are packed into compressed chunks. The index at the
-end of the file states where the chunks are, and each chunk is followed by an index of its
-messages. This module recomputes all checksums, and builds the index again from the records to
-compare it with the index in the file. Other programs (pymcap-cli doctor) check that a file
-conforms to every rule of the format.
+An MCAP file consists of records. Messages are packed into compressed chunks, each followed by
+an index of its messages, and the index at the end of the file states where the chunks are. This
+module recomputes all checksums, and rebuilds the index from the records to compare it with the
+one in the file. To check that a file conforms to every rule of the format, use another program
+(pymcap-cli doctor).
 
 Invariant:
-    - Each problem is reported once, with its offset. Problems that follow from another problem
+    - Each problem is reported once, with its offset. Problems that result from another problem
       are not reported.
-    - An index is compared with the records in the file, and never used to find them.
-    - Every MCAP file is accepted, not only logs of trilat-net.
+    - An index is compared with the records in the file, but never used to find them.
+    - Any MCAP file is accepted, not only logs of trilat-net.
 """
 
 from array import array
@@ -32,18 +32,17 @@ _INDEX_HEAD_BYTES = 6
 class FileCheck:
     """Checks the checksums, the records and the index of one MCAP file.
 
-    The caller reads the file, passes each record to `check_record`, and calls `finish` at the
-    end.
+    The caller reads the file, passes each record to `check_record`, and finally calls `finish`.
 
     Args:
         file: Name of the file.
         scanner: Scanner that finds the records of the file.
-        findings: Results of the checks, to which the problems are added under the names "whole"
-            (damaged or missing parts), "checksums", "records" and "index".
+        findings: Results of the checks. Problems are added under the names "whole" (damaged or
+            missing parts), "checksums", "records" and "index".
 
     Attributes:
-        counts: Numbers of bytes, chunks and messages in the file, and of compared checksums
-            ("crcs").
+        counts: Number of bytes, chunks and messages in the file, and number of checksums that
+            were compared ("crcs").
     """
 
     def __init__(
@@ -76,10 +75,10 @@ class FileCheck:
         self._has_unreadable = False
 
     def check_record(self, record: mcap_records.ScannedRecord) -> None:
-        """Checks one record of the file, and notes how it must appear in the file's index.
+        """Checks one record of the file, and stores how the index must refer to it.
 
-        The index, which is at the end of the file, is compared with these notes when the whole
-        file has been read. Problems are added to the findings.
+        The index is at the end of the file, so the comparison follows when the whole file has
+        been read. Problems are added to the findings.
 
         Args:
             record: The record.
@@ -300,8 +299,8 @@ class FileCheck:
     def finish(self) -> None:
         """Reports the damaged parts of the file, and compares its end with the data.
 
-        The end has an index and statistics. The end is compared only if the file was finished
-        and has no damaged part, because otherwise everything would differ.
+        The end holds an index and statistics. It is compared only if the file was finished and
+        has no damaged part, since otherwise everything would differ.
         """
         scanner = self._scanner
         if not scanner.begins:

@@ -1,18 +1,19 @@
 """Reads MCAP files chunk by chunk, and collects the messages of a log by topic.
 
 An MCAP file stores messages in compressed chunks. Each message belongs to a channel, which has
-a topic (a name). `McapReader` reads any MCAP file. `LogContents.read` uses it to read a log of
-trilat-net, which contains the messages of a session, completely.
+a topic (a name). `McapReader` reads any MCAP file. `LogContents.read` uses it to load a
+complete log of trilat-net.
 
 Invariant:
-    - The reader has one unpacked chunk in memory at a time. Parts that cannot be read are
-      skipped and reported.
+    - The reader holds one uncompressed chunk in memory at a time. Unreadable parts are skipped
+      and reported.
     - The messages of a log stay encoded until they are needed.
-    - `McapReader.blocks` yields the messages of `McapReader.messages`, in the same order on
-      each channel, and finds the same damage.
-    - Channels that are written for viewers (/viz) are skipped.
-    - The memory is bounded, even if a file was made to do harm. A channel whose messages would
-      need too much memory is read in part. The other channels are read completely.
+    - `McapReader.blocks` yields the same messages as `McapReader.messages`, in the same order
+      within each channel, and finds the same damage.
+    - Channels written for viewers (/viz) are skipped.
+    - Memory is bounded, even if a file was crafted to cause harm. A channel whose messages
+      would need too much memory is read only in part, and the other channels are read
+      completely.
 """
 
 import math
@@ -74,19 +75,19 @@ Progress = Callable[[int, int], None]
 
 
 def shift_progress(progress: Progress | None, before: int, total: int) -> Progress | None:
-    """Converts the progress in one of several files to the progress in all of them.
+    """Converts the progress within one of several files to the overall progress.
 
-    Several files are read one after another. The returned function receives the progress in the
-    present file, adds the sizes of the earlier files, and calls `progress`.
+    For files that are read one after another. The returned function takes the progress in the
+    current file, adds the sizes of the earlier files, and calls `progress`.
 
     Args:
-        progress: Function that receives the progress in all files, in bytes. None if the
-            progress is not needed.
-        before: Size of the files that were read before, in bytes.
-        total: Size of all files, in bytes.
+        progress: Function that is called with the overall progress, in bytes. None if progress
+            is not reported.
+        before: Total size of the files already read, in bytes.
+        total: Total size of all files, in bytes.
 
     Returns:
-        The function for the present file. None if `progress` is None.
+        The progress function for the current file, or None if `progress` is None.
     """
     if progress is None:
         return None
@@ -102,8 +103,8 @@ class ChannelInfo(NamedTuple):
         schema: Name of the schema, which describes the fields of the messages. Empty if the
             channel has no schema.
         schema_encoding: Language in which the schema is written.
-        metadata: Further facts about the channel, by name.
-        schema_data: Text of the schema, encoded.
+        metadata: Maps the names of further facts about the channel to their values.
+        schema_data: Encoded text of the schema.
     """
 
     topic: str
@@ -115,13 +116,13 @@ class ChannelInfo(NamedTuple):
 
 
 class McapMessage(NamedTuple):
-    """One message of an MCAP file, with its channel, times and number, still encoded.
+    """One message of an MCAP file, still encoded, with its channel, times and number.
 
     Attributes:
         topic: Topic of the channel. Empty if the file does not define the channel.
         payload: Bytes of the message, as published.
-        log_time_ns: Time of arrival at the recorder, in Unix time, in ns.
-        publish_time_ns: Time of sending, in Unix time, in ns.
+        log_time_ns: Arrival time at the recorder in Unix time, in ns.
+        publish_time_ns: Sending time in Unix time, in ns.
         sequence: Sequence number of the message, modulo 2^32.
     """
 
@@ -160,25 +161,25 @@ class _MessageBlock(NamedTuple):
 
     @property
     def most_bytes(self) -> int:
-        """Upper limit of the total length of the messages in this block, in bytes.
+        """Upper bound on the total length of the messages in this block, in bytes.
 
         A reader reserves this much memory before it copies the messages.
         """
         return int(self.run.lengths[self.slot])
 
     def copy_payloads(self, target: NDArray[np.uint8], offset: int) -> tuple[Ints, Ints]:
-        """Copies the payloads of the K messages one after another into an array.
+        """Copies the payloads of the K messages into an array, one after another.
 
-        It must be called before the reader continues, which reuses the memory of `run`.
+        Call this before the reader continues, because the reader reuses the memory of `run`.
 
         Args:
-            target: Array that receives the payloads.
-            offset: Offset in `target` at which the first payload begins.
+            target: Array to copy the payloads to.
+            offset: Offset in `target` of the first payload.
 
         Returns:
-            The offset in `target` at which each payload ends, shape (K,), and the times of
-            arrival and of sending, in Unix time, in ns, shape (2, K). The times are unsigned
-            numbers in a signed type, so a time of 2^63 ns or later appears negative.
+            The offset in `target` at which each payload ends, shape (K,), and the arrival and
+            sending times in Unix time, in ns, shape (2, K). The times are unsigned integers in
+            a signed type, so a time of 2^63 ns or later appears negative.
         """
         ends = np.zeros(self.messages, np.int64)
         times = np.zeros((2, self.messages), np.int64)
@@ -213,29 +214,29 @@ _BLOCK_BYTES = 1 << 12
 
 
 class McapReader:
-    """Reads one MCAP file from its beginning to its end, even if the file is damaged.
+    """Reads one MCAP file from start to end, even if the file is damaged.
 
-    `messages` yields the messages one by one, and `blocks` in blocks, which is much faster.
-    `scan` yields the records and the damaged parts of the file, for checking and recovering it.
-    `read_record` yields the messages of a record.
+    `messages` yields the messages one by one, and `blocks` yields them in blocks, which is much
+    faster. To check or recover the file, `scan` yields its records and damaged parts, and
+    `read_record` the messages of a record.
 
     Args:
         stream: The file, opened for reading.
         name: Name of the file for error messages.
         progress: Function that is called after every record of the file.
-        kept: True if the caller stores the messages. The memory for them is then limited, see
+        kept: True if the caller stores the messages. Their memory is then limited, see
             `KEPT_RATIO`.
 
     Attributes:
-        metadata: Metadata read so far, by name.
-        attachments: Attachments read so far, by name.
-        channels: Descriptions of the channels read so far, by topic. If a topic is defined
-            repeatedly, the first definition counts.
-        library: Program that wrote the file, as the header states.
-        chunks: Number of chunks read so far, by compression. The key is empty for chunks that
-            are not compressed.
-        packed_bytes: Size of these chunks in the file, in bytes.
-        unpacked_bytes: Size of these chunks after unpacking, in bytes.
+        metadata: Maps the name of each metadata record read so far to its contents.
+        attachments: Maps the name of each attachment read so far to its contents.
+        channels: Maps the topic of each channel read so far to its description. If a topic is
+            defined repeatedly, the first definition counts.
+        library: Program that wrote the file, according to the header.
+        chunks: Maps each compression to the number of chunks read so far. The key is empty for
+            uncompressed chunks.
+        packed_bytes: Compressed size of these chunks, in bytes.
+        unpacked_bytes: Uncompressed size of these chunks, in bytes.
         size: Size of the file, in bytes.
         offset: Offset of the record that is being read.
         complete: True if the file was finished and has been read completely.
@@ -288,30 +289,30 @@ class McapReader:
 
     @property
     def damaged(self) -> list[mcap_records.Damage]:
-        """Unreadable parts among the parts of the file that have been examined.
+        """Unreadable parts of the file found so far.
 
-        A channel of which only some messages were read, because of the memory limit, is listed
-        as well.
+        Also lists a channel that was read only in part because of the memory limit.
         """
         return self.scanner.damaged + self._more_damage
 
     @property
     def torn(self) -> mcap_records.Damage | None:
-        """Unreadable rest of a file whose end is missing, such as a record that is cut off.
+        """Unreadable rest of a file whose end is missing, such as a truncated record.
 
-        The rest extends to the last byte of the file. The value is None if the file ends
-        properly, or if its end has not been reached yet.
+        The rest extends to the last byte of the file. None if the file ends properly, or if its
+        end has not been reached yet.
         """
         return self.scanner.torn
 
     def messages(self) -> Iterator[McapMessage]:
-        """Yields every message in the order of the file.
+        """Yields every message in file order.
 
-        A part that cannot be read is added to `damaged`, and reading continues after it, until
-        there are too many damaged parts.
+        An unreadable part is added to `damaged`, and reading continues after it unless there
+        are too many damaged parts.
 
         Raises:
-            LogError: The file is no MCAP file, or unpacks to far too much for its size.
+            LogError: The file is not an MCAP file, or its uncompressed size is out of
+                proportion to its size.
         """
         self._check_begin()
         for item in self._walk():
@@ -325,15 +326,16 @@ class McapReader:
                 self._note_damage(item.frame, error)
 
     def blocks(self, topic_is_kept: Callable[[str], bool]) -> Iterator[_MessageBlock]:
-        """Yields the messages of some topics in blocks of many messages, which is faster.
+        """Yields the messages of selected topics in large blocks.
 
-        `messages` finds the same messages one by one.
+        Finds the same messages as `messages`, but is faster than yielding them one by one.
 
         Args:
-            topic_is_kept: Function that decides whether the messages of a topic are yielded.
+            topic_is_kept: Function that returns True for the topics whose messages are wanted.
 
         Raises:
-            LogError: The file is no MCAP file, or unpacks to far too much for its size.
+            LogError: The file is not an MCAP file, or its uncompressed size is out of
+                proportion to its size.
         """
         self._check_begin()
         is_kept = cache(topic_is_kept)
@@ -358,7 +360,7 @@ class McapReader:
     def scan(self) -> Iterator[mcap_records.ScannedRecord | mcap_records.Damage]:
         """Yields the records and the damaged parts of the file, see `RecordScanner.scan`.
 
-        The file may begin with any bytes, and is scanned to its end. The caller passes each
+        The file may begin with any bytes, and is scanned to its end. The caller must pass each
         record to `read_record`, even if it does not need the messages, because `read_record`
         collects the metadata and the digests of the file. After too many damaged parts,
         `read_record` does nothing.
@@ -388,14 +390,14 @@ class McapReader:
     def read_record(self, record: mcap_records.ScannedRecord) -> Iterator[McapMessage]:
         """Yields the messages in a record, and stores its metadata, attachments or definitions.
 
-        Callers use it with `scan`, if they need the records and the messages of a file. A
+        Used with `scan` by callers that need both the records and the messages of a file. A
         record that cannot be read is added to `damaged`.
 
         Args:
             record: The next record of the file.
 
         Raises:
-            LogError: The file unpacks to far too much for its size.
+            LogError: The uncompressed size of the file is out of proportion to its size.
         """
         if record.frame.opcode not in _READ or self._gave_up:
             return
@@ -713,7 +715,7 @@ class McapReader:
                 yield _MessageBlock(topic, chunk, run, count, slot)
 
     def judge_digest(self) -> Integrity:
-        """Determines from the digests in a file whether the file was changed later.
+        """Determines from the digests in the file whether the file was modified later.
 
         The file must have been read to its end.
 
@@ -726,10 +728,10 @@ class McapReader:
 
     @property
     def agrees_on_messages(self) -> bool:
-        """True if the messages have not been changed since the file was written.
+        """True if the messages have not changed since the file was written.
 
-        The file contains digests, checksums of its contents. The digest of the messages, in
-        their order, and the number of messages are compared with those that were read.
+        Compares the number of messages read, and the digest of these messages in order, with
+        the number and digest stored in the file.
         """
         stated = self.metadata.get(DIGESTS, {})
         computed = self._chain.facts()
@@ -864,11 +866,11 @@ _FIRST_BYTES = 1 << 12
 
 
 class ChannelMessages:
-    """All messages of one topic in a log, still encoded, in the order of the file.
+    """All messages of one topic in a log, still encoded, in file order.
 
     Attributes:
-        log_ns: Time of arrival of each of the K messages at the recorder, in Unix time, in ns.
-        publish_ns: Time of sending that each message states, in Unix time, in ns.
+        log_ns: Arrival time of each of the K messages at the recorder in Unix time, in ns.
+        publish_ns: Sending time stated by each message in Unix time, in ns.
     """
 
     def __init__(self) -> None:
@@ -883,7 +885,7 @@ class ChannelMessages:
 
     @property
     def payloads(self) -> PackedMessages:
-        """The contents of all K messages of the topic, as they were published.
+        """The payloads of all K messages of the topic, as published.
 
         Messages that are added to the topic later are not included.
         """
@@ -893,10 +895,10 @@ class ChannelMessages:
         return PackedMessages(data[: self._size + PADDING], starts, ends)
 
     def payload(self, number: int) -> bytes:
-        """Returns the content of one message of the topic, as it was published.
+        """Returns the payload of one message of the topic, as published.
 
         Args:
-            number: Number of the message, from 0.
+            number: Number of the message, counted from 0.
         """
         start = self._ends[number - 1] if number else 0
         return self._data[start : self._ends[number]].tobytes()
@@ -917,12 +919,14 @@ class ChannelMessages:
         return self._data
 
     def add(self, payload: bytes, log_ns: int, publish_ns: int) -> None:
-        """Appends a message to the messages of the topic, in the order of the file.
+        """Appends a message to those of the topic.
+
+        Messages must be added in file order.
 
         Args:
             payload: The message, encoded as published.
-            log_ns: Time of arrival at the recorder, in Unix time, in ns.
-            publish_ns: Time of sending, in Unix time, in ns.
+            log_ns: Arrival time at the recorder in Unix time, in ns.
+            publish_ns: Sending time in Unix time, in ns.
         """
         data = self._reserve(len(payload))
         end = self._size + len(payload)
@@ -933,7 +937,7 @@ class ChannelMessages:
         self.publish_ns.append(publish_ns)
 
     def add_block(self, block: _MessageBlock) -> None:
-        """Appends a block of messages to those of the topic, in the order of the file."""
+        """Appends a block of messages to those of the topic. Blocks must come in file order."""
         data = self._reserve(block.most_bytes)
         ends, (log_ns, publish_ns) = block.copy_payloads(data, self._size)
         self._size = int(ends[-1])
@@ -943,11 +947,11 @@ class ChannelMessages:
         self.publish_ns.frombytes(publish_ns.tobytes())
 
     def times(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Returns the arrival and sending times of the topic's K messages, as arrays.
+        """Returns the arrival and sending times of the topic's K messages as arrays, in ns.
 
         Returns:
-            The times of arrival and of sending, shape (K,) each, in Unix time, in ns. A time of
-            2^63 ns or later is replaced by the latest time that the arrays can contain.
+            The arrival times and the sending times in Unix time, each of shape (K,). A time of
+            2^63 ns or later is replaced by the largest value that fits.
         """
         return _clip_times(self.log_ns), _clip_times(self.publish_ns)
 
@@ -960,19 +964,18 @@ def _clip_times(times: "array[int]") -> NDArray[np.int64]:
 
 @dataclass
 class LogContents:
-    """Everything in a log, from one file or several, before its messages are decoded.
+    """Everything in a log, from one or several files, before its messages are decoded.
 
     Attributes:
         sources: Names of the files.
         session: Metadata of the session, such as its name and its start time.
-        scenario: Text of the scenario, encoded.
-        metadata: All metadata, by name.
-        channels: The messages, by topic.
+        scenario: Encoded text of the scenario.
+        metadata: Maps the name of each metadata record to its contents.
+        channels: Maps each topic to its messages.
         complete: True if all parts are present and finished, and can be read completely.
         ended: True if the last part was finished.
-        damaged: A sentence for every part of a file that cannot be read.
-        chain: Whether the log agrees with its digests, the checksums that reveal changes. For
-            several files, the worst result.
+        damaged: One sentence for each part of a file that cannot be read.
+        chain: Whether the log matches its digests. For several files, the worst result.
     """
 
     sources: tuple[str, ...]
@@ -1002,15 +1005,15 @@ class LogContents:
         *,
         trusted: bool = False,
     ) -> "LogContents":
-        """Reads everything in one file of a log into memory, without decoding the messages.
+        """Reads everything in a log file into memory, without decoding the messages.
 
         Args:
             stream: The file, opened for reading.
             name: Name of the file for error messages.
             progress: Function that is called after every record of the file.
-            trusted: True if this program has just written the file. The memory for the messages
-                is then not limited. The limit protects against files that were made to do harm,
-                but a file in which arms hardly move may exceed it, because it is compressed so
+            trusted: True if this program has just written the file. Memory for the messages is
+                then unlimited. The limit protects against files crafted to cause harm, but a
+                harmless file in which arms hardly move may exceed it, because it compresses so
                 well.
 
         Raises:
@@ -1039,7 +1042,7 @@ class LogContents:
 
     @staticmethod
     def check(stream: BinaryIO, name: str) -> None:
-        """Reads a log once without storing its messages, to find out whether it can be opened.
+        """Reads a log once, without storing its messages, to find out whether it can be opened.
 
         A log of any length can be checked with little memory.
 
@@ -1048,7 +1051,7 @@ class LogContents:
             name: Name of the file for error messages.
 
         Raises:
-            LogError: The file cannot be opened as a log. The text states the reason.
+            LogError: The file cannot be opened as a log. The message states the reason.
         """
         reader = McapReader(stream, name)
         # Reads all messages, but stores no message.

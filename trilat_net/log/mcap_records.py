@@ -1,14 +1,14 @@
 """Finds and decodes the records of MCAP files, including damaged files.
 
-An MCAP file is a sequence of records. A record is an opcode (1 byte), the length of its content
-(8 bytes) and the content, see the specification at mcap.dev. A chunk is a record whose content
-is a sequence of compressed records. The `mcap` package decodes the content of the other
-records.
+An MCAP file is a sequence of records. A record consists of an opcode (1 byte), the length of
+its content (8 bytes) and the content, as specified at mcap.dev. A chunk is a record whose
+content is a sequence of compressed records. All other record contents are decoded by the `mcap`
+package.
 
 Invariant:
-    - No number in a file is trusted. Nothing outside the file is read. A chunk is unpacked only
-      if its head agrees with its data, and only up to a size that is reasonable for its
-      compressed size.
+    - No number in a file is trusted. Nothing outside the file is read. A chunk is decompressed
+      only if its header is consistent with its data, and only up to a size that is plausible
+      for its compressed size.
     - Every function raises `UnreadableRecord` for bytes that are not a valid record.
     - After such bytes, the scan of a file continues at the next readable chunk.
 """
@@ -74,9 +74,9 @@ _COMPRESSION_NAME = re.compile(
 
 
 class UnreadableRecord(Exception):  # noqa: N818 - describes a part of a file
-    """Error: a part of an MCAP file cannot be read. The text of the error states the reason.
+    """Raised if a part of an MCAP file cannot be read. The message states the reason.
 
-    It is used only within the package `log`: a scan catches it and continues at the next
+    Used only within the package `log`: a scan catches the error and continues at the next
     readable part, and a check reports it.
     """
 
@@ -87,8 +87,8 @@ class ChunkHead(NamedTuple):
     Attributes:
         start_ns: Arrival time of the earliest message in the chunk, in ns.
         end_ns: Arrival time of the latest message in the chunk, in ns.
-        size: Size of the unpacked records, in bytes.
-        crc: CRC-32 checksum of the unpacked records. It is 0 if there is no checksum.
+        size: Size of the uncompressed records, in bytes.
+        crc: CRC-32 checksum of the uncompressed records; 0 if there is no checksum.
         compression: Name of the compression method. Empty if the records are not compressed.
         data_offset: Offset of the compressed records in the content of the chunk, in bytes.
     """
@@ -102,14 +102,14 @@ class ChunkHead(NamedTuple):
 
     @classmethod
     def parse(cls, content: bytes, length: int) -> "ChunkHead":
-        """Decodes the head of a chunk (compressed block of messages), and checks its lengths.
+        """Decodes the header of a chunk, and checks that its lengths are consistent.
 
         Args:
-            content: Content of the chunk. Its first `_MAX_HEAD_BYTES` bytes suffice.
-            length: Length of the whole content, in bytes.
+            content: Content of the chunk, or at least its first `_MAX_HEAD_BYTES` bytes.
+            length: Length of the complete content, in bytes.
 
         Raises:
-            UnreadableRecord: The head is incomplete or contradicts the length.
+            UnreadableRecord: The header is incomplete or contradicts the length.
         """
         try:
             start_ns, end_ns, size, crc, name_bytes = _FIXED_HEAD.unpack_from(content)
@@ -137,19 +137,19 @@ class ChunkHead(NamedTuple):
 
 
 def unpack_chunk(content: bytes) -> bytes:
-    """Unpacks the compressed records of a chunk, and checks them against its head.
+    """Decompresses the records of a chunk, and checks them against its header.
 
-    The head may be wrong. Therefore at most its stated size is unpacked, within reasonable
-    limits.
+    Since the header may be wrong, at most the stated size is decompressed, and only within
+    reasonable limits.
 
     Args:
-        content: Content of the chunk: its head and the compressed records.
+        content: Content of the chunk, consisting of its header and the compressed records.
 
     Returns:
-        The unpacked records.
+        The uncompressed records.
 
     Raises:
-        UnreadableRecord: The chunk cannot be unpacked, or its size or its checksum is wrong.
+        UnreadableRecord: The chunk cannot be decompressed, or its size or checksum is wrong.
     """
     head = ChunkHead.parse(content, len(content))
     limit = max(MAX_UNPACKED_BYTES, MAX_UNPACKED_RATIO * len(content))
@@ -208,15 +208,14 @@ def _unpack(head: ChunkHead, data: memoryview) -> bytes:
 
 
 def iterate_records(data: bytes | bytearray, offset: int = 0) -> Iterator[tuple[int, int, int]]:
-    """Finds the records in an unpacked chunk, one after another, without decoding them.
+    """Finds the records in an uncompressed chunk one after another, without decoding them.
 
     Args:
-        data: The unpacked chunk.
+        data: The uncompressed chunk.
         offset: Offset of the first record to find.
 
     Yields:
-        The number of the record's kind, the offset of its content, and the offset after its
-        content.
+        The opcode of the record, the offset of its content, and the offset after its content.
 
     Raises:
         UnreadableRecord: The last record is incomplete.
@@ -240,7 +239,7 @@ class RecordFrame(NamedTuple):
 
     Attributes:
         offset: Offset of the record's first byte in the file.
-        opcode: Number of the kind of record, such as chunk or metadata.
+        opcode: Identifies the kind of record, such as chunk or metadata.
         length: Length of the record's content, in bytes.
     """
 
@@ -250,12 +249,12 @@ class RecordFrame(NamedTuple):
 
     @property
     def size(self) -> int:
-        """Size of a whole MCAP record in bytes: opcode, length field and content."""
+        """Total size of the MCAP record in bytes: opcode, length field and content."""
         return RECORD_HEAD_BYTES + self.length
 
     @property
     def end(self) -> int:
-        """Offset in the file of the first byte after this record, where the next one begins."""
+        """Offset of the first byte after this record, where the next record begins."""
         return self.offset + self.size
 
 
@@ -279,14 +278,14 @@ class Damage(NamedTuple):
 
 
 class ScannedRecord:
-    """A record that was found in an MCAP file, whose content is read only when needed.
+    """A record found in an MCAP file, whose content is read only when needed.
 
     Args:
-        scanner: Scanner that has found the record.
-        frame: Kind and place of the record.
+        scanner: Scanner that found the record.
+        frame: Kind and position of the record.
 
     Attributes:
-        frame: Kind and place of the record.
+        frame: Kind and position of the record.
     """
 
     __slots__ = ("_content", "_problem", "_scanner", "_unpacked", "frame")
@@ -300,31 +299,31 @@ class ScannedRecord:
 
     @property
     def content(self) -> bytes:
-        """Content of the record as bytes, without the fields for its kind and its length.
+        """Content of the record in bytes, without the opcode and the length field.
 
-        It is read from the file at first use, so that a scan of a large file is fast.
+        Read from the file on first access, so that scanning a large file is fast.
         """
         if self._content is None:
             self._content = self._scanner.content(self.frame)
         return self._content
 
     def head(self) -> "ChunkHead":
-        """Returns the head of a chunk, without unpacking its messages.
+        """Returns the header of a chunk, without decompressing its messages.
 
-        The head states the times of the messages, and how they are compressed.
+        The header states the times of the messages, and how they are compressed.
 
         Raises:
-            UnreadableRecord: The head is incomplete, or contains impossible values.
+            UnreadableRecord: The header is incomplete, or contains impossible values.
         """
         return self._scanner.head(self.frame)
 
     def unpack(self) -> bytes:
-        """Returns the decompressed records of a chunk, a compressed block of messages.
+        """Returns the uncompressed records of a chunk.
 
         The chunk is decompressed only in the first call.
 
         Raises:
-            UnreadableRecord: The chunk cannot be unpacked, or its checksum is wrong.
+            UnreadableRecord: The chunk cannot be decompressed, or its checksum is wrong.
         """
         if self._problem is not None:
             raise self._problem
@@ -338,23 +337,24 @@ class ScannedRecord:
 
 
 class RecordScanner:
-    """Finds the records of an MCAP file one after another, and skips damaged parts.
+    """Finds the records of an MCAP file one after another, skipping damaged parts.
 
-    Every program that reads a file, whether it checks, recovers or verifies it, reads the
-    records that this scanner yields.
+    Every program that checks, recovers or verifies a file reads the records through this
+    scanner.
 
     Args:
-        stream: The file, opened for reading. It begins at the current position of the stream.
+        stream: The file, opened for reading. The file begins at the current position of the
+            stream.
 
     Attributes:
         size: Size of the file, in bytes.
-        begins: True if the file begins with the mark of MCAP files.
+        begins: True if the file begins with the magic bytes of MCAP.
         ends: True if the file ends with a footer and the end mark.
         finished: True if the file was finished and has been read to its end.
-        trailing: Number of bytes after the end mark, if the mark has been read.
-        damaged: Damaged parts that were found so far, except a missing end.
-        torn: The incomplete part at the end of the file. None if the file is not cut off, or if
-            its end has not been reached yet.
+        trailing: Number of bytes after the end mark, once the mark has been read.
+        damaged: Damaged parts found so far, except a missing end.
+        torn: The incomplete part at the end of the file. None if the file is not truncated, or
+            if its end has not been reached yet.
     """
 
     def __init__(self, stream: BinaryIO) -> None:
@@ -370,29 +370,29 @@ class RecordScanner:
         self.torn: Damage | None = None
 
     def read(self, offset: int, length: int) -> bytes:
-        """Reads some bytes of the file. Fewer bytes are returned at the end of the file.
+        """Reads bytes of the file at a given offset.
 
         Args:
             offset: Offset of the first byte in the file.
             length: Number of bytes to read.
 
         Returns:
-            The bytes. There are fewer than `length` if the file ends before.
+            The bytes, fewer than `length` if the end of the file comes first.
         """
         self._stream.seek(self._base + offset)
         return self._stream.read(max(0, min(length, self.size - offset)))
 
     def frames(self) -> Iterator[RecordFrame]:
-        """Yields the kind and the position of every readable record of an MCAP file.
+        """Yields the kind and position of every readable record of an MCAP file.
 
-        Parts of the file that cannot be read are left out.
+        Unreadable parts of the file are skipped.
         """
         for item in self.scan():
             if isinstance(item, ScannedRecord):
                 yield item.frame
 
     def scan(self) -> Iterator[ScannedRecord | Damage]:
-        """Yields the records and the damaged parts of the file in the order of their offsets.
+        """Yields the records and the damaged parts of the file, sorted by offset.
 
         Bytes that cannot be a record are skipped, added to `damaged`, and yielded as a damaged
         part. If the end of the file is missing, `torn` is set. Every call starts at the
@@ -502,29 +502,27 @@ class RecordScanner:
         return RecordFrame(offset, opcode, length)
 
     def content(self, frame: RecordFrame) -> bytes:
-        """Reads the content of a record, without the fields for its kind and its length.
+        """Reads the content of a record, without the opcode and the length field.
 
         Args:
-            frame: Place of the record in the file.
+            frame: Position of the record in the file.
 
         Returns:
-            The content. It is shorter than `frame.length` if the file ends before.
+            The content, shorter than `frame.length` if the end of the file comes first.
         """
         return self.read(frame.offset + RECORD_HEAD_BYTES, frame.length)
 
     def head(self, frame: RecordFrame) -> ChunkHead:
-        """Reads the head of a chunk, a block of compressed messages in an MCAP file.
-
-        The compressed messages themselves are not read.
+        """Reads the header of a chunk, but not its compressed messages.
 
         Args:
-            frame: Place of the chunk in the file.
+            frame: Position of the chunk in the file.
 
         Returns:
-            The head, which states the times, the size, the compression and the checksum.
+            The header, which states the times, the size, the compression and the checksum.
 
         Raises:
-            UnreadableRecord: The head is incomplete, or contains impossible values.
+            UnreadableRecord: The header is incomplete, or contains impossible values.
         """
         content = self.read(
             frame.offset + RECORD_HEAD_BYTES, min(frame.length, _MAX_HEAD_BYTES)
@@ -557,11 +555,11 @@ class RecordScanner:
         return None
 
     def crc(self, begin: int, end: int) -> int:
-        """Computes the CRC-32 checksum of a part of the file, to detect changed bytes.
+        """Computes the CRC-32 checksum of a part of the file, to detect modified bytes.
 
         Args:
             begin: Offset of the first byte of the part.
-            end: Offset of the first byte after the part.
+            end: Offset after the last byte of the part.
         """
         crc = 0
         for offset in range(begin, end, _SCAN_BYTES):
@@ -572,19 +570,18 @@ class RecordScanner:
         """Reads the footer of the file, its last record, which states where the index is.
 
         Returns:
-            The footer. None if the file is not finished and therefore has no footer.
+            The footer, or None if the file is unfinished and therefore has no footer.
         """
         content = self.read(max(0, self.size - _FOOTER_BYTES) + RECORD_HEAD_BYTES, 20)
         return parse_record(Opcode.FOOTER, content) if self.ends else None
 
     def is_summary_intact(self, footer: records.Footer) -> bool:
-        """Checks the summary at the end of an MCAP file, which has its index, by its checksum.
+        """Returns True if the summary at the end of the file matches its checksum.
+
+        The summary contains the index of the file.
 
         Args:
             footer: Footer of the file, which states the checksum.
-
-        Returns:
-            True if the summary has this checksum.
         """
         summary_start = footer.summary_start
         footer_start = self.size - _FOOTER_BYTES
@@ -600,13 +597,12 @@ class RecordScanner:
 
 
 def has_right_crc(attachment: bytes) -> bool:
-    """Returns True if an attachment of a log, such as its scenario, has its stored checksum.
+    """Returns True if an attachment of a log, such as its scenario, matches its checksum.
+
+    A checksum of 0 means that there is none, and also counts as a match.
 
     Args:
-        attachment: Content of the attachment's record.
-
-    Returns:
-        True if the checksum is right, or if it is 0, which means that there is none.
+        attachment: Content of the attachment record.
     """
     crc = int.from_bytes(attachment[-4:], "little")
     return not crc or zlib.crc32(memoryview(attachment)[:-4]) == crc
@@ -615,11 +611,11 @@ def has_right_crc(attachment: bytes) -> bool:
 def parse_record(opcode: int, content: bytes) -> Any:
     """Decodes the content of a record with the `mcap` package.
 
-    The package raises various errors for damaged content. They are converted to a single kind
-    of error here.
+    The various errors that the package raises for damaged content are converted to a single
+    error type.
 
     Args:
-        opcode: Number of the kind of record, which must be in `KINDS`.
+        opcode: Opcode of the record, which must be in `KINDS`.
         content: Content of the record.
 
     Returns:

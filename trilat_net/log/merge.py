@@ -1,14 +1,13 @@
 """Reads the files of a session's log, and merges them into one log.
 
-A log contains the messages of a session, a joint run of several arms. It has several files, the
-parts, if the recorder split it, or if several recorders recorded the session one after another
-or at the same time.
+A log has several files (parts) if the recorder split it, or if several recorders recorded the
+session, one after another or simultaneously.
 
 Invariant:
-    - A message that several parts contain is written once.
-    - Parts of different sessions are refused. Parts that contain different messages with the
-      same number are also refused.
-    - The order in which the user names the parts does not matter.
+    - A message that occurs in several parts is written once.
+    - Parts of different sessions are rejected, and so are parts that contain different messages
+      with the same number.
+    - The order in which the user lists the parts does not matter.
 """
 
 import hashlib
@@ -36,8 +35,8 @@ def read_session(
 
     Args:
         sources: Paths, or binary files opened for reading, in any order.
-        progress: Function that is called repeatedly with the number of bytes read and their
-            total over all files.
+        progress: Function that is called repeatedly with the number of bytes read and the total
+            over all files.
 
     Returns:
         The contents of all files, as if they were one file.
@@ -53,9 +52,9 @@ def read_sessions(files: Sequence[Path], progress: Progress | None) -> list[LogC
     """Reads the logs of one or several sessions.
 
     Args:
-        files: The files, in any order.
-        progress: Function that is called repeatedly with the number of bytes read and their
-            total over all files.
+        files: Paths of the files, in any order.
+        progress: Function that is called repeatedly with the number of bytes read and the total
+            over all files.
 
     Returns:
         The contents of each session. Files of the same session are merged.
