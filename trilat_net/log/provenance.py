@@ -1,6 +1,6 @@
 """Collects the versions of the program and its packages, which are stored in every log.
 
-With these versions, a run can be repeated later with the same program (law L5 of
+They make it possible to repeat a run later with the same program (law L5 of
 docs/develop/design.md).
 
 Invariant:
@@ -48,8 +48,8 @@ def collect_provenance() -> dict[str, str]:
     """Collects the facts about this program that explain how a log was produced.
 
     Returns:
-        Versions of the program and its packages, commit and platform, as metadata of a log.
-        There are no paths, times or host names, so that equal runs have equal logs.
+        Versions of the program and its packages, commit and platform, as metadata for a log.
+        Paths, times and host names are excluded so that equal runs have equal logs.
     """
     commit = _run_git("rev-parse", "HEAD")
     changed = _run_git("status", "--porcelain", "--untracked-files=no")

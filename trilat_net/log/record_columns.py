@@ -1,14 +1,13 @@
-"""Decodes single fields of many records into arrays, without decoding whole records.
+"""Decodes single fields of many records into arrays, without decoding complete records.
 
-This is much faster if only some fields are needed. A record is the encoded state of an arm in
-one period of its control loop. For example, `RecordColumns.ticks` returns the number of the
-period of each record. Every method raises `WireError` for the first message that is not a valid
-record.
+This is much faster if only a few fields are needed. For example, `RecordColumns.ticks` returns
+the tick of each record. Every method raises `WireError` at the first message that is not a
+valid record.
 
 Invariant:
     - Only the requested fields are decoded.
-    - Each field is checked as in a whole record: its type, its length, and that its numbers are
-      finite.
+    - Each field is checked in the same way as in a complete record: its type, its length, and
+      that its values are finite.
 """
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -41,24 +40,20 @@ _DEFAULTS = {"sent_ns": 0}
 
 
 class RecordColumns:
-    """Fields of encoded records, each of which is decoded into an array when it is requested.
+    """Fields of encoded records, each decoded into an array when it is requested.
 
-    Records of every version of the format that can be read are accepted. `IndexedRecords` has
-    the same arrays for records whose exact layout is known.
+    Accepts records of every readable version of the format. For records with an exactly known
+    layout, `IndexedRecords` provides the same arrays.
 
     Args:
-        payloads: K encoded records (results of control periods) of one site (arm controller).
+        payloads: K encoded records of one site.
     """
 
     def __init__(self, payloads: Sequence[bytes]) -> None:
         self._payloads = payloads
 
     def ticks(self) -> Ints:
-        """Decodes from every record the number of its control period (tick).
-
-        Returns:
-            The ticks, shape (K,).
-        """
+        """Decodes the tick of every record, shape (K,)."""
         if any(len(payload) > MAX_BYTES for payload in self._payloads):
             raise self._find_error()
         pairs = chain.from_iterable(self._decode_fields("v", "tick"))
@@ -70,7 +65,7 @@ class RecordColumns:
         return rows[:, 1].copy()
 
     def ints(self, field: str) -> Ints:
-        """Decodes an integer field of every record, and skips all other fields.
+        """Decodes an integer field of every record, skipping all other fields.
 
         Args:
             field: Name of an integer field of `State`.
@@ -81,15 +76,15 @@ class RecordColumns:
         return self._to_array(self._decode_fields(field), np.int64, len(self._payloads))
 
     def vectors(self, layout: Layout, *fields: str) -> dict[str, Array]:
-        """Decodes some vectors, such as joint angles, of every record, and skips other fields.
+        """Decodes vectors of every record, such as joint angles, skipping all other fields.
 
         Args:
             layout: Lengths of the vectors in these records.
             fields: Names of the fields, such as "q".
 
         Returns:
-            For each field an array of shape (K, length of the vector). The shape is (K, 0) for
-            a field that these records do not have.
+            Maps each field to an array of shape (K, length of the vector). The shape is (K, 0)
+            for a field that these records do not have.
         """
         record_count = len(self._payloads)
         lengths = layout.lengths()
@@ -131,18 +126,17 @@ class RecordColumns:
         return self._to_array(self._decode_fields(field), np.object_, len(self._payloads))
 
     def per_peer(self, field: str, peers: Sequence[str], absent: int) -> dict[str, Ints]:
-        """Decodes a field that contains an integer for each peer, such as `used`.
+        """Decodes a field that contains one integer per peer, such as `used`.
 
-        A peer is another site (arm controller) whose samples (sent states) the site receives.
-        The field of a record is a map from names of peers to integers.
+        In a record, such a field maps the names of peers to integers.
 
         Args:
             field: Name of the field.
             peers: Names of the peers.
-            absent: Number to return for a peer that the map of a record does not contain.
+            absent: Value to return for a peer that the field of a record does not contain.
 
         Returns:
-            For each peer the integers of all records, shape (K,).
+            Maps each peer to the integers of all records, shape (K,).
         """
         # A struct with an attribute per peer is decoded faster than a dict. The name of a peer
         # need not be a valid identifier, so the attributes have other names.
@@ -167,17 +161,17 @@ class RecordColumns:
         return {peer: rows[:, n].copy() for n, peer in enumerate(peers)}
 
     def arrivals(self) -> tuple[Ints, Ints]:
-        """Decodes which states of other arms arrived in each control period.
+        """Decodes which samples of other arms arrived in each tick.
 
         Returns:
-            The number of arrivals of each record, shape (K,), and all N arrivals in order,
-            shape (N, 3). The columns are those of the field `rx` of a record: index of the
-            peer, tick (control period) of the sample, and delay in us.
+            The number of arrivals in each record, shape (K,), and all N arrivals in order,
+            shape (N, 3). The columns are those of the field `rx`: index of the peer, tick of
+            the sample, and delay in us.
         """
         counts = np.zeros(len(self._payloads), dtype=np.int64)
 
         def iterate_numbers() -> Iterator[int]:
-            """Yields the three numbers of every arrival, and stores the arrivals per record."""
+            """Yields three integers per arrival, and stores the arrivals of each record."""
             for row, arrivals in enumerate(self._decode_fields("rx")):
                 counts[row] = len(arrivals)
                 for entry in arrivals:

@@ -1,17 +1,17 @@
 """Recovers a damaged or unfinished MCAP file into a new, finished file.
 
 An MCAP file stores messages in compressed chunks, most of them with a checksum. Any MCAP file
-is accepted. For a log of trilat-net, the numbers of received and missing messages (the
-accounts) are computed again from its messages.
+is accepted. For a log of trilat-net, the accounts (counts of received and missing messages) are
+recomputed from its messages.
 
 Invariant:
-    - Everything that can be read is copied byte for byte: messages with their times and
-      numbers, metadata and attachments. Everything else is left out and reported.
-    - Nothing is invented. A message of a trilat-net log is copied only if a valid checksum
-      covers it or if its content proves that it is genuine (`content_check`), and only from a
-      chunk that is in its original place (`recovery_survey`).
+    - Everything readable is copied byte for byte: messages with their times and numbers,
+      metadata and attachments. Everything else is left out and reported.
+    - Nothing is invented. A message of a trilat-net log is copied only if it is covered by a
+      valid checksum or proved genuine by its content (`content_check`), and only from a chunk
+      in its original place (`recovery_survey`).
     - The new file is never empty. If nothing can be saved, no file is created.
-    - The new file is read again. If no command of trilat-net can open it, this is reported.
+    - The new file is read back. If no command of trilat-net can open it, this is reported.
     - The source file is not changed.
 """
 
@@ -75,22 +75,21 @@ _REGENERATED = frozenset(
 
 @dataclass(repr=False)
 class Recovery(Result):
-    """Result of the recovery of a damaged log: what was copied and what was lost.
+    """Result of recovering a damaged log: what was copied and what was lost.
 
     Attributes:
         path: The source file.
         output: The new file.
         finished: True if the source file had been finished.
         messages: Number of messages in the new file.
-        duration_s: Time from the first to the last message, by their arrival, in s.
-        salvaged: Number of messages that were saved from a last chunk that was cut off.
-        lost: A sentence for each loss.
+        duration_s: Time between the arrivals of the first and the last message, in s.
+        salvaged: Number of messages saved from a truncated last chunk.
+        lost: One sentence per loss.
         lost_bytes: Number of bytes that could not be read.
-        missing: A line for each site (arm controller) whose records are incomplete in the new
-            file, either because they were lost in the source file or because they were never
-            recorded.
-        coverage: Numbers of records in the new file and of ticks (control periods) in the run,
-            by site. Empty if the source is not a log of trilat-net.
+        missing: One line per site whose records are incomplete in the new file, either because
+            they were lost in the source file or because they were never recorded.
+        coverage: Number of records in the new file and of ticks in the run, per site. Empty if
+            the source is not a log of trilat-net.
         chain: Result of comparing the source with its digests. Empty if the source is not a log
             of trilat-net.
     """
@@ -111,16 +110,15 @@ class Recovery(Result):
     def lossless(self) -> bool:
         """True if the recovered file contains everything that the damaged file contains.
 
-        The value is False if some bytes could not be read or assigned. `lost` then describes
-        them.
+        False if some bytes could not be read or assigned, in which case `lost` describes them.
         """
         return not self.lost
 
     def to_dict(self) -> dict[str, Any]:
-        """Returns the result of the recovery of a damaged log as plain values, for JSON.
+        """Returns the result of recovering a damaged log as plain values, for JSON.
 
-        `trilat log recover --json` prints them. The entries say what was saved ("messages",
-        "coverage"), and what was lost ("lost_bytes", "missing").
+        This is the output of `trilat log recover --json`. The entries state what was saved
+        ("messages", "coverage") and what was lost ("lost_bytes", "missing").
         """
         return {
             "file": self.path.as_posix(),
@@ -142,20 +140,21 @@ class Recovery(Result):
         }
 
     def add_loss(self, text: str, size: int = 0) -> None:
-        """Notes that a part of the damaged file was lost, for the report to the user.
+        """Adds the loss of a part of the damaged file to the report for the user.
 
         Args:
             text: Sentence that describes the loss to the user.
-            size: Size of the part that cannot be read, in bytes. 0 if something else was lost.
+            size: Number of bytes that cannot be read. 0 if the loss is not a range of bytes.
         """
         self.lost.append(text)
         self.lost_bytes += size
 
     def facts(self) -> dict[str, str]:
-        """Returns a summary of what was recovered and what was lost, as strings by name.
+        """Summarises what was recovered and what was lost, as a dictionary of strings.
 
-        The summary is stored as metadata in the recovered file: the source file, the losses
-        and the missing records. A reader can thus recognise the file as a recovered log.
+        The summary is stored in the metadata of the recovered file, so that readers can
+        recognise the file as a recovered log. It states the source file, the losses and the
+        missing records.
         """
         losses = self.lost[:_MAX_LISTED_LOSSES]
         unlisted = len(self.lost) - len(losses)
@@ -174,13 +173,12 @@ class Recovery(Result):
 
 
 def recovered_path(path: Path) -> Path:
-    """Chooses the name of the recovered file, if the user gives none.
+    """Returns the default name of the recovered file.
 
-    For an unfinished log run.mcap.active it is run.mcap, and for run.mcap it is
-    run.recovered.mcap.
+    This is run.mcap for an unfinished log run.mcap.active, and run.recovered.mcap for run.mcap.
 
     Args:
-        path: The damaged file.
+        path: Path of the damaged file.
     """
     if path.name.endswith(ACTIVE_SUFFIX) and path.name != ACTIVE_SUFFIX:
         return path.with_name(path.name.removesuffix(ACTIVE_SUFFIX))
@@ -194,24 +192,24 @@ def recover(
     force: bool = False,
     progress: Progress | None = None,
 ) -> Recovery:
-    """Recovers a damaged or unfinished file into a new file, as `trilat log recover` does.
+    """Recovers a damaged or unfinished file into a new file, like `trilat log recover`.
 
     >>> path = tn.simulate("two_sites", duration_s=0.1).save("torn.mcap")
     >>> tn.recover(path, "whole.mcap").lossless
     True
 
     Args:
-        file: The source file.
-        out: The new file. By default, its name is derived from the source, see
+        file: Path of the source file.
+        out: Path of the new file. By default, it is derived from the source, see
             `recovered_path`.
-        force: True if the new file may replace an existing file.
+        force: True to allow replacing an existing file.
         progress: Function that is called after every record of the source file.
 
     Raises:
         LogError: The source file cannot be read.
         NothingSaved: Nothing could be recovered.
-        UsageError: The new file exists already or cannot be created.
-        LogRefused: The disk refused the data. No file was created.
+        UsageError: The new file already exists or cannot be created.
+        LogRefused: Writing to the disk failed. No file was created.
     """
     path = Path(file)
     if not path.name:
@@ -390,12 +388,11 @@ class _FileCopy:
                 self._open_channel(number)
 
     def run(self, restored: bytes) -> None:
-        """Copies everything that can be read from a damaged log into a new file.
+        """Copies everything readable from a damaged log to a new file.
 
         Args:
-            restored: Text of the scenario (the description of the experiment), from a file
-                beside the damaged log. It is written first. Empty if the log itself contains
-                its scenario.
+            restored: Text of the scenario, from a file next to the damaged log. Written first.
+                Empty if the log itself contains its scenario.
 
         Raises:
             NothingSaved: Nothing could be copied.

@@ -1,18 +1,17 @@
 """Surveys a damaged MCAP file before its messages are recovered.
 
 The survey collects everything in the file except the messages: the metadata of the session, the
-scenario (the description of the experiment), the definitions of the channels and the index. A
-damaged disk or a damaged copy may contain parts of other files. Therefore the survey also
-decides which parts belong together. It lists the chunks, the compressed blocks of messages,
-that are not in their original places.
+scenario, the definitions of the channels and the index. Since a damaged disk or a damaged copy
+may contain parts of other files, the survey also decides which parts belong together, and lists
+the chunks (compressed blocks of messages) that are not in their original places.
 
 Invariant:
     - If a schema or channel is defined twice with the same number, the definition with a valid
       checksum is used. Without a checksum, the first definition is used.
     - If a file contains several sessions and scenarios, the survey selects a session and a
       scenario that refer to each other. A session whose start time contradicts all messages
-      with a checksum belongs to another log and is rejected. In simulated time all sessions
-      start at 0. In this case, the numbers that identify the starts of the sites are compared
+      with a checksum belongs to another log and is rejected. In simulated time, where all
+      sessions start at 0, the numbers that identify the starts of the sites are compared
       instead.
     - A chunk with a valid checksum may still be outdated, from another file, or in the wrong
       place. In a finished file, the index shows which chunks belong to it. In an unfinished
@@ -49,27 +48,30 @@ _SAMPLED_CHUNKS = 16
 class RecoverySurvey:
     """Everything in a damaged file except its messages: metadata, definitions and chunks.
 
-    The recovery creates this object first, and then copies the messages to a new file.
+    The recovery creates this object before it copies the messages to a new file.
 
     Args:
         scanner: Scanner that finds the records of the file.
 
     Attributes:
         is_finished: True if the file has an end mark.
-        trailing_bytes: Number of bytes behind the end mark.
+        trailing_bytes: Number of bytes after the end mark.
         profile: Profile in the header of the MCAP file.
         library: Program that wrote the file, as stated in the header.
         definitions: Schemas and channels that are defined outside of chunks.
-        metadata: Metadata by name. If a name occurs repeatedly, the last entry counts. Of
-            several sessions, the one that names the scenario counts.
-        attachments: Attachments by name. If a name occurs repeatedly, the first entry counts.
-            Of several scenarios, the one that the session names counts.
-        count: Number of messages that the file states. None if no valid checksum covers it.
-        is_redefined: True if a definition among the data differs from that in the summary at
-            the end of the file, which a checksum covers.
-        is_foreign_session: True if the file names another session than its messages.
-        misplaced: Description of the problem for each chunk that is not in its original place,
-            by the offset of the chunk.
+        metadata: Maps the name of each metadata record to its contents. If a name occurs
+            repeatedly, the last entry counts. If there are several sessions, the one that names
+            the scenario counts.
+        attachments: Maps the name of each attachment to its contents. If a name occurs
+            repeatedly, the first entry counts. If there are several scenarios, the one named by
+            the session counts.
+        count: Number of messages stated in the file. None if it is not covered by a valid
+            checksum.
+        is_redefined: True if a definition among the data differs from the one in the summary at
+            the end of the file, which is covered by a checksum.
+        is_foreign_session: True if the file names a session other than that of its messages.
+        misplaced: Maps the offset of each chunk that is not in its original place to a
+            description of the problem.
         is_chunked: True if the file contains chunks.
         is_session_log: True if anything in the file shows that it is the log of a session.
         why_empty: Reason why there is nothing to recover. Empty if something can be recovered.
@@ -118,13 +120,13 @@ class RecoverySurvey:
 
     @classmethod
     def of_unfinished_file(cls, path: Path) -> "RecoverySurvey | None":
-        """Reads a file for what can be recovered if its end is missing or damaged.
+        """Surveys what can be recovered from a file whose end is missing or damaged.
 
         Args:
-            path: The file.
+            path: Path of the file.
 
         Returns:
-            The survey. None if the file ends as it should.
+            The survey, or None if the file ends properly.
 
         Raises:
             LogError: The file cannot be read.
@@ -323,9 +325,9 @@ class RecoverySurvey:
         def is_genuine(definition: Definition) -> bool:
             """Returns True if a definition may belong to the session of the messages.
 
-            Definitions with a valid checksum do. Other definitions are foreign if they name the
-            rejected session, and if they lie in a page with foreign data or the session was
-            renamed.
+            This holds for all definitions with a valid checksum. Any other definition is
+            foreign if it names the rejected session and either lies in a page with foreign data
+            or the session was renamed.
             """
             offset = self._uncovered_offsets.get(definition)
             if offset is None:  # a checksum covers the definition

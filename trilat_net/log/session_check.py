@@ -1,13 +1,12 @@
-"""Checks a log: its bytes, its completeness, and its agreement with its scenario.
+"""Checks a log: its bytes, its completeness, and its consistency with its scenario.
 
-It implements `trilat log check`. The bytes of any MCAP file are checked. The content is checked
-only if the file is a log of trilat-net: each message is compared with the place in the file
-where it is stored, with the scenario (the description of the experiment), and with the earlier
-messages. The control laws are not executed again. That is the task of
-`trilat_net.execution.verification`.
+Implements `trilat log check`. The bytes of any MCAP file are checked, but the content only if
+the file is a log of trilat-net. Each message is then compared with its position in the file,
+with the scenario, and with the earlier messages. The control laws are not executed again. That
+is the task of `trilat_net.execution.verification`.
 
 Invariant:
-    - Each check produces one finding, with the places at which the check failed.
+    - Each check produces one finding, which lists the places where the check failed.
     - Missing messages are listed as ranges of their numbers.
 """
 
@@ -64,7 +63,7 @@ _ACCOUNTS_SINCE = 3
 class LogCheckResult(CheckReport):
     """Result of checking the files of one log for damage and missing messages.
 
-    `trilat log check` prints it.
+    Printed by `trilat log check`.
 
     Attributes:
         files: Names of the files.
@@ -109,12 +108,11 @@ class LogCheckResult(CheckReport):
         ]
 
     def check_signatures(self, key_file: Path, progress: Progress | None = None) -> None:
-        """Checks the signatures of the files as well, and adds the result to the findings.
+        """Checks the signatures of the files too, and adds the result to the findings.
 
         Args:
-            key_file: File of the public key of a signer whom the user trusts.
-            progress: Function that is called after every record (result of a control period) of
-                a log.
+            key_file: Path of the public key file of a signer whom the user trusts.
+            progress: Function that is called after every record of a log.
 
         Raises:
             LogError: A log cannot be read.
@@ -126,7 +124,7 @@ class LogCheckResult(CheckReport):
 
 
 def check_file(*files: str | Path, progress: Progress | None = None) -> LogCheckResult:
-    """Checks that a log is well-formed, complete and consistent, as `trilat log check` does.
+    """Checks that a log is well-formed, complete and consistent, like `trilat log check`.
 
     Every byte of the file, or of all parts of the log, is checked.
 
@@ -135,8 +133,8 @@ def check_file(*files: str | Path, progress: Progress | None = None) -> LogCheck
     True
 
     Args:
-        files: The file, or the parts of the log.
-        progress: Function that is called repeatedly with the number of bytes read and their
+        files: Path of the file, or paths of the parts of the log.
+        progress: Function that is called repeatedly with the number of bytes read and the
             total.
 
     Raises:
@@ -220,9 +218,9 @@ class _ChannelCheck:
 
     @property
     def name(self) -> str:
-        """Short name of the channel for texts, such as "m1/state".
+        """Short name of the channel for messages to the user, such as "m1/state".
 
-        It consists of the publishing member ("m1") and the kind of message ("state").
+        Consists of the publishing member ("m1") and the kind of message ("state").
         """
         return f"{self.member}/{self.kind}"
 
@@ -230,8 +228,8 @@ class _ChannelCheck:
         """Starts the check of the channel in the next file of the log.
 
         A log may be divided into several files. The description of the channel in the file
-        (schema, encoding and metadata) is checked at once. The messages of the file are passed
-        to `check_message` afterwards.
+        (schema, encoding and metadata) is checked immediately. The messages of the file are
+        passed to `check_message` afterwards.
 
         Args:
             file: Name of the file.
@@ -272,11 +270,10 @@ class _ChannelCheck:
         return ""
 
     def check_message(self, stored: McapMessage, offset: int) -> None:
-        """Checks one message: that it can be decoded, is in its place, and has a possible time.
+        """Checks that a message can be decoded, is in its place, and has a plausible time.
 
-        A message states its sender, its number and its sending time. They must agree with the
-        sender, number and time that the file states for the message. Problems are added to the
-        findings.
+        The sender, number and sending time in the message must match those that the file states
+        for it. Problems are added to the findings.
 
         Args:
             stored: The message, with its times and its sequence number in the file.
@@ -456,13 +453,13 @@ class _SessionCheck:
     def read(self, file: str, stream: BinaryIO, progress: Progress | None = None) -> None:
         """Checks every byte of one file of the log, and its messages.
 
-        The problems are collected, and `findings` returns them after the last file.
+        Problems are collected, and returned by `findings` after the last file.
 
         Args:
             file: Name of the file.
             stream: The file, opened for reading.
-            progress: Function that is called repeatedly with the number of bytes read and
-                their total.
+            progress: Function that is called repeatedly with the number of bytes read and the
+                total.
 
         Raises:
             LogError: The file belongs to another session than the previous files.
@@ -686,11 +683,11 @@ class _SessionCheck:
             self._findings["schema"].add(self._file, None, text)
 
     def findings(self) -> Iterator[Finding]:
-        """Completes all checks after the files were read, and yields their results.
+        """Completes all checks after the files have been read, and yields their results.
 
         If the files contain no session of trilat-net, only the checks of the file format are
-        yielded. If checksums show that the session was removed from the file, the result
-        "chain" is also yielded.
+        yielded, plus the result "chain" if checksums show that the session was removed from the
+        file.
         """
         counts = self._counts
         findings = self._findings

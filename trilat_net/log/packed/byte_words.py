@@ -1,10 +1,10 @@
 """Loads eight bytes from an array as one integer, in compiled code.
 
-Compiled code thus compares and copies encoded messages eight bytes at a time, instead of byte
+This lets compiled code compare and copy encoded messages eight bytes at a time instead of byte
 by byte.
 
 Invariant:
-    - The caller makes sure that the eight bytes lie within the array.
+    - The caller ensures that the eight bytes lie within the array.
     - All integers are signed, because Numba converts a sum of signed and unsigned numbers to a
       floating-point number.
 """

@@ -1,12 +1,11 @@
 """Checks whether encoded records have the exact layout, and finds where their values lie.
 
-A record is the encoded state of an arm in one period of its control loop. Once the offsets of
-the values are known, a field of all records can be read directly from the bytes
-(`indexed_records`).
+Once the offsets of the values are known, a field of all records can be read directly from the
+bytes (`indexed_records`).
 
 Invariant:
-    - A record is accepted only if the decoder of whole records also accepts it, with the same
-      values.
+    - A record is accepted only if the decoder for complete records accepts it too, with the
+      same values.
     - A record with another order of fields, another version, or an unusual value is not
       accepted, even if it is valid.
 """
@@ -393,20 +392,19 @@ def scan_records(
 ) -> int:
     """Checks that each record has the exact layout, and finds where its values lie.
 
-    A record is the encoded state of an arm in one period of its control loop (tick). With the
-    offsets that this function finds, a field of all records can be read without decoding.
+    With the offsets found here, a field of all records can be read without decoding.
 
     Args:
         data: The records, followed by padding.
         starts: Offset of the first byte of each of the K records, shape (K,).
         ends: Offset after the last byte of each record, shape (K,).
         layout: The exact layout of the records, a `RecordLayout`.
-        heads: Receives the tick, the boot (identifier of the process) and the number of the
-            operating mode of each record, shape (K, 3). A boot of 2^63 or more is stored as the
-            signed number with the same bits.
-        marks: Receives the offsets of values (TIME, ...) from the start of each record,
+        heads: Output array for the tick, the boot (identifier of the process) and the mode code
+            of each record, shape (K, 3). A boot of 2^63 or more is stored as the signed integer
+            with the same bits.
+        marks: Output array for the offsets of values (TIME, ...) from the start of each record,
             shape (K, MARKS).
-        counts: Receives the lengths of lists (ARRIVAL_COUNT, ...), shape (K, COUNTS).
+        counts: Output array for the lengths of lists (ARRIVAL_COUNT, ...), shape (K, COUNTS).
 
     Returns:
         The number of records before the first one that is not accepted.
@@ -424,15 +422,15 @@ def scan_records(
 
 @loop_leaf
 def gather_ints(data: Bytes, starts: Ints, marks: Any, gaps: Ints, numbers: Ints) -> None:
-    """Reads integers that follow each other, at known positions of each encoded record.
+    """Reads consecutive integers at known positions in each encoded record.
 
     Args:
         data: The encoded records, followed by padding.
         starts: Offset of the first byte of each of the K records, shape (K,).
-        marks: Offset at which the search for the numbers begins, from the start of each record,
-            shape (K,).
-        gaps: Number of other bytes before each of the N numbers, shape (N,).
-        numbers: Receives the numbers, shape (K, N).
+        marks: Offset at which the search for the integers begins, from the start of each
+            record, shape (K,).
+        gaps: Number of other bytes before each of the N integers, shape (N,).
+        numbers: Output array for the integers, shape (K, N).
     """
     for k in range(starts.shape[0]):
         offset = starts[k] + marks[k]
@@ -444,17 +442,17 @@ def gather_ints(data: Bytes, starts: Ints, marks: Any, gaps: Ints, numbers: Ints
 
 @loop_leaf
 def gather_floats(data: Bytes, starts: Ints, marks: Any, places: Ints, bits: Ints) -> None:
-    """Reads some floating-point numbers, as their bits, from each record.
+    """Reads floating-point values from each encoded record as bit patterns.
 
-    Vectors have fixed lengths, so their numbers lie at fixed distances after a position in each
-    record, the mark.
+    Vectors have fixed lengths, so their entries lie at fixed offsets from a known position (the
+    mark) in each record.
 
     Args:
         data: The encoded records, followed by padding.
         starts: Offset of the first byte of each of the K records, shape (K,).
         marks: Offset of the mark from the start of each record, shape (K,).
-        places: Offset of each of the N numbers from the mark, shape (N,).
-        bits: Receives the bits of the numbers, shape (K, N).
+        places: Offset of each of the N values from the mark, shape (N,).
+        bits: Output array for the bit patterns, shape (K, N).
     """
     for k in range(starts.shape[0]):
         offset = starts[k] + marks[k] + 1  # the first byte of a number states its type
@@ -464,15 +462,15 @@ def gather_floats(data: Bytes, starts: Ints, marks: Any, places: Ints, bits: Int
 
 @loop_leaf
 def gather_stamps(data: Bytes, starts: Ints, marks: Any, counts: Any, numbers: Ints) -> None:
-    """Reads the arrivals of samples (states of other arms) from every record.
+    """Reads the arrivals of samples from every encoded record.
 
     Args:
         data: The encoded records, followed by padding.
         starts: Offset of the first byte of each of the K records, shape (K,).
         marks: Offset of the list of arrivals from the start of each record, shape (K,).
         counts: Number of arrivals in each record, shape (K,).
-        numbers: Receives the N arrivals of all records in order, three numbers each, shape
-            (N, 3).
+        numbers: Output array for the N arrivals of all records in order, with three integers
+            per arrival, shape (N, 3).
     """
     row = 0
     for k in range(starts.shape[0]):
@@ -488,16 +486,16 @@ def gather_stamps(data: Bytes, starts: Ints, marks: Any, counts: Any, numbers: I
 
 @loop_leaf
 def gather_memories(data: Bytes, starts: Ints, marks: Any, counts: Any, bits: Ints) -> None:
-    """Reads the internal state of the control law from every encoded record, as bits.
+    """Reads the internal state of the control law from every record as bit patterns.
 
-    It is the field `mem` of a record.
+    The state is stored in the field `mem`.
 
     Args:
         data: The encoded records, followed by padding.
         starts: Offset of the first byte of each of the K records, shape (K,).
-        marks: Offset of the first number from the start of each record, shape (K,).
-        counts: Count of numbers in each record, shape (K,).
-        bits: Receives the bits of the N numbers of all records, shape (N,).
+        marks: Offset of the first entry of the state from the start of each record, shape (K,).
+        counts: Length of the state vector in each record, shape (K,).
+        bits: Output array for the bit patterns of the N entries of all records, shape (N,).
     """
     row = 0
     for k in range(starts.shape[0]):

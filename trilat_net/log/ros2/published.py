@@ -1,15 +1,14 @@
 """Defines the topics under which ROS 2 programs see a session, and encodes their messages.
 
-ROS 2 is the Robot Operating System. The command `trilat ros2` publishes a running session as
-ROS 2 topics (the live bridge), and the export `ros2` converts a log to a bag, a recording of
-ROS 2. Both use this module. A bag contains a message for every record, the state of an arm in
-one period of its control loop. The live bridge publishes a part of these messages.
+The command `trilat ros2` publishes a running session as ROS 2 topics (the live bridge), and the
+export `ros2` converts a log to a bag, a recording of ROS 2. Both use this module. A bag
+contains one message per record. The live bridge publishes some of these messages.
 
 Invariant:
     - The live bridge and a bag have the same topics with the same types and the same numbers,
       because this module encodes the messages of both.
-    - The quaternions of a topic do not jump. Two quaternions of opposite sign are the same
-      orientation. The one that is nearer to the previous quaternion is chosen.
+    - The quaternions of a topic do not jump. Two quaternions of opposite sign represent the
+      same orientation, and the one closer to the previous quaternion is chosen.
     - A message is encoded only if its topic is wanted.
 """
 
@@ -81,14 +80,14 @@ _INDEX_ERRORS = (
 
 
 class Ros2Topics(dict[str, Ros2Channel]):
-    """Descriptions of ROS 2 topics, by their full names, which begin with "/"."""
+    """Maps the full names of ROS 2 topics, which begin with "/", to their descriptions."""
 
     @classmethod
     def of_session(cls, scenario: Scenario, session: str, table: TopicTable) -> "Ros2Topics":
         """Lists all topics under which a session is published, by the bridge or in a bag.
 
         Args:
-            scenario: Scenario of the session, its description in a TOML file.
+            scenario: Scenario of the session.
             session: Name of the session.
             table: Names of the topics in ROS 2.
         """
@@ -106,10 +105,10 @@ class Ros2Topics(dict[str, Ros2Channel]):
 
     @classmethod
     def of_log(cls, log: "Log") -> "Ros2Topics":
-        """Lists the topics under which a bridge would publish the session of a log live.
+        """Lists the topics that a bridge would use to publish the session of a log live.
 
-        Files for viewers then work for the log and for the live session. The names follow the
-        first of the built-in conventions.
+        Files for viewers then work for the log and for the live session alike. The names follow
+        the first of the built-in conventions.
 
         Args:
             log: Log of the session.
@@ -123,10 +122,11 @@ class Ros2Topics(dict[str, Ros2Channel]):
         """Lists the standard ROS 2 channels that a finished log or bag contains.
 
         Args:
-            path: The file.
+            path: Path of the file.
 
         Returns:
-            The descriptions of the channels, by topic. Empty if the file has no readable index.
+            Maps each topic to the description of its channel. Empty if the file has no readable
+            index.
 
         Raises:
             LogError: The file cannot be opened.
@@ -148,7 +148,7 @@ class Ros2Topics(dict[str, Ros2Channel]):
 
     @property
     def are_of_log(self) -> bool:
-        """True if the topics are those that a log contains for viewers, and not those of a bag.
+        """True if the topics are those of a log (for viewers) rather than those of a bag.
 
         False for a file without topics.
         """
@@ -156,18 +156,18 @@ class Ros2Topics(dict[str, Ros2Channel]):
 
 
 class SiteMessages:
-    """Encodes everything that one arm controller (site) publishes as ROS 2 messages.
+    """Encodes everything that one site publishes as ROS 2 messages.
 
     Args:
         scenario: Scenario of the session.
-        site: Name of the site, a process that runs one arm.
-        epoch_unix_ns: Start time of the session (tick 0), in Unix time, in ns. It is 0 in
-            virtual time.
+        site: Name of the site.
+        epoch_unix_ns: Start time of the session (tick 0) in Unix time, in ns; 0 in virtual
+            time.
 
     Attributes:
-        topics: Description of each topic of the site, by its name in trilat-net. The topics of
-            the whole session and `/tf` are not included.
-        frame: Name of the frame in which the poses of the end effector are given.
+        topics: Maps the trilat-net name of each topic of the site to its description. The
+            topics of the session as a whole and `/tf` are not included.
+        frame: Name of the frame in which the poses of the end effector are expressed.
         description: Message of the topic `robot_description`, the model of the arm.
     """
 
@@ -283,13 +283,12 @@ class SiteMessages:
         return topics
 
     def stamp_ns(self, record: State) -> int:
-        """Returns the time stamp of all ROS 2 messages that are derived from one record.
+        """Returns the time stamp of the ROS 2 messages derived from one record, in ns.
+
+        This is the nominal time of the record's tick, in Unix time.
 
         Args:
             record: The record.
-
-        Returns:
-            The nominal time of the record's tick, in Unix time, in ns.
         """
         return max(0, self._epoch_unix_ns + record.t_ns)
 
@@ -299,19 +298,18 @@ class SiteMessages:
         shares: Sequence[float],
         is_wanted: IsWanted = lambda _topic: True,
     ) -> NamedMessages:
-        """Converts the state of an arm in one control period to ROS 2 messages.
+        """Converts the record of a site to ROS 2 messages.
 
-        The state is a record of a site (arm controller): motion, reference, torques and mode.
+        The record contains the motion, reference, torques and mode of the arm at one tick.
 
         Args:
-            record: The record. The records must be passed in the order of their times, because
-                the signs of quaternions depend on the previous record.
-            shares: Dominance factors at the time of the record: the weights with which the site
-                follows each of the other sites.
+            record: The record. Records must be passed in chronological order, because the signs
+                of quaternions depend on the previous record.
+            shares: Dominance factors at the time of the record.
             is_wanted: Function that returns False for topics whose messages are not needed.
 
         Yields:
-            For each wanted topic, its name in trilat-net, and the encoded message.
+            For each wanted topic, its trilat-net name and the encoded message.
         """
         stamp_ns = self.stamp_ns(record)
         if is_wanted("joint_states"):
@@ -492,10 +490,10 @@ class SiteMessages:
                 yield topic, data
 
     def pack_frames(self, record: State) -> Iterable[bytes]:
-        """Encodes the poses of all links of an arm for viewers, in one control period.
+        """Encodes the poses of all links of an arm at one tick, for viewers.
 
         Args:
-            record: The record (result of a control period), which contains the joint positions.
+            record: The record, which contains the joint positions.
 
         Yields:
             The messages for the topic `/tf`.
@@ -520,7 +518,7 @@ class SiteMessages:
             stats: The statistics.
 
         Yields:
-            The name of the topic in trilat-net, and the message.
+            The trilat-net name of the topic, and the message.
         """
         yield from self._channels.pack_statistics(stats)
 
@@ -539,14 +537,13 @@ def _fill_rotation(values: Sequence[float]) -> list[float]:
 def pack_session_diagnostics(
     session: str, epoch_unix_ns: int, records: Sequence[State]
 ) -> bytes:
-    """Encodes the status of all arm controllers for the ROS 2 topic `/diagnostics`.
+    """Encodes the status of all sites for the ROS 2 topic `/diagnostics`.
 
     Args:
         session: Name of the session.
-        epoch_unix_ns: Start time of the session (tick 0), in Unix time, in ns. It is 0 in
-            virtual time.
-        records: Newest record (result of a control period) of each site (arm controller) that
-            has published records.
+        epoch_unix_ns: Start time of the session (tick 0) in Unix time, in ns; 0 in virtual
+            time.
+        records: Newest record of each site that has published any.
 
     Returns:
         The message, with one status per site.

@@ -1,14 +1,14 @@
 """Builds the model of an arm that a viewer draws: its URDF, and the poses of its links.
 
-URDF is an XML description of a robot by its links (bodies) and joints. A viewer draws the arms
-of all sites (processes that run one arm) in one scene. They stand in a row, `SPACING_M` apart,
-in a common frame `WORLD` whose z axis points up. If a URDF contains no shapes, plain shapes are
-added, so that the arm is visible. The files of meshes are never opened.
+URDF is an XML format that describes a robot by its links (bodies) and joints. A viewer draws
+the arms of all sites in one scene. They stand in a row, `SPACING_M` apart, in a common frame
+`WORLD` whose z axis points up. If a URDF contains no shapes, plain shapes are added to make the
+arm visible. Mesh files are never opened.
 
 Invariant:
     - The frame of a link is named "<site>/<link>", both in the URDF and in the transforms, so
-      that arms with the same URDF can be shown together.
-    - The joints have the same names in the URDF as in the messages with joint states.
+      that several arms with the same URDF can be shown together.
+    - The joints have the same names in the URDF as in the joint state messages.
     - The transforms place the end effector at the position that the site computes.
 """
 
@@ -66,7 +66,7 @@ class _JointFrame(NamedTuple):
     q_index: int
 
     def compute_transform(self, position: float) -> Transform:
-        """Computes the pose of a link relative to the link before it, by the joint's position.
+        """Computes the pose of a link relative to its parent, for a given joint position.
 
         Args:
             position: Position of the joint, in rad or m.
@@ -90,7 +90,7 @@ class _JointFrame(NamedTuple):
 def multiply_quaternions(a: Quaternion, b: Quaternion) -> Quaternion:
     """Computes the product a b of two quaternions.
 
-    For unit quaternions, the product is the rotation b, followed by the rotation a.
+    For unit quaternions, the product represents rotation b followed by rotation a.
 
     Args:
         a: The left factor.
@@ -107,10 +107,10 @@ def multiply_quaternions(a: Quaternion, b: Quaternion) -> Quaternion:
 
 
 def rotate_vector(rotation: Quaternion, vector: Vector) -> Vector:
-    """Rotates a vector by a rotation that is given as a unit quaternion.
+    """Rotates a vector by a unit quaternion.
 
-    The result is q v q*, with the vector v as a quaternion without scalar part, and the
-    conjugate q* of q.
+    Computes q v q*, where v is taken as a quaternion without scalar part, and q* is the
+    conjugate of q.
 
     Args:
         rotation: The unit quaternion q.
@@ -133,7 +133,7 @@ def _rotate_about(axis: Vector, angle: float) -> Quaternion:
 
 
 def compute_quaternion(rotation_vector: Vector) -> Quaternion:
-    """Converts a rotation vector to a unit quaternion (x, y, z, w).
+    """Converts a rotation vector in rad to a unit quaternion (x, y, z, w).
 
     Args:
         rotation_vector: Axis of the rotation times its angle, in rad.
@@ -185,9 +185,8 @@ _PLANAR = (DEFINITIONS / "planar.urdf").read_text(encoding="utf-8")
 def name_ros_joints(scenario: Scenario, site: str) -> list[str]:
     """Lists the names of an arm's joints in ROS messages and in the URDF for viewers.
 
-    Joints keep the names of their URDF. If no arm of the scenario has a URDF, the joints have
-    the same names at all sites (arm controllers). The name of the site is therefore put in
-    front: "m1_q1".
+    Joints keep the names from their URDF. If no arm of the scenario has a URDF, the joints have
+    the same names at all sites, so the name of the site is added as a prefix: "m1_q1".
 
     Args:
         scenario: Scenario of the session.
@@ -203,7 +202,7 @@ def name_ros_joints(scenario: Scenario, site: str) -> list[str]:
 
 
 class RobotModel:
-    """The arm of one site (arm controller) as a tree of rigid links, for viewers that draw it.
+    """The arm of one site as a tree of rigid links, for viewers that draw it.
 
     The model is built from the URDF of the arm, or from the built-in planar arm.
 
@@ -269,15 +268,15 @@ class RobotModel:
         self.description = _describe_robot(root, site, site_number)
 
     def compute_transforms(self, q: Sequence[float]) -> list[Transform]:
-        """Computes the poses of the arm's links for given positions of its joints.
+        """Computes the poses of the arm's links for given joint positions.
 
         Viewers draw the arm from these poses.
 
         Args:
-            q: Positions of the joints, in rad or m.
+            q: Joint positions, in rad or m.
 
         Returns:
-            The pose of each frame in its parent frame, in the order of `frames`.
+            The pose of each frame relative to its parent frame, in the order of `frames`.
         """
         transforms: list[Transform] = [self._base]
         for joint in self._joints:
@@ -288,22 +287,21 @@ class RobotModel:
         return transforms
 
     def pack(self, stamp_ns: int, q: Sequence[float]) -> bytes:
-        """Encodes the poses of all links of an arm as one ROS 2 message of the topic `/tf`.
+        """Encodes the poses of all links of an arm as one ROS 2 message for the topic `/tf`.
 
         Args:
             stamp_ns: Unix time of the message, in ns, 0 or more.
-            q: Positions of the joints, in rad or m.
+            q: Joint positions, in rad or m.
         """
         transforms = self.compute_transforms(q)
         return self.pack_transforms(stamp_ns, transforms)
 
     def pack_transforms(self, stamp_ns: int, transforms: Iterable[FramePose]) -> bytes:
-        """Encodes given poses of frames as one ROS 2 message of the topic `/tf`.
+        """Encodes given poses of frames as one ROS 2 message for the topic `/tf`.
 
         Args:
             stamp_ns: Unix time of the message, in ns, 0 or more.
-            transforms: For each frame of `frames` the origin in m, and the quaternion x, y, z,
-                w.
+            transforms: The origin in m and the quaternion x, y, z, w of each frame in `frames`.
         """
         numbers: list[float] = []
         for origin, rotation in transforms:

@@ -1,15 +1,16 @@
 """Converts the messages of a session to standard ROS 2 messages for general viewers.
 
-Only trilat-net can decode the session's own messages in a log. Therefore a log may also contain
-channels of standard ROS 2 messages, which viewers such as Foxglove and PlotJuggler display.
-This module defines these channels with their units and names, and converts the messages.
+The session's own messages in a log can be decoded only by trilat-net. A log may therefore also
+contain channels of standard ROS 2 messages, which viewers such as Foxglove and PlotJuggler can
+display. This module defines these channels with their units and names, and converts the
+messages.
 
 Invariant:
-    - Values are copied without a conversion. Only times are converted, to the unit that is
-      stated in the metadata of the channel.
+    - Values are copied unchanged, except that times are converted to the unit stated in the
+      metadata of the channel.
     - A value that was not measured is NaN.
-    - Each curve has a name, which viewers display. Joint states contain the names of the
-      joints. In an array, the label of each dimension lists the names of its entries.
+    - Each curve has a name that viewers display. Joint states contain the names of the joints.
+      In an array, the label of each dimension lists the names of its entries.
 """
 
 import math
@@ -48,7 +49,7 @@ class Ros2Channel(NamedTuple):
 
     Attributes:
         kind: ROS type of the messages.
-        about: Metadata of the channel, such as units and names of its numbers.
+        about: Metadata of the channel, such as the units and names of its numbers.
         latched: True if a subscriber that joins late receives the last message.
     """
 
@@ -64,8 +65,8 @@ class Ros2Channel(NamedTuple):
     def name_numbers(self) -> list[str]:
         """Returns the names of the numbers in a message of the channel, in order.
 
-        The metadata has a list of names for each axis of the numbers, such as "m1 m2; 1 2". The
-        name of a number combines one name of each axis.
+        The metadata contain one list of names per dimension of the array, such as "m1 m2; 1 2".
+        The name of a number combines one name from each list.
         """
         axes = [axis.split(" ") for axis in self.about.get("names", "").split("; ")]
         return [" ".join(filter(None, parts)) for parts in product(*axes)]
@@ -76,14 +77,14 @@ Ros2Channels = Mapping[str, Ros2Channel]
 
 
 class StandardChannels:
-    """Registers ROS 2 channels for viewers in an MCAP file, each when it is first needed.
+    """Registers ROS 2 channels for viewers in an MCAP file when they are first needed.
 
     Indexing the object with the topic of a channel returns the number of the channel in the
-    file. If the channel is not registered yet, it is registered first.
+    file, after registering the channel if necessary.
 
     Args:
-        file: The file.
-        known: Descriptions of the channels that may be registered, by topic.
+        file: Writer of the MCAP file.
+        known: Maps the topic of each channel that may be registered to its description.
     """
 
     def __init__(self, file: McapWriter, known: Mapping[str, Ros2Channel]) -> None:
@@ -151,7 +152,7 @@ _MODE_NUMBERS.update(NUMBERS_BY_MODE_WORD)
 
 
 def pack_event(event: Event, stamp_ns: int) -> NamedMessages:
-    """Encodes an event for viewers as two messages: a string, and a line for the ROS log.
+    """Encodes an event for viewers as two messages: a string, and a line of the ROS log.
 
     Args:
         event: The event, such as the loss of a connection.
@@ -210,22 +211,21 @@ ArrayChannels = dict[str, _ArrayChannel]
 class Ros2SiteChannels:
     """Describes the ROS 2 channels of one site for viewers, and encodes arrays of numbers.
 
-    A site is a process that runs one arm. The other sites, its peers, have the order of the
-    scenario.
+    Peers are in scenario order.
 
     Args:
-        scenario: Scenario (description of the experiment) of the session.
+        scenario: Scenario of the session.
         site: Name of the site.
 
     Attributes:
         joints: Names of the joints, from the URDF or numbered for a planar arm.
-        arrays: The array channels, by the last part of their topic.
-        record_arrays: Names of the arrays that are computed from records (results of control
-            periods). The others are computed from statistics.
-        error_row: Slice of the error e = q - q_des, Eq. (9), in the numbers of a record from
-            `stack_signals`.
-        slow_row: Slice of the numbers that follow the error: the exogenous torque, the
-            estimated parameters, the vectors that the control law sends, and the mode.
+        arrays: Maps the last part of the topic of each array channel to the channel.
+        record_arrays: Names of the arrays that are computed from records. The others are
+            computed from statistics.
+        error_row: Slice of the error e = q - q_des, Eq. (9), in the values that `stack_signals`
+            returns for a record.
+        slow_row: Slice of the values after the error: the exogenous torque, the estimated
+            parameters, the vectors that the control law sends, and the mode.
         robot: Model of the arm for viewers. None for a planar arm.
     """
 
@@ -302,10 +302,10 @@ class Ros2SiteChannels:
 
     @property
     def channels(self) -> dict[str, Ros2Channel]:
-        """ROS 2 channels of this site for viewers, by the last part of their topic.
+        """Maps the last part of each topic to the ROS 2 channel of this site for viewers.
 
-        There is a channel for each array of numbers. If the arm has a robot model, there are
-        also channels for the model and for the poses of its links.
+        There is one channel per array of numbers. If the arm has a robot model, there are also
+        channels for the model and for the poses of its links.
         """
         channels: dict[str, Ros2Channel] = {}
         for name, array in self.arrays.items():
@@ -315,7 +315,7 @@ class Ros2SiteChannels:
         return channels
 
     def joint_states(self, names: Sequence[str], *, effort: bool = True) -> Ros2Channel:
-        """Returns a channel of joint states, the usual message with the joints of a robot.
+        """Returns a channel of joint states, the usual message for the joints of a robot.
 
         Args:
             names: Names of the joints.
@@ -347,12 +347,12 @@ class Ros2SiteChannels:
     def pack_slow_arrays(self, row: Sequence[float]) -> NamedMessages:
         """Encodes the quantities of a record that viewers receive at a reduced rate.
 
-        These are the exogenous torque of Eq. (8), the estimated parameters, the numbers that
+        These are the exogenous torque of Eq. (8), the estimated parameters, the vectors that
         the control law sends, and the mode.
 
         Args:
-            row: Values of these quantities: the slice `slow_row` of the numbers that
-                `stack_signals` returns for a record (result of a control period).
+            row: Values of these quantities: the slice `slow_row` of the values that
+                `stack_signals` returns for a record.
 
         Yields:
             The name of each array, and the encoded message.
@@ -366,11 +366,12 @@ class Ros2SiteChannels:
             start = end
 
     def pack_statistics(self, stats: LinkStats) -> NamedMessages:
-        """Encodes the statistics about the connections of a site to other sites as arrays.
+        """Encodes the statistics of a site's connections to its peers as arrays.
 
-        The age of the received states is always included. Delays, clock offsets and the timing
+        The age of the received samples is always included. Delays, clock offsets and the timing
         of the control loop are included only in a live session, because simulated time has no
-        such quantities. Nothing is yielded for a site that receives samples of no other site.
+        such quantities. Nothing is yielded for a site that receives no samples from any other
+        site.
 
         Args:
             stats: The statistics.
@@ -456,20 +457,20 @@ SignalRow = Sequence[float]
 
 
 def stack_signals(records: Sequence[Record]) -> list[SignalRow]:
-    """Collects the curves that viewers draw from some records of an arm controller (site).
+    """Collects from the records of a site the curves that viewers draw.
 
     The curves are the joint positions q, their references q_des, the velocities qd, the torques
     tau, the error e = q - q_des, the exogenous torque tau_x, the estimated parameters
-    theta_hat, the numbers that the control law sends, and the mode. If the sites share the pose
-    x of the end effector instead, the joints have no reference. Then q is repeated in place of
-    q_des, and e is x - x_des.
+    theta_hat, the vectors that the control law sends, and the mode. If the sites share the pose
+    x of the end effector instead, the joints have no reference. In that case q is repeated in
+    place of q_des, and e is x - x_des.
 
     Args:
         records: The records, at least one.
 
     Returns:
-        The values of each curve, one per record. The mode has a single value if all records
-        have the same mode.
+        The values of each curve, one per record. The mode has a single value if it is the same
+        in all records.
     """
     first = records[0]
     is_task_space = bool(first.x)
