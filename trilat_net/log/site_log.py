@@ -1,14 +1,14 @@
-"""Gives access to the recorded states of one arm, as arrays over time or one by one.
+"""Provides the recorded states of one arm, as arrays over time or as single records.
 
-An arm publishes a record of its state in every period of its control loop, and a log stores the
-records as encoded bytes. This module decodes the fields of all records into arrays (`SiteLog.q`
-has the joint angles), or whole records into objects (`SiteLog.states`).
+An arm publishes a record of its state in every tick, and a log stores the records as encoded
+bytes. This module decodes fields of all records into arrays (`SiteLog.q` contains the joint
+angles), or complete records into objects (`SiteLog.states`).
 
 Invariant:
     - Only the requested fields and records are decoded.
     - An invalid record raises an error that names the arm.
-    - The memory for whole records is bounded, however long the log is: long sequences of
-      records are decoded in blocks when they are accessed.
+    - Memory for complete records is bounded, however long the log is: long sequences of records
+      are decoded in blocks when they are accessed.
 """
 
 import math
@@ -57,7 +57,7 @@ DecodeStates = Callable[[Sequence[bytes]], list[State]]
 
 
 def freeze(value: T) -> T:
-    """Makes an array read-only, so that a user of a log cannot change its values by accident.
+    """Makes arrays read-only, so that users of a log cannot change its values by accident.
 
     Args:
         value: An array, or a tuple or dictionary of arrays, all of which are made read-only.
@@ -79,15 +79,15 @@ def freeze(value: T) -> T:
 def compute_task_errors(x: Array, x_des: Array, axes: Sequence[float]) -> Array:
     """Computes the differences between the poses of an end effector and their references.
 
-    The error of a position is x - x_des. The error of an orientation is the rotation vector
-    (axis times angle) of the shortest rotation from the reference to the orientation.
+    The position error is x - x_des. The orientation error is the rotation vector (axis times
+    angle) of the shortest rotation from the reference to the orientation.
 
     Args:
         x: Positions x, y, z in m, or poses, which are positions and rotation vectors in rad,
-            shape (K, m), for K records (results of control periods).
+            shape (K, m), for K records.
         x_des: Their references, in the same format, shape (K, m).
-        axes: For each of the m coordinates, 1 if the site (arm controller) follows its
-            reference along that axis. For the other axes it is 0, and the error is set to 0.
+        axes: One entry per coordinate: 1 if the site follows its reference along that axis, or
+            0 if not, in which case the error is set to 0.
 
     Returns:
         The errors, shape (K, m), in m and rad.
@@ -101,16 +101,15 @@ def compute_task_errors(x: Array, x_des: Array, axes: Sequence[float]) -> Array:
 
 
 class LazyRecords(Sequence[State]):
-    """Sequence of the records of a site, which are decoded only when they are accessed.
+    """Sequence of the records of a site, decoded only when they are accessed.
 
-    A record is the result of one tick of the control loop. The records are decoded in blocks,
-    and the blocks that were accessed last are kept in memory. Thus a log of any length can be
-    read with little memory.
+    The records are decoded in blocks, and the most recently used blocks are cached. A log of
+    any length can therefore be read with little memory.
 
     Args:
         payloads: The encoded records.
         decode_block: Function that decodes several encoded records.
-        heavy: True if the decoded records are so large that only few of them are kept, see
+        heavy: True if the decoded records are so large that only a few of them are cached, see
             `HEAVY_BYTES`.
     """
 
@@ -125,7 +124,7 @@ class LazyRecords(Sequence[State]):
 
         @lru_cache(maxsize=block_count)
         def get_block(number: int) -> list[State]:
-            """Returns a block of consecutive records. It is decoded if it is not in memory.
+            """Returns a block of consecutive records, decoding it if it is not cached.
 
             Args:
                 number: Number of the block, counted from 0.
@@ -160,15 +159,15 @@ class LazyRecords(Sequence[State]):
 
 
 def decode_records(payloads: Sequence[bytes], decode_block: DecodeStates) -> Sequence[State]:
-    """Decodes the records of a site (arm controller), at once or when they are accessed.
+    """Decodes the records of a site, either immediately or when they are accessed.
 
-    A list is faster to use, but keeps all decoded records (results of control periods) in
-    memory. Therefore records are decoded at once only if there are at most
-    `MAX_DECODED_RECORDS` of them, and if they are not heavy (see `HEAVY_BYTES`).
+    A list is faster to use, but keeps all decoded records in memory. Records are therefore
+    decoded immediately only if there are at most `MAX_DECODED_RECORDS` of them, and if they are
+    not heavy (see `HEAVY_BYTES`).
 
     Args:
         payloads: The encoded records.
-        decode_block: Function that decodes some of them.
+        decode_block: Function that decodes a block of them.
 
     Returns:
         The records in the order of `payloads`: a list, or a sequence that decodes on access.
@@ -198,13 +197,13 @@ def _estimate_bytes(state: State) -> int:
 
 
 class RecordsByTick(Mapping[int, State]):
-    """Read-only mapping from ticks (control periods) to the records of a site (arm controller).
+    """Read-only mapping from ticks to the records of a site.
 
-    It is used for long logs, because a record is decoded only when it is accessed. If several
-    records have the same tick, the mapping contains the last of them.
+    Used for long logs, because a record is decoded only when it is accessed. If several records
+    have the same tick, the mapping contains the last of them.
 
     Args:
-        states: The K records, in the order of their ticks.
+        states: The K records, in tick order.
         ticks: The tick of each record, shape (K,).
     """
 
@@ -232,12 +231,12 @@ class RecordsByTick(Mapping[int, State]):
 
 
 class TimedMessages(NamedTuple, Generic[M]):
-    """Messages of a log with the times at which they were sent and at which they arrived.
+    """Messages of a log with their sending and arrival times.
 
     Attributes:
         messages: The K messages.
-        log_ns: Times of arrival at the recorder, in Unix time, shape (K,), in ns.
-        publish_ns: Times of sending, in Unix time, shape (K,), in ns.
+        log_ns: Arrival times at the recorder in Unix time, shape (K,), in ns.
+        publish_ns: Sending times in Unix time, shape (K,), in ns.
     """
 
     messages: list[M]
@@ -289,38 +288,36 @@ def _read_objects(site: "SiteLog", field: str) -> NDArray[np.object_]:
 
 
 class SiteLog:
-    """Records of one site, in the order of their ticks (control periods).
+    """Records of one site, in tick order.
 
-    `Log` creates this object for each site of a log. K is the number of records (results of
-    control periods) below, n the number of joints, m the number of coordinates that the sites
-    share (the joints, or the coordinates of the end effector in task space), and P the number
-    of parameters.
+    `Log` creates one such object per site. In the following, K is the number of records, n the
+    number of joints, m the number of coordinates that the sites share (the joints, or the
+    coordinates of the end effector in task space), and P the number of parameters.
 
     Args:
         name: Name of the site.
-        peers: Names of its peers, the sites whose samples it receives, in scenario order.
+        peers: Names of the peers from which the site receives samples, in scenario order.
         rate_hz: Tick rate of the site, in Hz.
         payloads: The encoded records, as published, in any order.
         source: Name of the file for error messages.
-        times: Times of arrival and of sending of each record, in Unix time, shape (K,) each, in
-            ns. If None, all times are 0.
+        times: Arrival and sending times of the records in Unix time, each of shape (K,), in ns.
+            If None, all times are 0.
         layout: Lengths of the vectors of a record: n, m and P.
-        channel: Names and lengths of the numbers that the site's control law sends to its
+        channel: Names and lengths of the vectors that the site's control law sends to its
             peers.
         axes: In task space, 1 for each coordinate that the site follows, and 0 for the others.
 
     Attributes:
-        payloads: The encoded records, in the order of their ticks.
-        indexed: The records, if all of them have the exact layout that this program writes.
-            Their fields are then read by compiled code.
+        payloads: The encoded records, in tick order.
+        indexed: The records in a form whose fields compiled code can read, if all of them have
+            the exact layout that this program writes.
         tick: Tick of each record, shape (K,).
-        log_time_ns: Time of arrival of each record at the recorder, in Unix time, shape (K,),
-            in ns.
-        publish_time_ns: Time of sending of each record, as the record states it, in Unix time,
-            shape (K,), in ns.
+        log_time_ns: Arrival time of each record at the recorder in Unix time, shape (K,), in
+            ns.
+        publish_time_ns: Sending time stated by each record in Unix time, shape (K,), in ns.
 
     Raises:
-        LogError: A record cannot be read. The properties raise it as well, for the fields that
+        LogError: A record cannot be read. Also raised by the properties, for the fields that
             they decode.
     """
 
@@ -442,26 +439,25 @@ class SiteLog:
             field: Name of the field in a record, see `State`.
 
         Returns:
-            The value in each record, shape (K,), in the order of the ticks.
+            The value in each record, shape (K,), in tick order.
         """
         return _read_ints(self, field)
 
     def memory(self, first: int, count: int) -> Array:
-        """Returns a part of the internal state of the site's control law in all records.
+        """Returns a part of the control law's internal state in all records.
 
-        The field `mem` of a record contains every number that the site (arm controller) and its
-        control law need to continue from this tick (control period), and that no other field
-        contains. The numbers have no names.
+        The field `mem` of a record contains all numbers that the site and its control law need
+        to continue from this tick and that are in no other field. The numbers have no names.
 
         Args:
-            first: Index of the first wanted number in `mem`.
-            count: Number of wanted numbers.
+            first: Index in `mem` of the first number to return.
+            count: Number of entries to return.
 
         Returns:
-            The numbers, shape (K, count).
+            The selected entries, shape (K, count).
 
         Raises:
-            LogError: The field of a record contains too few numbers.
+            LogError: `mem` has too few entries in a record.
         """
         wanted_numbers = [row[first : first + count] for row in self.mem]
         try:
@@ -474,10 +470,10 @@ class SiteLog:
             ) from None
 
     def record(self, n: int) -> State:
-        """Decodes a single record of an arm without all others, which is fast for a long log.
+        """Decodes a single record of an arm without the others, which is fast for a long log.
 
         Args:
-            n: Index of the record in the order of ticks. -1 is the last record.
+            n: Index of the record in tick order. -1 is the last record.
 
         Returns:
             The record.
@@ -485,10 +481,10 @@ class SiteLog:
         return self.decode([self.payloads[n]])[0]
 
     def decode(self, payloads: Sequence[bytes]) -> list[State]:
-        """Decodes whole records, and checks that their vectors have the lengths of this arm.
+        """Decodes complete records, and checks that the vector lengths match those of this arm.
 
         Args:
-            payloads: Encoded records (results of control periods) of the site (arm controller).
+            payloads: Encoded records of the site.
 
         Raises:
             LogError: A record cannot be decoded.
@@ -501,19 +497,19 @@ class SiteLog:
 
     @cached_property
     def states(self) -> Sequence[State]:
-        """The whole records in the order of their ticks, decoded and checked.
+        """The complete records in tick order, decoded and checked.
 
-        If there are many records, a record is decoded only when it is accessed. To compute with
-        a single quantity, the arrays such as `q` are much faster.
+        If there are many records, a record is decoded only when it is accessed. For
+        computations on a single quantity, arrays such as `q` are much faster.
         """
         return decode_records(self.payloads, self.decode)
 
     @cached_property
     def by_tick(self) -> "dict[int, State] | RecordsByTick":
-        """All records by the number of their control period (tick).
+        """Mapping from ticks to records.
 
-        Two logs are compared this way, because either may lack records. If several records have
-        the same tick, the last one counts.
+        Used to compare two logs, because either may lack records. If several records have the
+        same tick, the last one counts.
         """
         if isinstance(self.states, LazyRecords):
             return RecordsByTick(self.states, self.tick)
@@ -521,7 +517,7 @@ class SiteLog:
 
     @property
     def last_tick(self) -> int:
-        """Number of the control period (tick) of the last record, or -1 without records.
+        """Tick of the last record, or -1 if there are no records.
 
         Ticks are counted from 0 at the start of the run.
         """
@@ -531,8 +527,8 @@ class SiteLog:
     def diverged_s(self) -> float | None:
         """Time at which the arm exceeded a safety limit, which ended the run, in s.
 
-        This is the time of the last record if its mode is "diverged". The value is None if the
-        arm stayed within its limits, or if there are no records.
+        This is the time of the last record if its mode is "diverged". None if the arm stayed
+        within its limits, or if there are no records.
         """
         if not len(self):
             return None
@@ -543,8 +539,8 @@ class SiteLog:
     def missing(self) -> int:
         """Number of ticks before the last record that have no record.
 
-        The network or a full queue lost these records, or the site skipped the ticks. Records
-        that are missing at the end cannot be counted here.
+        These records were lost in the network or because a queue was full, or the site skipped
+        the ticks. Records missing after the last one cannot be counted here.
         """
         if not len(self):
             return 0
@@ -555,7 +551,7 @@ class SiteLog:
 
     @property
     def skipped(self) -> int:
-        """Number of ticks that the site skipped because it was late, as its records state.
+        """Number of ticks that the site skipped because it was late, according to its records.
 
         Only a site with an external arm skips ticks, because a real arm cannot catch up.
         """
@@ -563,7 +559,7 @@ class SiteLog:
 
     @property
     def skipped_ranges(self) -> list[tuple[int, int]]:
-        """Ranges of skipped ticks, as (first tick, last tick), in ascending order.
+        """Ranges (first tick, last tick) of skipped ticks, in ascending order.
 
         The record after a range states how many ticks the site skipped before it.
         """
@@ -638,7 +634,7 @@ class SiteLog:
     def t_s(self) -> Array:
         """Nominal time since the epoch, the common start of the session, shape (K,), in s.
 
-        It is the ideal time of each tick, not the time at which the tick was computed.
+        This is the ideal time of each tick, not the time at which the tick was computed.
         """
         return freeze(self.t_ns / NS_PER_S)
 
@@ -646,8 +642,8 @@ class SiteLog:
     def orientation(self) -> Array:
         """Orientation of the end effector as unit quaternions (w, x, y, z), shape (K, 4).
 
-        A quaternion and its negative are the same orientation. The sign is chosen so that each
-        quaternion is nearest to the previous one. The shape is (K, 0) for sites that do not
+        A quaternion and its negative represent the same orientation. Signs are chosen to bring
+        each quaternion closest to the previous one. The shape is (K, 0) for sites that do not
         follow orientations.
         """
         return self._compute_orientation(self.x)
@@ -656,9 +652,9 @@ class SiteLog:
     def orientation_des(self) -> Array:
         """Orientation of the reference as unit quaternions (w, x, y, z), shape (K, 4).
 
-        The reference is the motion that the end effector of the arm follows, and K is the
-        number of records. The shape is (K, 0) for sites that do not follow orientations. The
-        signs are chosen so that each quaternion is nearest to the previous one.
+        The reference is the motion that the end effector follows, and K is the number of
+        records. The shape is (K, 0) for sites that do not follow orientations. Signs are chosen
+        to bring each quaternion closest to the previous one.
         """
         return self._compute_orientation(self.q_des)
 
@@ -674,11 +670,11 @@ class SiteLog:
 
     @cached_property
     def body_poses(self) -> Array:
-        """Poses of the b bodies that the simulated environment of the arm contains.
+        """Poses of the b bodies in the simulated environment of the arm, shape (K, b, 7).
 
-        The shape is (K, b, 7). A pose is the position x, y, z in m and the orientation as a
-        unit quaternion w, x, y, z. A quaternion and its negative are the same orientation. Its
-        sign is chosen so that the quaternion is nearest to the previous one.
+        A pose consists of the position x, y, z in m and the orientation as a unit quaternion w,
+        x, y, z. A quaternion and its negative represent the same orientation. The sign is
+        chosen to bring the quaternion closest to the previous one.
         """
         poses = self.bodies.reshape(len(self), -1, POSITION + 4).copy()
         for body in range(poses.shape[1]):
@@ -700,12 +696,12 @@ class SiteLog:
 
     @cached_property
     def sent(self) -> dict[str, Array]:
-        """Numbers that the site's control law sends to the other sites in each control period.
+        """Quantities that the site's control law sends to the other sites in each tick.
 
-        A key is the name of the quantity in the control law, such as "E", if all other sites
-        receive the same numbers. If the numbers are meant for one site, the key also contains
-        its name, such as "u[m2]". The value is an array of shape (K, w), with K records and w
-        numbers of the quantity. Empty if the control law sends nothing.
+        Each key is the name of a quantity in the control law, such as "E", if all other sites
+        receive the same values. If the values are meant for one site, the key also contains its
+        name, such as "u[m2]". Each value is an array of shape (K, w), for K records and w
+        entries of the quantity. Empty if the control law sends nothing.
         """
         columns: dict[str, list[int]] = {}
         for column, entry in enumerate(self.channel.entries(self.peers)):
@@ -716,19 +712,18 @@ class SiteLog:
     def busy_us(self) -> Ints:
         """Computing time of each tick except the last one, shape (K - 1,), in us.
 
-        A record contains the computing time of the previous tick, because the time of its own
-        tick is not known yet when the record is published. The values are shifted by one row
+        A record contains the computing time of the previous tick, because that of its own tick
+        is not yet known when the record is published. The values are shifted by one row
         accordingly.
         """
         return self.numbers("busy_us")[1:]
 
     @cached_property
     def used(self) -> dict[str, Ints]:
-        """Which received state of each peer the control law used, in each of the K records.
+        """Tick of the sample of each peer that the control law used in each record.
 
-        A peer is another site (arm controller), and a sample is the state that it sends in each
-        tick (period of its control loop). The key is the name of the peer. The value has the
-        shape (K,), with the number of the tick, or -1 before the first sample of the peer.
+        Maps the name of each peer to an array of shape (K,). The tick is -1 before the first
+        sample of the peer.
         """
         if self.indexed is not None:
             ticks = self.indexed.used
@@ -737,11 +732,11 @@ class SiteLog:
 
     @cached_property
     def arrivals(self) -> tuple[Ints, Ints]:
-        """Messages from other arms that arrived at this arm, with their delays.
+        """Samples from other arms that arrived at this arm, with their delays.
 
-        The first array contains the number of messages (samples) in each record, shape (K,).
-        The second array contains all arrivals in order, shape (N, 3), with the columns of `rx`:
-        index of the peer, tick of the sample, and delay in us.
+        The first array contains the number of samples in each record, shape (K,). The second
+        lists all N arrivals in order, shape (N, 3), with the columns of `rx`: index of the
+        peer, tick of the sample, and delay in us.
         """
         if self.indexed is not None:
             return freeze(self.indexed.arrivals)
@@ -761,22 +756,21 @@ class SiteLog:
         return {tick: tick_texts for tick, tick_texts in pairs if tick_texts}
 
     def changes(self) -> dict[int, list[str]]:
-        """Lists the changes of settings that the arm controller (site) applied during the run.
+        """Lists the parameter changes that the site applied during the run.
 
         Returns:
-            For each tick with changes, the changes as JSON texts in the order of application.
+            Maps each tick with changes to the changes as JSON strings, in order of application.
         """
         return {tick: list(texts) for tick, texts in self._changes.items()}
 
     def age_s(self, peer: str, rate_hz: int) -> Array:
-        """Computes the age of the peer's sample that the control law used in each record.
+        """Computes the age of the peer's sample that the control law used in each record, in s.
 
         The age is the time of the record minus the stamp of the sample. The stamp is the
-        nominal time of the tick (control period) in which the peer computed the sample.
+        nominal time of the tick in which the peer computed the sample.
 
         Args:
-            peer: Name of the peer, another site (arm controller) whose samples this site
-                receives.
+            peer: Name of the peer.
             rate_hz: Tick rate of the peer, in Hz.
 
         Returns:
@@ -790,7 +784,7 @@ class SiteLog:
     def iterate_delays(
         self, peer: str, rate_hz: int, sent_ticks: Sequence[int]
     ) -> Iterator[TracePoint]:
-        """Yields the stamp and the delay of every sample of a peer, in the order of the stamps.
+        """Yields the stamp and the delay of every sample of a peer, in order of their stamps.
 
         A sample that was sent but did not arrive has an infinite delay. It is left out if it
         may have arrived in a tick whose record is missing. `Log.link_delays` defines the
@@ -799,8 +793,8 @@ class SiteLog:
         Args:
             peer: Name of the sender.
             rate_hz: Tick rate of the sender, in Hz.
-            sent_ticks: Ticks of the samples that the sender is known to have sent. If there are
-                none, samples of all ticks up to the last arrival count as sent.
+            sent_ticks: Ticks of the samples that the sender is known to have sent. If empty,
+                samples of all ticks up to the last arrival count as sent.
 
         Yields:
             The stamp in s after the start of the session, and the delay in ms.

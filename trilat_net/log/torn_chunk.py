@@ -1,17 +1,17 @@
-"""Recovers messages from a compressed block of a log that was cut off.
+"""Recovers messages from a truncated compressed chunk of a log.
 
 An MCAP file stores messages in compressed chunks. If a recording is interrupted, the last chunk
-may be incomplete. The checksum of such a chunk proves nothing, because it covers all messages
-of the chunk, including those at the missing end. But the compressed data consist of blocks,
-which can be unpacked one by one, and the messages of all complete blocks can be used.
+may be incomplete. Its checksum is then useless, because it covers all messages of the chunk,
+including those in the missing part. But the compressed data consist of blocks that can be
+decompressed one by one, so the messages of all complete blocks can be used.
 
 Invariant:
-    - The messages of a block are used together or not at all, because damage in the compressed
+    - The messages of a block are used together or not at all, because damage to the compressed
       bytes of a block may falsify any of its messages, including messages that still look
       correct.
     - Compressed bytes are read up to the first doubtful page. A page that contains only zeros
-      was never written to the disk. A page that is equal to another page of the file was
-      written to the wrong place.
+      was never written to the disk. A page that equals another page of the file was written to
+      the wrong place.
 """
 
 from collections.abc import Callable, Iterator
@@ -48,13 +48,13 @@ InnerRecord = tuple[int, bytes]
 
 
 class TornChunk(NamedTuple):
-    """A compressed block of messages (chunk) whose end is missing from its file.
+    """A compressed chunk of messages whose end is missing from its file.
 
-    This happens when a recording is interrupted. The messages in the existing part can still be
-    recovered.
+    This happens when a recording is interrupted. The messages in the part that exists can still
+    be recovered.
 
     Attributes:
-        head: Head of the chunk, which describes the compressed records.
+        head: Header of the chunk, which describes the compressed records.
         packed: Compressed bytes of the chunk that exist and can be trusted.
         offset: Offset of the first compressed byte in the file.
     """
@@ -65,18 +65,18 @@ class TornChunk(NamedTuple):
 
     @classmethod
     def read(cls, scanner: RecordScanner, offset: int) -> "TornChunk":
-        """Reads the existing part of a chunk (compressed block of messages) that is cut off.
+        """Reads the existing part of a truncated chunk.
 
         Args:
             scanner: Scanner of the file.
             offset: Offset of the chunk in the file.
 
         Returns:
-            The head of the chunk, and its compressed bytes. The bytes end before the first page
-            of the file that was probably not written correctly, see `_find_doubtful_page`.
+            The header of the chunk, and its compressed bytes. The bytes end before the first
+            page of the file that was probably not written correctly, see `_find_doubtful_page`.
 
         Raises:
-            UnreadableRecord: The head of the chunk contains impossible values.
+            UnreadableRecord: The header of the chunk contains impossible values.
         """
         # Missing bytes are replaced by zeros, so that the code below refuses an incomplete
         # head.
@@ -93,16 +93,16 @@ class TornChunk(NamedTuple):
         return cls(head, packed, begin + head.data_offset)
 
     def iterate_blocks(self) -> Iterator[list[InnerRecord]]:
-        """Unpacks the intact part of the chunk block by block.
+        """Decompresses the intact part of the chunk block by block.
 
-        A block is a piece of the compressed data that can be unpacked as a whole. A record that
+        A block is a piece of the compressed data that is decompressed as a unit. A record that
         continues in the next block is yielded with the block that contains its end.
 
         Yields:
             The records of each block. Nothing if the first block is damaged or incomplete.
 
         Raises:
-            UnreadableRecord: The unpacked bytes are not a record.
+            UnreadableRecord: The decompressed bytes are not a record.
         """
         unpacked = bytearray()
         for block in self._unpack():

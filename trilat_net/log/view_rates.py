@@ -1,7 +1,7 @@
-"""Defines how often a log gets messages for general viewers, such as Foxglove.
+"""Defines how often a log stores messages for general viewers, such as Foxglove.
 
 Viewers cannot decode the messages of a session. A log may therefore contain standard messages
-beside them (`ros2.viz_channels`), at a lower rate to keep the file small.
+next to them (`ros2.viz_channels`), at a lower rate to keep the file small.
 """
 
 import math
