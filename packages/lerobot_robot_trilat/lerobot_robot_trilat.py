@@ -1,12 +1,12 @@
-"""A LeRobot robot through which a policy drives one of the two masters of a trilat-net session.
+"""A LeRobot robot that lets a policy drive one of the two masters of a trilat-net session.
 
-In such a session a slave arm follows two master arms. The policy drives one master, and another
-user drives the other. An action of the policy moves its master as an operator would (a "live
-hand" of the scenario). An observation consists of the newest states of the slave and of that
-master, and of the position and force of the operator.
+In such a session, a slave arm follows two master arms, one driven by the policy and the other
+by another user. An action of the policy moves its master as an operator would (a "live hand" of
+the scenario). An observation consists of the newest states of the slave and of that master, and
+of the position and force of the operator.
 
 `python -m lerobot_robot_trilat FOLDER` runs a trained policy in a session. `lerobot-rollout` of
-LeRobot 0.6.1 cannot do this, because it leaves out torques, forces and
+LeRobot 0.6.1 cannot do this, because it omits torques, forces and
 `observation.environment_state`.
 
 Invariant:
@@ -43,18 +43,16 @@ The values are the method of `tn.hand`, and the suffix of the keys of a command.
 class TrilatRobotConfig(RobotConfig):
     """Settings of a `TrilatRobot`: the session, and the site that the policy drives.
 
-    A site is an arm with its control loop.
-
     Attributes:
         session: Name of the session.
-        scenario: Name or path of the scenario of the session. Empty if it has the name of the
-            session.
+        scenario: Name or path of the scenario of the session. Empty if it has the same name as
+            the session.
         site: Name of the master that the policy drives.
         slave: Name of the slave, which the policy also observes.
         connect: Network endpoints of the session. Empty for the default endpoints on this
             machine.
         keys: Folder of the operator's keys. Empty for a session without keys.
-        timeout_s: Longest wait for the session, in s.
+        timeout_s: Maximum time to wait for the session, in s.
     """
 
     session: str = "play"
@@ -67,7 +65,7 @@ class TrilatRobotConfig(RobotConfig):
 
 
 class TrilatRobot(Robot):
-    """Robot for LeRobot: the slave arm and one master arm of a session of trilat-net.
+    """LeRobot robot that consists of the slave and one master of a trilat-net session.
 
     A policy observes both arms and drives the master, which the slave follows. LeRobot creates
     the object from a `TrilatRobotConfig`, and calls its methods in a loop.
@@ -105,19 +103,20 @@ class TrilatRobot(Robot):
 
     @property
     def observation_features(self) -> dict[str, type]:
-        """Names and types of the numbers that LeRobot receives as an observation of the robot.
+        """Names and types of the values that LeRobot receives as an observation of the robot.
 
-        The numbers are the states of both arms, and the position and force of the operator, the
-        program that moves the master arm. A joint has its angle in rad, its velocity in rad/s
-        and its external torque in N m. The operator has a position in m, and feels a force in
-        N. In mode `joint` these are angles in rad and torques in N m.
+        An observation contains the states of both arms, and the position and force of the
+        operator, the program that moves the master. For each joint, it contains the angle in
+        rad, the velocity in rad/s and the external torque in N m. For the operator, it contains
+        the position in m and the force on the operator in N, or angles in rad and torques in N
+        m in mode `joint`.
         """
         keys = [*self._joint_keys, *self._position_keys, *self._felt_keys]
         return dict.fromkeys(keys, float)
 
     @property
     def action_features(self) -> dict[str, type]:
-        """Keys of an action: a command of the operator.
+        """Keys of an action, which is a command of the operator.
 
         Depending on the mode in the scenario, the command is a position in m (mode `tip`),
         angles in rad (`joint`) or a force in N (`force`).
@@ -128,14 +127,14 @@ class TrilatRobot(Robot):
     def is_connected(self) -> bool:
         """True between `connect` and `disconnect`.
 
-        It stays true after the end of the session, because LeRobot disconnects a device only if
-        it is connected, and a device that is not disconnected keeps the process alive.
+        Stays True after the end of the session, because LeRobot disconnects a device only if it
+        is connected, and a device that is not disconnected keeps the process alive.
         """
         return self._hand is not None
 
     @property
     def is_calibrated(self) -> bool:
-        """Always True: no calibration is needed, as the scenario file describes the arms."""
+        """Always True. No calibration is needed, because the scenario describes the arms."""
         return True
 
     def calibrate(self) -> None:
@@ -148,7 +147,7 @@ class TrilatRobot(Robot):
         """Joins the teleoperation session, and waits for the first state of both arms.
 
         Args:
-            calibrate: Not used, because there is nothing to calibrate.
+            calibrate: Ignored, because there is nothing to calibrate.
 
         Raises:
             DeviceAlreadyConnectedError: The robot is already connected.
@@ -202,10 +201,11 @@ class TrilatRobot(Robot):
         """Returns the newest states of the slave and of the driven master, for the policy.
 
         The state of an arm consists of the angles, velocities and external torques of its
-        joints. The position of the operator and the reaction to the operator's force follow.
+        joints, followed by the position of the operator and the reaction to the operator's
+        force.
 
         Returns:
-            Numbers with the keys of `observation_features`.
+            Values with the keys of `observation_features`.
         """
         hand = self._require_running_hand()
         self._receive_newest()
@@ -219,9 +219,9 @@ class TrilatRobot(Robot):
         return dict(zip(self.observation_features, values, strict=True))
 
     def send_action(self, action: dict[str, Any]) -> dict[str, float]:
-        """Sends the policy's decision to the operator that moves the master arm.
+        """Sends an action of the policy to the operator that moves the master arm.
 
-        The site enforces the limits of force and speed.
+        The site enforces the limits on force and speed.
 
         Args:
             action: A command, with the keys of `action_features`.
@@ -318,15 +318,15 @@ def run_policy(
     duration_s: float,
     fps: int,
 ) -> int:
-    """Lets a trained policy move the arm of a robot, at a fixed rate.
+    """Runs a trained policy that moves the arm of a robot, at a fixed rate.
 
     Args:
         robot: The connected robot.
         decide: The policy. Its argument has the keys of an exported dataset,
-            `observation.state` and `observation.environment_state`. Its result has a number for
+            `observation.state` and `observation.environment_state`. It returns one number for
             each key of `action_features`.
         duration_s: Time after which the policy ends, in s.
-        fps: Number of decisions per second, as in the dataset of the training.
+        fps: Number of decisions per second, as in the training dataset.
 
     Returns:
         The number of decisions.
@@ -375,8 +375,8 @@ def _load_policy(folder: str) -> Callable[[dict[str, list[float]]], list[float]]
         """Returns the action of the trained policy for an observation, as a list of numbers.
 
         Args:
-            state: Numbers of each feature of the observation. Features with which the policy
-                was not trained are left out.
+            state: Maps each feature of the observation to its values. Features with which the
+                policy was not trained are left out.
         """
         tensors = {
             key: torch.tensor([numbers], dtype=torch.float32)

@@ -1,9 +1,9 @@
-"""Checks the arguments that a scenario gives to a user's class, and creates the instance.
+"""Checks the arguments that a scenario passes to a user's class, and creates the instance.
 
 The class is a control law, a hand (a program that moves an arm) or a plant (a model of an arm).
-Its arguments are the keys that the user wrote beside its name. An argument that the class does
-not have, or whose value has the wrong type, is refused before any code of the class runs. The
-error names the class, its file, the argument, and the arguments that the class has.
+Its arguments are the keys that the user wrote next to its name. An argument that the class does
+not have, or whose value has the wrong type, is rejected before any code of the class runs. The
+error names the class, its file, the argument, and the arguments that the class accepts.
 """
 
 import inspect
@@ -23,7 +23,7 @@ _TYPE_NAMES: dict[type, tuple[tuple[type, ...], str]] = {
 def make_own_instance(
     kind: Any, code: str, context: Any, settings: dict[str, Any], path: str
 ) -> Any:
-    """Creates an object of a user's class, after a check of its arguments.
+    """Creates an instance of a user's class, after checking its arguments.
 
     A wrong argument is reported with its path in the scenario, like any other wrong key, and
     not as an exception within the class. A class without a constructor receives neither the
@@ -31,14 +31,14 @@ def make_own_instance(
 
     Args:
         kind: The class.
-        code: Module and class, for example "mylaws:Spring", for errors.
-        context: First argument of the class: the facts about the site (arm controller).
+        code: Module and class, for example "mylaws:Spring", for error messages.
+        context: First argument of the class: the facts about the site.
         settings: Keyword arguments of the class.
-        path: Path of the table with the arguments in the scenario, for errors.
+        path: Path in the scenario of the table with the arguments, for error messages.
 
     Raises:
         ScenarioError: An argument is unknown, missing or of the wrong type, or the class raised
-            an exception, of any kind.
+            any exception.
     """
     check_arguments(kind, code, settings, path)
     has_init = kind.__init__ is not object.__init__
@@ -56,16 +56,16 @@ def make_own_instance(
 
 
 def check_arguments(kind: Any, code: str, settings: Mapping[str, Any], path: str) -> None:
-    """Rejects arguments in a scenario that a user's class does not accept.
+    """Raises ScenarioError if a user's class does not accept its arguments in the scenario.
 
-    The check compares them with the constructor of the class, before an object is created, so
-    that the error names the wrong key of the scenario.
+    The arguments are compared with the constructor of the class before an instance is created,
+    so that the error names the wrong key of the scenario.
 
     Args:
-        kind: The class, whose first argument is for the facts about the site.
-        code: Module and class, for example "mylaws:Spring", for errors.
-        settings: The keyword arguments, by name.
-        path: Path of the table with the arguments in the scenario, for errors.
+        kind: The class, whose first argument receives the facts about the site.
+        code: Module and class, for example "mylaws:Spring", for error messages.
+        settings: Maps the names of the keyword arguments to their values.
+        path: Path in the scenario of the table with the arguments, for error messages.
 
     Raises:
         ScenarioError: The class has no such argument, an argument without a default is missing,

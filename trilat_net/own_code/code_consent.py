@@ -1,16 +1,16 @@
-"""Decides which code of users may run, and remembers permissions.
+"""Decides which user-written code may run, and remembers permissions.
 
-A scenario describes an experiment and may name classes that users wrote: control laws, programs
-that move an arm, and plants (simulations of an arm). Code that users name in their own scenario
-may run. A log, or another member of a session, may have an unknown author. Code that it names
-may run only if a person names the file of the code. The person may let the program remember the
-permission in the configuration folder.
+A scenario may name user-written classes: control laws, programs that move an arm, and plants
+(simulations of an arm). Code that users name in their own scenario may run. A log, or another
+member of a session, may have an unknown author, and code that it names may run only if a person
+names the file of the code. On request, the program remembers the permission in the
+configuration folder.
 
 Invariant:
-    - The file that a person names must have the hash that the log states, unless the person
+    - The file that a person names must have the hash stated in the log, unless the person
       explicitly allows another version.
     - A permission applies to one class in one file, with the arguments of one log. A log with
-      other arguments needs a permission of its own, and the error message says which arguments
+      other arguments needs its own permission, and the error message says which arguments
       differ.
 """
 
@@ -46,13 +46,13 @@ LawFiles = str | Path | Sequence[str | Path]
 
 
 def list_imported_code(scenarios: Iterable[ScenarioWithCode]) -> list[tuple[str, str]]:
-    """Returns the users' Python classes that experiments name, and that would run with them.
+    """Returns the user-written Python classes that would run in the given scenarios.
 
     Args:
-        scenarios: Descriptions of the experiments.
+        scenarios: The scenarios.
 
     Returns:
-        The different classes, each as its name, such as "mylaws:Spring", with the SHA-256 of
+        The distinct classes, each as its name, such as "mylaws:Spring", and the SHA-256 hash of
         its file.
     """
     named = [code for scenario in scenarios for code in _list_named_code(scenario)]
@@ -92,7 +92,7 @@ def allow_own_code(
     codes: Container[Any] | None = None,
     changed_from: ScenarioWithCode | None = None,
 ) -> AnyScenario:
-    """Permits users' classes to run, because a user of this process has named them.
+    """Permits user-written classes to run, because a user of this process has named them.
 
     Code that nobody has named or permitted is rejected, because a scenario from elsewhere may
     name harmful code.
@@ -100,10 +100,9 @@ def allow_own_code(
     Args:
         scenario: Scenario that names the code.
         codes: Classes that the user named, for example "package.module:Law". If None, the user
-            wrote the whole scenario, so all its code may run.
-        changed_from: Scenario that the user changed to get this scenario. Code that may run
-            there may run here as well, with its new arguments. None if there is no such
-            scenario.
+            wrote the complete scenario, so all its code may run.
+        changed_from: Scenario that the user modified to get this scenario. Code that may run
+            there may also run here, with its new arguments. None if there is no such scenario.
 
     Returns:
         The same scenario.
@@ -125,7 +124,7 @@ def allow_own_code(
 
 
 def import_named_class(code: str, path: str) -> Any:
-    """Imports a control law that a user of this process names, and thereby permits to run.
+    """Imports a control law that a user of this process has named, and so permitted to run.
 
     Args:
         code: Module and class, as in "mylaws:Spring".
@@ -159,20 +158,20 @@ def allow_logged_code(
     other_version: bool = False,
     remember: bool = False,
 ) -> None:
-    """Allows code that a log names to run, if a person has permitted it.
+    """Permits code that a log names to run, if a person has permitted it.
 
     A log may have an unknown author, so its code does not run without permission. A person
-    permits code by naming its file now, or by a permission stored earlier. See `open_log`.
+    permits code by naming its file now, or has stored a permission earlier. See `open_log`.
 
     Args:
         scenario: Scenario of the log, which names the code.
         law: Python files that the person permits to run. By default, no file is permitted.
-        other_version: If True, a file may differ from the file that ran.
-        remember: If True, the permission is stored for later logs.
+        other_version: True to allow a file to differ from the one that ran.
+        remember: True to store the permission for later logs.
 
     Raises:
-        UsageError: A file does not define code that the log names, or is another version of it;
-            or an option requires a file, and no file is named.
+        UsageError: A file does not define code that the log names, or is another version of it.
+            Also raised if an option requires a file and none is named.
         ScenarioError: A file cannot be read, or does not define such a class. No code has run.
     """
     files = [Path(law)] if isinstance(law, str | Path) else list(map(Path, law))
@@ -350,9 +349,9 @@ class _LoggedUserLaw(NamedTuple):
 
 
 def find_user_laws(scenario: ScenarioWithCode) -> list[_LoggedUserLaw]:
-    """Returns the control laws in an experiment that are users' classes, without running them.
+    """Returns the control laws of a scenario that are user-written classes.
 
-    Each entry states whether the law may run, and which file would be used.
+    No user code runs. Each entry states whether the law may run, and which file would be used.
 
     Args:
         scenario: Scenario of a log.

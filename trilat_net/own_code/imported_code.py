@@ -1,19 +1,20 @@
-"""Imports classes that users wrote, if a person has permitted it.
+"""Imports user-written classes, once a person has permitted them.
 
 A scenario names a class by its module and its name, for example `law = "package.module:Law"`.
-Importing a module runs its code, and a scenario may have an unknown author. Therefore a person
-must permit the code first. A permission applies to one class in one file, which is identified
-by its SHA-256 hash.
+Importing a module runs its code, and a scenario may have an unknown author, so a person must
+permit the code first. A permission applies to one class in one file, which is identified by its
+SHA-256 hash.
 
 Invariant:
     - A scenario contains the hash of the file that defines a class. If a run is repeated from
       its log, the hash shows whether the code is still the code that ran.
     - Looking up a class by its name runs no code, not even that of the enclosing packages.
-    - `CodeKey.import_class` is the only way to run code of users. It imports a class only if
-      `allowed_code` contains a permission, and if the file still has the permitted hash and
+    - `CodeKey.import_class` is the only way to run user-written code. It imports a class only
+      if `allowed_code` contains a permission, and if the file still has the permitted hash and
       defines a class of that name.
-    - A permission includes the arguments of the class. Harmless code may do harm with other
-      arguments, for example if an argument is the name of a file that it overwrites.
+    - A permission includes the arguments of the class, because code that is harmless with some
+      arguments may do harm with others, for example if an argument is the name of a file to
+      overwrite.
 """
 
 import ast
@@ -51,14 +52,14 @@ Its arguments are the tick and the call, a function without arguments.
 
 
 def call_directly(_k: int, function: Callable[[], Any]) -> Any:
-    """Calls a user's code without a time limit.
+    """Calls user-written code without a time limit.
 
-    In a live session, a user's code must not delay the control loop, so its calls are watched.
-    This function takes the place of such a `Watch` in virtual time, in which no other process
-    waits for the result.
+    In a live session, user-written code must not delay the control loop, so its calls are
+    monitored by a `Watch`. In virtual time, where no other process waits for the result, this
+    function takes its place.
 
     Args:
-        _k: Number of the tick in which the call is made. It is not used.
+        _k: Tick in which the call is made. Not used.
         function: Function without arguments that makes the call.
 
     Returns:
@@ -68,7 +69,7 @@ def call_directly(_k: int, function: Callable[[], Any]) -> Any:
 
 
 class NamedCode(Protocol):
-    """Interface of an entry of a scenario that names a user's class.
+    """Protocol for an entry of a scenario that names a user-written class.
 
     The class is a control law, an operator (a program that moves an arm) or a plant (a program
     that computes the motion of an arm).
@@ -85,11 +86,11 @@ class NamedCode(Protocol):
 
     @property
     def source_sha256(self) -> str:
-        """SHA-256 hash of the file of the module, which shows whether the file has changed."""
+        """SHA-256 hash of the module's file, which shows whether the file has changed."""
 
     @property
     def settings(self) -> dict[str, Any]:
-        """Arguments by name with which an object of the user's class is created."""
+        """Maps the names of the constructor arguments of the user's class to their values."""
 
 
 class _SiteWithCode(Protocol):
@@ -102,26 +103,26 @@ class _SiteWithCode(Protocol):
 
     @property
     def control(self) -> Any:
-        """Control law of the arm, possibly a user's class."""
+        """Control law of the arm, possibly a user-written class."""
 
     @property
     def hands(self) -> Sequence[Any]:
-        """Persons and programs who move the arm. A program may be a user's class."""
+        """Persons and programs who move the arm. A program may be a user-written class."""
 
     @property
     def plant(self) -> Any:
-        """What computes or measures the motion of the arm, possibly a user's class."""
+        """The plant that computes or measures the arm's motion, possibly a user's class."""
 
 
 class ScenarioWithCode(Protocol):
-    """Interface of a scenario, the description of an experiment, which may name users' classes.
+    """Protocol for a scenario that may name user-written classes.
 
-    Only the attributes that the checks of permissions need are listed.
+    Lists only the attributes that the permission checks need.
     """
 
     @property
     def sites(self) -> Mapping[str, _SiteWithCode]:
-        """Description of each arm's process (site), by name."""
+        """Maps the name of each site to its description."""
 
 
 ANY_SETTINGS = "*"
@@ -133,15 +134,15 @@ arguments itself.
 
 
 class CodeKey(NamedTuple):
-    """Identification of a user's code: a class, the hash of its file and its arguments.
+    """Identifies user-written code by its class, the hash of its file and its arguments.
 
     A person permits code to run under this key. If the file or an argument changes, the
     permission no longer applies.
 
     Attributes:
         code: Module and class, for example "package.module:Law".
-        sha256: SHA-256 hash of the file, as the scenario states it.
-        settings: Arguments of the class as a JSON text with sorted keys, or `ANY_SETTINGS`.
+        sha256: SHA-256 hash of the file, as stated in the scenario.
+        settings: Arguments of the class as a JSON string with sorted keys, or `ANY_SETTINGS`.
     """
 
     code: str
@@ -165,21 +166,20 @@ class CodeKey(NamedTuple):
         )
 
     def find_consent(self) -> "CodeConsent | None":
-        """Returns the permission under which a user's class may run with its arguments.
-
-        The result is None if nobody has permitted the class, its present file or its arguments.
+        """Returns the permission that lets a user's class run with its arguments.
 
         Returns:
-            The permission. None if the code may not run.
+            The permission, or None if nobody has permitted the class, its current file or its
+            arguments.
         """
         return allowed_code.get(self) or allowed_code.get(self._replace(settings=ANY_SETTINGS))
 
     def describe_new_settings(self) -> str:
-        """Explains why a user's class that was permitted before is refused with new arguments.
+        """Explains why a user's class that was permitted before is rejected with new arguments.
 
-        A permission applies only to certain arguments of a class. The text states how the
-        arguments of the refused code differ from permitted ones. If several sets of arguments
-        were permitted, those with the fewest differences are compared.
+        A permission applies only to certain arguments of a class. The explanation states how
+        the arguments of the rejected code differ from permitted ones. If several sets of
+        arguments were permitted, the one with the fewest differences is used.
 
         Returns:
             Part of a sentence. Empty if the code was not permitted with any arguments.
@@ -206,8 +206,8 @@ class CodeKey(NamedTuple):
     def import_class(self, path: str, method: str = "torque") -> Any:
         """Imports a user's class from its permitted file.
 
-        The file must be the file that a person permitted. It is checked before any of its code
-        runs.
+        The file must be the one that a person permitted, which is checked before any of its
+        code runs.
 
         Args:
             path: Path of the key in the scenario, for error messages.
@@ -216,8 +216,8 @@ class CodeKey(NamedTuple):
         Raises:
             CodeWithheld: There is no permission.
             ScenarioError: The file differs from the permitted one, or does not define such a
-                class; none of its code has run in these cases. Also raised if the code raises
-                an error while it is imported.
+                class, in which case none of its code has run. Also raised if the code raises an
+                error while it is imported.
         """
         code = self.code
         module, _, name = code.partition(":")
@@ -257,12 +257,12 @@ class CodeKey(NamedTuple):
 
 
 class CodeConsent(NamedTuple):
-    """Permission of a person to run the code of one Python file, which a scenario names.
+    """Permission by a person to run the code of one Python file that a scenario names.
 
     Attributes:
-        file: Path of the file. If None, it is the file that Python's import finds for the
+        file: Path of the file. If None, the file that Python's import system finds for the
             module.
-        sha256: SHA-256 hash that the file must have. Otherwise the permission does not apply.
+        sha256: SHA-256 hash that the file must have for the permission to apply.
     """
 
     file: Path | None
@@ -288,7 +288,7 @@ def allowing_any_settings(allowed: CodeConsents) -> Iterator[None]:
     varies the arguments itself, so it needs a wider permission.
 
     Args:
-        allowed: Permissions of the code that is studied.
+        allowed: Permissions for the code under study.
     """
     widened_permissions = {
         key._replace(settings=ANY_SETTINGS): consent for key, consent in allowed.items()
@@ -329,8 +329,8 @@ LONGEST_SETTING = 300
 def describe_setting(value: Any) -> str:
     """Returns the value of an argument as a string for messages.
 
-    It is a JSON text, which contains no control characters. A long text is shortened in the
-    middle, because paths of files differ at their ends.
+    The string is JSON, which contains no control characters. A long string is shortened in the
+    middle, because file paths differ at their ends.
 
     Args:
         value: Value of the argument, of any type that JSON supports.
@@ -347,16 +347,16 @@ _executed: dict["_CodeSource", Any] = {}
 
 
 class ImportedLaw(LawSettings, frozen=True, tag_field="law", tag="own"):
-    """Control law of a scenario whose torques a user's Python class computes.
+    """Control law of a scenario that is implemented by a user-written Python class.
 
-    The scenario names the class and the hash of its file. It does not import the class, so a
-    scenario from an unknown author can be read without running its code.
+    The scenario names the class and the hash of its file. The class is not imported when the
+    scenario is read, so a scenario from an unknown author can be read without running its code.
 
     Attributes:
         code: Module and class, for example "package.module:Law".
-        source_sha256: SHA-256 hash of the file of the module.
-        settings: Arguments of the class, by name.
-        sends: Vectors that the law sends to its peers, as the class declares them.
+        source_sha256: SHA-256 hash of the module's file.
+        settings: Maps the names of the class's arguments to their values.
+        sends: Vectors that the law sends to its peers, as declared by the class.
     """
 
     method: ClassVar[str] = "torque"
@@ -367,13 +367,13 @@ class ImportedLaw(LawSettings, frozen=True, tag_field="law", tag="own"):
     sends: SentVectorSpecs = field(default_factory=dict)
 
     def build_factory(self, sites: int, scheme: str) -> UserLawFactory:
-        """Returns a function that creates the control law for a site (arm controller).
+        """Returns a function that creates the control law for a site.
 
         The user's class is imported only when the returned function is called.
 
         Args:
-            sites: Number of sites of the experiment.
-            scheme: Integration scheme of the experiment.
+            sites: Number of sites in the scenario.
+            scheme: Integration scheme of the scenario.
         """
 
         def make(context: LawContext) -> UserLaw:
@@ -415,14 +415,15 @@ class _CodeSource(NamedTuple):
 
 
 def read_code(code: str, path: str, file: Path | None = None) -> _CodeSource:
-    """Reads the file that defines a class, without running any code of it.
+    """Reads the file that defines a class, without running any of its code.
 
-    Its hash shows whether a permission applies to it.
+    The hash of the file determines whether a permission applies to it.
 
     Args:
         code: Module and class, for example "package.module:Law".
         path: Path of the key in the scenario, for error messages.
-        file: The file. If None, it is the file that Python's import finds for the module.
+        file: Path of the file. If None, the file that Python's import system finds for the
+            module.
 
     Raises:
         ScenarioError: There is no such file, or it cannot be read.
@@ -519,13 +520,12 @@ PAGES = {
 
 
 def check_class(source: _CodeSource, code: str, path: str, method: str = "torque") -> None:
-    """Checks that a Python file defines a given class with a given method.
+    """Raises ScenarioError unless a Python file defines a given class with a given method.
 
-    The check parses the file and runs no code of it, because the code may not have been
-    permitted to run yet.
+    The file is parsed but not run, because the code may not have been permitted yet.
 
     Args:
-        source: File, as it was read from disk.
+        source: The file, as read from disk.
         code: Module and class, for example "package.module:Law".
         path: Path of the key in the scenario, for error messages.
         method: Method that the class must have.
@@ -626,10 +626,10 @@ def _name_law_class(kind: type) -> str:
 
 
 def name_law_classes(value: Any) -> Any:
-    """Converts a value that a Python program passed to types that TOML supports.
+    """Converts a value passed by a Python program to types that TOML supports.
 
-    A user's class becomes its name (see `_name_law_class`), and a number or an array of NumPy
-    becomes a number or a list. Tables are converted entry by entry. Other values are returned
+    A user's class becomes its name (see `_name_law_class`), and a NumPy number or array becomes
+    a number or a list. Tables are converted entry by entry. Other values are returned
     unchanged.
 
     Args:
