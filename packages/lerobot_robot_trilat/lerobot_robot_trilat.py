@@ -34,7 +34,7 @@ _HAND_COMMANDS = {
 }
 """Commands of a hand (operator) in each mode.
 
-The values are the method of `tn.hand`, and the suffix of the keys of a command.
+Maps each mode to the method of `tn.hand` and the suffix of the keys of a command.
 """
 
 
@@ -177,7 +177,7 @@ class TrilatRobot(Robot):
             self._stack = stack.pop_all()
 
     def _await_records(self, timeout_s: float) -> None:
-        """Waits until both arm controllers (sites) have published their state.
+        """Waits until both sites have published their state.
 
         Raises:
             DeviceNotConnectedError: A site has published no record for `timeout_s` seconds.
@@ -193,7 +193,7 @@ class TrilatRobot(Robot):
             self._receive_newest()
 
     def _receive_newest(self) -> None:
-        """Receives all new records, the states of sites, and keeps the newest of each site."""
+        """Receives all new records, and keeps the newest of each site."""
         for record in self._receive_records():
             self._records[record.site] = record
 
@@ -244,9 +244,9 @@ class TrilatRobot(Robot):
         self._stack.close()
 
     def _require_running_hand(self) -> Any:
-        """Returns the connection of the operator while the session runs.
+        """Returns the connection of the operator, if the session is running.
 
-        After the end of the session, the newest record would be observed again and again.
+        After the end of the session, the newest record would be observed over and over.
 
         Raises:
             DeviceNotConnectedError: The robot is not connected, or the session has ended.
@@ -259,7 +259,7 @@ class TrilatRobot(Robot):
         return hand
 
     def _require_hand(self) -> Any:
-        """Returns the connection with which the policy acts as an operator.
+        """Returns the connection through which the policy acts as an operator.
 
         Raises:
             DeviceNotConnectedError: The robot is not connected; call `connect` first.
@@ -270,10 +270,10 @@ class TrilatRobot(Robot):
 
 
 def _find_hand_mode(scenario: Any, site: str) -> str:
-    """Returns whether a program may move a site's arm by "force" or by "position".
+    """Returns the mode in which a program may move a site's arm, such as "tip" or "force".
 
-    The scenario (settings of the session) decides this in its entry for a live operator (hand),
-    whose commands come from another program.
+    The scenario determines the mode in its entry for a live operator (hand), whose commands
+    come from another program.
 
     Args:
         scenario: The scenario of the session.
@@ -352,7 +352,7 @@ def _load_policy(folder: str) -> Callable[[dict[str, list[float]]], list[float]]
     """Loads a trained policy that `lerobot-train` has stored in a folder.
 
     Args:
-        folder: Folder of the policy, which ends in `pretrained_model`.
+        folder: Folder of the policy, whose path ends in `pretrained_model`.
 
     Returns:
         A function that decides, see `run_policy`.
@@ -391,7 +391,7 @@ def _load_policy(folder: str) -> Callable[[dict[str, list[float]]], list[float]]
 
 
 def _main() -> None:
-    """Runs a trained policy, which moves an arm of a running teleoperation session.
+    """Runs a trained policy that moves an arm of a running teleoperation session.
 
     This is the command `python -m lerobot_robot_trilat`.
     """

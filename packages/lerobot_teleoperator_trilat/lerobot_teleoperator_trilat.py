@@ -32,7 +32,7 @@ _HAND_COMMANDS = {
 }
 """Commands of a hand (operator) in each mode.
 
-The values are the method of `tn.hand`, and the suffix of the keys of a command.
+Maps each mode to the method of `tn.hand` and the suffix of the keys of a command.
 """
 
 
@@ -242,7 +242,7 @@ class TrilatTeleoperator(Teleoperator):
         self._stack.close()
 
     def _require_hand(self) -> Any:
-        """Returns the connection with which feedback moves the person's arm.
+        """Returns the connection through which feedback moves the person's arm.
 
         Raises:
             DeviceNotConnectedError: The teleoperator is not connected; call `connect` first.
@@ -253,10 +253,10 @@ class TrilatTeleoperator(Teleoperator):
 
 
 def _find_hand_mode(scenario: Any, site: str) -> str:
-    """Returns whether a program may move a site's arm by "force" or by "position".
+    """Returns the mode in which a program may move a site's arm, such as "tip" or "force".
 
-    The scenario (settings of the session) decides this in its entry for a live operator (hand),
-    whose commands come from another program.
+    The scenario determines the mode in its entry for a live operator (hand), whose commands
+    come from another program.
 
     Args:
         scenario: The scenario of the session.

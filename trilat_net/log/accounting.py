@@ -49,7 +49,7 @@ class RangeSet:
         return len(self._ranges)
 
     def _count_started(self, number: int) -> int:
-        """Returns the number of ranges whose first number is at most `number`."""
+        """Returns the number of ranges that begin at or below `number`."""
         return bisect_right(self._ranges, (number, math.inf))
 
     def insert(self, first: int, last: int) -> None:
@@ -74,9 +74,9 @@ class RangeSet:
         self._forget_lowest()
 
     def _forget_lowest(self) -> None:
-        """Removes the ranges with the lowest numbers, if there are more than permitted.
+        """Removes the lowest ranges if there are more than the permitted number.
 
-        The memory thus stays bounded, whatever numbers a faulty or hostile sender uses (L6).
+        This bounds the memory, whatever numbers a faulty or hostile sender uses (L6).
         """
         del self._ranges[: -self._max_ranges]
 
@@ -143,10 +143,10 @@ class RangeSet:
 
 
 MAX_GAPS = 50_000
-"""Largest number of gaps that an account stores. The messages of lower gaps are only counted.
+"""Maximum number of gaps that an account stores. The messages of lower gaps are only counted.
 """
 SHOWN_GAPS = 20
-"""Largest number of gaps that are listed in a text."""
+"""Maximum number of gaps listed in a message to the user."""
 
 
 class Account:
@@ -166,7 +166,7 @@ class Account:
     """
 
     def __init__(self) -> None:
-        """Starts an account of received messages with no message counted yet."""
+        """Creates an account in which no message has been counted yet."""
         self.received = 0
         self.duplicate = 0
         self.reordered = 0
@@ -420,12 +420,12 @@ class Account:
         return [f"{base + first}-{base + last}" for first, last in gaps]
 
     def _add(self, number: int) -> bool:
-        """Marks the number of a message as received.
+        """Marks a message number as received.
 
-        It is removed from the missing numbers, or extends the known numbers.
+        The number is removed from the missing numbers, or extends the range of known numbers.
 
         Returns:
-            False if the number had been marked as received before.
+            False if the number had already been marked as received.
         """
         if number > self.last:
             self.add_expected(number)
@@ -458,9 +458,9 @@ class StartGap:
     """
 
     def __init__(self, account: Account, under_way: int) -> None:
-        """Stores the account of a site's messages before the site was started again.
+        """Stores the account of a site's messages before the site was restarted.
 
-        The number of messages that were lost between both starts is initially unknown.
+        The number of messages lost between the two starts is unknown at first.
         """
         self._account = account
         self._under_way = under_way
@@ -539,7 +539,7 @@ def describe_unknown_ends(sites: Sequence[str]) -> str:
 
 
 MIN_COVERAGE = 0.999
-"""Default of the smallest fraction of every site's ticks that must be judged."""
+"""Default for the smallest fraction of each site's ticks that must be judged."""
 
 
 class Coverage(NamedTuple):
@@ -566,7 +566,7 @@ class Coverage(NamedTuple):
         return min(map(self._share, self.expected), default=0.0)
 
     def _share(self, site: str) -> float:
-        """Returns the fraction of judged ticks of a site. It is 1 for a site without ticks."""
+        """Returns the fraction of a site's ticks that were judged (1 if it has no ticks)."""
         expected = self.expected[site]
         if not expected:
             return 1.0
@@ -606,11 +606,11 @@ class Coverage(NamedTuple):
 
 
 def _format_percent(share: float) -> str:
-    """Formats a fraction as a percentage, rounded down so that only a full share is 100 %."""
+    """Formats a fraction as a percentage, rounded down so that only 1 is shown as 100 %."""
     return f"{math.floor(1e5 * share) / 1e3:g} %"
 
 
 LAST = "last"
 """Kind of the event in which a site states how many ticks of a peer it had received before the
-peer was started again.
+peer was restarted.
 """

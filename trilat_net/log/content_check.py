@@ -35,12 +35,12 @@ from .mcap_records import MESSAGE_HEAD, OP_MESSAGE, UnreadableRecord, iterate_re
 from .message_identity import AnyMessage, MessageIdentity, compute_virtual_boot
 
 _CDR_HEAD = b"\x00\x01"
-"""First bytes of a message that was written for viewers, in the encoding of ROS 2."""
+"""First bytes of a message for viewers, in the encoding of ROS 2."""
 
 _VIRTUAL_DRIVER = "virtual"
 """Value of the metadata `driver` for a session in virtual time."""
 _SAMPLED_MESSAGES = 200
-"""Number of messages of a chunk that are decoded to find their origins."""
+"""Number of messages of a chunk that are decoded to find out where they come from."""
 _CHECKED_MESSAGES = 20
 """Number of messages of a chunk whose boots are compared with those of the scenario."""
 
@@ -149,7 +149,7 @@ class ContentCheck:
     def __init__(
         self, scenario: Scenario, about: Mapping[str, str], *, is_continued: bool
     ) -> None:
-        """Prepares the check of a channel's messages. No message has been accepted yet."""
+        """Prepares the check of a session's messages. No message has been accepted yet."""
         self._scenario = scenario
         self._about = about
         self._session = about.get("session", "")
@@ -273,10 +273,10 @@ class ContentCheck:
         self.accept(topic, sequence, log_ns, payload)
 
     def _decode(self, topic: str, payload: bytes) -> tuple[AnyMessage, MessageIdentity]:
-        """Decodes a message, and returns it with the identity that its content states.
+        """Decodes a message and determines the identity stated by its content.
 
         The identity consists of sender, channel, number and sending time. It is compared with
-        the place of the message in the file.
+        the position of the message in the file.
 
         Args:
             topic: Topic of the message.
@@ -301,7 +301,7 @@ class ContentCheck:
     def _check_session_message(
         self, topic: str, sequence: int, publish_ns: int, payload: bytes
     ) -> None:
-        """Checks that a message from a process of the session is the next one of its channel.
+        """Raises UnreadableRecord unless a member's message is the next one of its channel.
 
         A damaged file may contain messages of other sessions, which must not be copied.
 
@@ -364,11 +364,11 @@ class ContentCheck:
             raise UnreadableRecord("a chunk belongs to another run")
 
     def _find_boot(self, member: str) -> int | None:
-        """Returns the number that identifies the present start of a process, or None.
+        """Returns the number that identifies the current start of a process, or None.
 
         All messages of one start contain this number (boot). In virtual time, it is computed
-        from the scenario. Otherwise it is read from the latest accepted message. The result is
-        None if there is no such message.
+        from the scenario. Otherwise it is read from the latest accepted message, and None is
+        returned if there is no such message.
         """
         if self._about.get("driver") == _VIRTUAL_DRIVER:
             return compute_virtual_boot(self._about.get("scenario_sha256", ""), member)
@@ -382,7 +382,7 @@ class ContentCheck:
         return None
 
     def _check_number(self, topic: str, message: AnyMessage, number: int) -> None:
-        """Checks that a message has the next number of its channel, and is not a repetition.
+        """Raises UnreadableRecord unless a message has the next number of its channel.
 
         Args:
             topic: Topic of the channel.
@@ -414,17 +414,17 @@ class ContentCheck:
             )
 
     def _check_tick(self, topic: str, record: State) -> None:
-        """Checks that the content of a record is possible in a run of the scenario.
+        """Raises UnreadableRecord if a record is impossible in a run of the scenario.
 
-        The tick (control period) must exist and have its nominal time, the peers (other sites)
-        must exist, and the mode must be known.
+        The tick must exist and have its nominal time, the peers must exist, and the mode must
+        be known.
 
         Args:
             topic: Topic of the record, for the error message.
             record: The record.
 
         Raises:
-            UnreadableRecord: The content is not possible.
+            UnreadableRecord: The content is impossible.
         """
         site = record.site
         ticks = self._scenario.ticks(site)

@@ -54,31 +54,32 @@ UNIT_SUFFIXES = {
     "ns/s": "ppb",
     "byte": "bytes",
 }
-"""Last part of a column's name, by unit."""
+"""Maps each unit to the last part of a column's name."""
 EVENTS_TABLE = "events"
 """Name of the table with the events."""
 SITE_TABLE_KINDS = ("state", "link", "arrivals")
-"""Kinds of tables that each site has."""
+"""Kinds of tables available for each site."""
 _NONE_BELOW_0 = {"age_us", "delay_us", "delay_max_us", "rtt_us"}
-"""Fields of the statistics in which -1 means that there is no value."""
+"""Fields of the statistics in which -1 represents a missing value."""
 _JOINT_VECTORS = ("q", "qd", "q_des", "qd_des", "tau", "tau_x")
-"""Vectors of a record with a number per joint, if the sites share joint positions."""
+"""Vectors of a record with one entry per joint, if the sites share joint positions."""
 _TASK_VECTORS = {
     **dict.fromkeys(("q_des", "x"), ("m", "rad")),
     **dict.fromkeys(("qd_des", "xd"), ("m/s", "rad/s")),
     "wrench": ("N", "N m"),
 }
-"""Vectors of a record with a number per coordinate of the end effector, if the sites share
-its position or pose. The units are those of the three position coordinates and of the others.
+"""Vectors of a record with one entry per coordinate of the end effector, if the sites share its
+position or pose. The first unit is that of the three position coordinates, the second that of
+the others.
 """
 
 
 _POSES = ("q_des", "x")
-"""Vectors of `_TASK_VECTORS` that contain an orientation. The other ones contain an angular
+"""Vectors in `_TASK_VECTORS` that contain an orientation. The others contain an angular
 velocity or a torque.
 """
 _STEADY_QUATERNION = "a unit quaternion w, x, y, z, each nearest to the one before"
-"""Part of the meaning of orientation columns."""
+"""Text that is part of the meaning of orientation columns."""
 
 
 class Column(NamedTuple):
@@ -162,7 +163,7 @@ class Table:
         return len(self.columns[0].values) if self.columns else 0
 
     def __getitem__(self, name: str) -> Column:
-        """Returns a column of the table by its name, as in `table["q1_rad"]`.
+        """Returns the column with a given name, as in `table["q1_rad"]`.
 
         Raises:
             KeyError: The table has no column of that name.
@@ -422,11 +423,11 @@ _COMPLETE_TEXTS = {
     "refused": "per peer, samples whose stamp was out of range",
     "lost": "per peer, samples that the link's model lost",
 }
-"""Meanings of fields whose text in the docstring cannot be understood alone."""
+"""Meanings of fields whose description in the docstring cannot be understood on its own."""
 
 
 class _FieldDoc(NamedTuple):
-    """Unit, meaning and type of one field of a message, for the head of an exported table.
+    """Unit, meaning and type of one field of a message, for the header of an exported table.
 
     Attributes:
         unit: Unit of the field. Empty if it has no unit.
@@ -473,7 +474,7 @@ def read_field_docs(kind: type[msgspec.Struct]) -> dict[str, _FieldDoc]:
 def _to_int_array(
     values: Iterable[int], source: str, field: str, kind: Any = np.int64
 ) -> NDArray[Any]:
-    """Converts integers of a log to an array, and refuses those that are too large for it.
+    """Converts integers of a log to an array, rejecting those that do not fit.
 
     Args:
         values: The integers.
@@ -485,7 +486,7 @@ def _to_int_array(
         The array, shape (K,) for K integers.
 
     Raises:
-        LogError: A number does not fit into the data type.
+        LogError: An integer does not fit into the data type.
     """
     try:
         return np.fromiter(values, kind)
@@ -498,13 +499,11 @@ def _make_time_columns(
 ) -> Iterator[Column]:
     """Yields the first columns of a table: nominal time, tick, arrival and sending times.
 
-    A tick is the number of a period of the control loop.
-
     Args:
-        tick: Ticks, shape (K,). None if the table has no column of ticks.
-        t_s: Nominal times since the session's start, shape (K,), in s. NaN if unknown.
-        log_ns: Times of arrival at the recorder, in Unix time, shape (K,), in ns.
-        publish_ns: Times of sending, in Unix time, shape (K,), in ns.
+        tick: Ticks, shape (K,). None if the table has no tick column.
+        t_s: Nominal times since the start of the session, shape (K,), in s. NaN if unknown.
+        log_ns: Arrival times at the recorder in Unix time, shape (K,), in ns.
+        publish_ns: Sending times in Unix time, shape (K,), in ns.
     """
     known: NDArray[np.bool_] = ~np.isnan(t_s)
     yield Column(
@@ -538,12 +537,12 @@ def _make_time_columns(
 def _make_vector_columns(site: SiteLog, arm: ArmModel) -> Iterator[Column]:
     """Yields the columns of the vectors in an arm's records, such as joint angles and torques.
 
-    Each vector has a number per joint, per coordinate of the end effector, or per parameter of
+    Each vector has one entry per joint, per coordinate of the end effector, or per parameter of
     the dynamics. If the arms share the pose of the end effector instead of joint angles, the
     reference and its velocity are vectors of the end effector.
 
     Args:
-        site: Records (results of control periods) of the arm.
+        site: Records of the arm.
         arm: Model of the arm.
     """
     end_effector_vectors = _TASK_VECTORS if arm.shares_pose else {}
@@ -556,7 +555,7 @@ def _make_vector_columns(site: SiteLog, arm: ArmModel) -> Iterator[Column]:
 
 
 def _make_joint_columns(site: SiteLog, arm: ArmModel, field: str) -> Iterator[Column]:
-    """Yields the columns of a vector that has a number per joint."""
+    """Yields the columns of a vector that has one entry per joint."""
     doc = read_field_docs(State)[field]
     units = arm.joint_units(doc.unit)
     for n, (unit, joint) in enumerate(zip(units, arm.joint_names, strict=True)):
@@ -571,12 +570,12 @@ def _make_joint_columns(site: SiteLog, arm: ArmModel, field: str) -> Iterator[Co
 def _make_task_columns(
     site: SiteLog, arm: ArmModel, field: str, units: tuple[str, str]
 ) -> Iterator[Column]:
-    """Yields the columns of a vector with a number per coordinate of the end effector.
+    """Yields the columns of a vector with one entry per coordinate of the end effector.
 
     An example is the position x, y and z.
 
     Args:
-        site: Records of the site (arm controller).
+        site: Records of the site.
         arm: Model of the site's arm.
         field: Name of the vector.
         units: Units of the position coordinates and of the other coordinates.
@@ -601,7 +600,7 @@ def _make_task_columns(
 def _make_parameter_columns(site: SiteLog, arm: ArmModel) -> Iterator[Column]:
     """Yields the columns of the estimated parameters of the arm's dynamics.
 
-    The two-link arm of the paper has parameters with numbers, such as theta_hat3. A chain of
+    The parameters of the two-link arm of the paper are numbered, as in theta_hat3. A chain of
     joints has the same parameters for each link, such as theta_hat2_m, the mass of the second
     link.
     """
@@ -622,10 +621,10 @@ def _make_parameter_columns(site: SiteLog, arm: ArmModel) -> Iterator[Column]:
 
 
 def _make_orientation_columns(site: SiteLog, field: str, text: str) -> Iterator[Column]:
-    """Yields four columns of a table with an orientation, as a unit quaternion.
+    """Yields the four columns of an orientation, given as a unit quaternion.
 
     Args:
-        site: Records of the site (arm controller).
+        site: Records of the site.
         field: Name of the vector that contains the poses.
         text: Meaning of the vector.
     """
@@ -651,15 +650,15 @@ def _make_number_column(
     text: str,
     known: NDArray[np.bool_] | None = None,
 ) -> Column:
-    """Returns a table column with one number of a vector, for example of joint 1 of "q".
+    """Returns a table column with one entry of a vector, for example joint 1 of "q".
 
     Args:
-        site: Records of the site (arm controller).
+        site: Records of the site.
         field: Name of the vector.
-        n: Index of the number in the vector.
+        n: Index of the entry in the vector.
         stem: Name of the column without its unit.
-        unit: Unit of the number.
-        text: Meaning of the number.
+        unit: Unit of the entry.
+        text: Meaning of the entry.
         known: True for the rows that have a value, shape (K,). None if all rows have one.
     """
     suffix = UNIT_SUFFIXES.get(unit, "")
@@ -673,9 +672,9 @@ def _make_number_column(
 
 
 def _make_sent_columns(site: SiteLog) -> Iterator[Column]:
-    """Yields the columns of the numbers that a site's control law sends to other sites.
+    """Yields the columns of the vectors that a site's control law sends to other sites.
 
-    Their names begin with "ch_". For example "ch_force_m1_nm" is a torque that is sent to m1.
+    Their names begin with "ch_". For example, "ch_force_m1_nm" is a torque that is sent to m1.
     """
     for n, entry in enumerate(site.channel.entries(site.peers)):
         (name, unit, length, _) = entry.vector
@@ -705,7 +704,7 @@ def _make_hand_columns(site: SiteLog, arm: ArmModel, mode: str) -> Iterator[Colu
     Args:
         site: Records of the site.
         arm: Model of the site's arm.
-        mode: How the operator moves the arm: to a target of the tip ("tip") or of the joints
+        mode: How the operator moves the arm: to a target for the tip ("tip") or for the joints
             ("joint"), or by a force ("force").
     """
     held: NDArray[np.bool_] = site.hand[:, 2] > 0.0
@@ -753,16 +752,17 @@ def _make_hand_columns(site: SiteLog, arm: ArmModel, mode: str) -> Iterator[Colu
 def _make_bodies_columns(site: SiteLog, bodies: Iterable[str]) -> Iterator[Column]:
     """Yields the columns of the poses of the bodies in the site's simulated environment.
 
-    Each record contains a pose of seven numbers for each body: the position (x, y, z) in m, and
-    the orientation as a unit quaternion (w, x, y, z). A quaternion and its negative are the
-    same orientation. The signs are chosen so that the curves of the four numbers do not jump.
+    For each body, a record contains a pose of seven numbers: the position (x, y, z) in m, and
+    the orientation as a unit quaternion (w, x, y, z). A quaternion and its negative represent
+    the same orientation. Signs are chosen such that the curves of the four components do not
+    jump.
 
     Args:
-        site: Records of the site, the process that runs one arm.
-        bodies: Names of the bodies, in the order of the records.
+        site: Records of the site.
+        bodies: Names of the bodies, in record order.
 
     Yields:
-        Seven columns for each body, such as "cup_x_m" and "cup_qw", with a row per record.
+        Seven columns per body, such as "cup_x_m" and "cup_qw", with one row per record.
     """
     pose_length = POSITION + len(QUATERNION_AXES)
     for body_index, body in enumerate(bodies):
@@ -793,10 +793,9 @@ def _make_bodies_columns(site: SiteLog, bodies: Iterable[str]) -> Iterator[Colum
 
 
 def _make_sample_columns(site: SiteLog, peer: str, rate_hz: int) -> Iterator[Column]:
-    """Yields the columns that state which sample of a peer the control law used, and its age.
+    """Yields the columns for the sample of a peer that the control law used, and its age.
 
-    A sample is the state that another site (arm controller), the peer, has sent. Its age is the
-    total delay that the control law sees.
+    The age is the total delay that the control law sees.
 
     Args:
         site: Records of the receiving site.
@@ -829,11 +828,11 @@ def _make_sample_columns(site: SiteLog, peer: str, rate_hz: int) -> Iterator[Col
 def _list_reasons(dropped: Iterable[Mapping[str, int]]) -> list[str]:
     """Returns the reasons why messages were dropped, each of which becomes a column.
 
-    The reasons are in the order in which they first occur. Reasons that give the same column
-    name are listed once.
+    The reasons are in the order in which they first occur. Reasons that result in the same
+    column name are listed once.
 
     Args:
-        dropped: Numbers of dropped messages by reason, for each statistics message.
+        dropped: For each statistics message, maps reasons to the number of dropped messages.
     """
     reason_by_column: dict[str, str] = {}
     for counts in dropped:
@@ -843,16 +842,16 @@ def _list_reasons(dropped: Iterable[Mapping[str, int]]) -> list[str]:
 
 
 def _to_word(text: str) -> str:
-    """Converts a string to a part of a column name: small letters, digits and underscores."""
+    """Converts a string to part of a column name: lowercase letters, digits and underscores."""
     return re.sub(r"[^a-z0-9]+", "_", text.lower())[:31]
 
 
 def _make_entry_column(
     source: str, field: str, name: str, values: Sequence[Mapping[str, int]]
 ) -> Column:
-    """Creates the column of one entry of a statistics field whose values are maps.
+    """Creates the column for one entry of a statistics field whose values are mappings.
 
-    For example, the field `delay_us` maps each peer to a delay. Its entry of the peer m2
+    For example, the field `delay_us` maps each peer to a delay. Its entry for the peer m2
     becomes the column delay_m2_us. A field without a unit is a count: the entry m2 of
     `accepted` becomes accepted_m2_count.
 
@@ -860,11 +859,11 @@ def _make_entry_column(
         source: Name of the file for error messages.
         field: Name of the field of the statistics.
         name: Key of the entry: a peer, or a reason why messages were dropped.
-        values: The maps, one per row.
+        values: The mappings, one per row.
 
     Returns:
-        The column. A value is unknown if the map has no such entry, or if the entry is -1 in a
-        field where -1 means that there is no value.
+        The column. A value is unknown if the mapping has no such entry, or if the entry is -1
+        in a field where -1 represents a missing value.
     """
     unit, meaning_of_field, _ = read_field_docs(LinkStats)[field]
     stem = field
@@ -891,7 +890,7 @@ def _make_entry_column(
 
 
 def _to_text(value: str | Mapping[str, Any]) -> str:
-    """Converts a field of an event (a notable occurrence in a session) to a table cell.
+    """Converts a field of an event to the string in a table cell.
 
     A dictionary becomes JSON, but an empty dictionary becomes the empty string.
     """

@@ -15,16 +15,16 @@ from ..errors import CodeWithheld
 from ..results import Result
 
 _MAX_LISTED_PROBLEMS = 1000
-"""Largest number of problems that a finding stores. Further problems are only counted."""
+"""Maximum number of problems that a finding stores. Any more are only counted."""
 
 
 class _ProblemPlace(NamedTuple):
-    """A problem that a check has found in a file, with its place in this file.
+    """A problem that a check found in a file, with its position in the file.
 
     Attributes:
         file: Name of the file.
         offset: Offset of the problem in the file, or of the chunk that contains it, in bytes.
-            None if the problem concerns the whole file.
+            None if the problem affects the file as a whole.
         text: Description of the problem.
     """
 

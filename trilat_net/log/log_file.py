@@ -29,9 +29,9 @@ from .log_layout import active_path
 from .mcap_records import MAGIC
 
 _DISK_FULL_ERRNOS = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EFBIG})
-"""Error numbers of a disk that accepts no more data."""
+"""Error numbers that indicate a disk that accepts no more data."""
 RESERVE_STEP_BYTES = 1 << 19
-"""Step by which the reserved space grows, in bytes."""
+"""Increment by which the reserved space grows, in bytes."""
 
 
 class DiskReserve:
@@ -92,12 +92,12 @@ class DiskReserve:
 
 
 def _allocate(descriptor: int, begin: int, end: int) -> None:
-    """Reserves disk space for a file from one offset up to another.
+    """Reserves disk space for a file from one offset to another.
 
     If the file system cannot reserve space, zeros are written.
 
     Raises:
-        OSError: The disk has no room.
+        OSError: The disk is full.
     """
     if hasattr(os, "posix_fallocate"):
         try:
@@ -113,11 +113,11 @@ def _allocate(descriptor: int, begin: int, end: int) -> None:
 
 
 SYNC_PERIOD_NS = 1_000_000_000
-"""Period with which a thread syncs the file, in ns."""
+"""Period at which a thread syncs the file, in ns."""
 
 
 class _FileSync:
-    """Forces the data of one file onto the disk (sync), so that they survive a loss of power.
+    """Syncs the data of one file to the disk, so that they survive a power failure.
 
     Args:
         descriptor: Descriptor of the file in the operating system.
@@ -157,7 +157,7 @@ class _FileSync:
             self._thread.start()
 
     def _run(self) -> None:
-        """Syncs the file in the thread, and stores an error for the next call of `sync_new`."""
+        """Syncs the file in the thread, and stores any error for the next `sync_new`."""
         try:
             _datasync(self._descriptor)
         except OSError as error:
@@ -173,16 +173,16 @@ class _FileSync:
 
 
 def _datasync(descriptor: int) -> None:
-    """Forces the written data of a file onto the disk, so that a power failure loses nothing.
+    """Syncs the written data of a file to the disk, so that a power failure loses nothing.
 
-    If the system has `fdatasync`, it is used instead of `fsync`, because it leaves out metadata
-    that are not necessary to read the file.
+    Uses `fdatasync` instead of `fsync` where available, because it skips metadata that are not
+    needed to read the file.
     """
     getattr(os, "fdatasync", os.fsync)(descriptor)
 
 
 RESERVE_MARGIN_BYTES = 1 << 16
-"""Space that is reserved for the counts of messages at the end, in bytes."""
+"""Space reserved for the message counts at the end, in bytes."""
 _ELSEWHERE = "choose another disk with -o"
 _ADVICE = {
     errno.ENOSPC: ("the disk is full", f"make room, or {_ELSEWHERE}"),
@@ -194,7 +194,7 @@ _ADVICE = {
     errno.EIO: ("the disk fails", _ELSEWHERE),
     errno.EROFS: ("the disk has become read-only", _ELSEWHERE),
 }
-"""Problem and advice for the user, by the error number of the disk."""
+"""Maps the error number of the disk to the problem and advice for the user."""
 
 
 def sync_folder(folder: Path) -> None:
@@ -252,7 +252,7 @@ class LogFile:
         opened: Callable[[Path, str], Any] | None = None,
         now_ns: Callable[[], int] | None = None,
     ) -> None:
-        """Creates the log under a working name, which shows that it is not complete yet."""
+        """Creates the log under a working name, which shows that it is not yet complete."""
         self.path = path
         self.working = working or active_path(path)
         self.size = 0
@@ -344,12 +344,12 @@ class LogFile:
             raise
 
     def _write_pending(self) -> None:
-        """Passes the bytes in memory to the operating system, and notes where the file ends.
+        """Passes the buffered bytes to the operating system, and records where the file ends.
 
         After an error, the next call continues after the bytes that were accepted.
 
         Raises:
-            OSError: The disk refuses the data.
+            OSError: Writing to the disk failed.
         """
         while self._written < len(self._pending):
             accepted = self._raw.write(memoryview(self._pending)[self._written :])
@@ -365,7 +365,7 @@ class LogFile:
         self._written = 0
 
     def _cut_off(self) -> None:
-        """Removes partly written data, so that the file ends where a complete flush ended.
+        """Truncates the file to where a complete flush ended, removing partly written data.
 
         A log that ends with half a chunk could only be read after a recovery.
         """
@@ -494,9 +494,9 @@ class LogFile:
 
 
 def _describe_content(path: Path) -> str:
-    """Returns the numbers of records and other messages in a finished log, as a string.
+    """Returns a description of how many records and other messages a finished log contains.
 
-    The numbers are read from the statistics at the end of the file.
+    The counts are read from the statistics at the end of the file.
     """
     from mcap.reader import make_reader
 

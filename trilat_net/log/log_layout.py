@@ -22,11 +22,11 @@ from ..errors import UsageError
 from ..net import Event, LinkStats, RecorderStats, State, matches_key, topics
 
 ACTIVE_SUFFIX = ".active"
-"""Suffix of a log's file name while the log is being recorded."""
+"""Suffix of the name of a log file while it is being recorded."""
 PART_STEM = re.compile(r"(.+)-(\d{3,})")
-"""Stem of a part's file name: stem of the log's name, and number of the part."""
+"""Stem of a part's file name: the stem of the log's name and the number of the part."""
 _CHUNK = re.compile(r"\*\*?|(?:\$\*|[^*$#?])+", re.DOTALL)
-"""Valid part of a Zenoh key expression, between slashes."""
+"""Pattern for a valid part of a Zenoh key expression, between slashes."""
 
 
 def active_path(path: Path) -> Path:
@@ -157,30 +157,32 @@ class ChannelFilter:
 
 
 ALL_CHANNELS = ChannelFilter()
-"""The filter that records all channels."""
+"""Filter that records all channels."""
 
 
 VIZ_ROOT = "/viz/"
-"""Prefix of the topics that are written for viewers such as Foxglove."""
+"""Prefix of the topics for viewers such as Foxglove."""
 MAX_TIME_NS = (1 << 64) - 1
-"""Largest time stamp of a message in a file. Later times are stored as this time."""
+"""Largest time stamp of a message in a file, in ns. Later times are stored as this time."""
 SESSION = "trilat.session"
-"""Name of the metadata that describe the session."""
+"""Name of the metadata record that describes the session."""
 PART = "trilat.part"
-"""Name of the metadata that state which part of a log the file is."""
+"""Name of the metadata record that states which part of a log the file is."""
 ACCOUNTS = "trilat.accounts"
-"""Name of the metadata with the numbers of received and missing messages of each channel."""
+"""Name of the metadata record with the numbers of received and missing messages of each
+channel.
+"""
 SCENARIO = "scenario.toml"
-"""Name of the attachment with the text of the scenario."""
+"""Name of the attachment that contains the text of the scenario."""
 CHANNEL_TYPES: dict[str, type[msgspec.Struct]] = {
     topics.STATE: State,
     topics.LINK: LinkStats,
     topics.EVENT: Event,
     topics.STATS: RecorderStats,
 }
-"""Type of the messages of each channel."""
+"""Maps each channel to the type of its messages."""
 EXECUTED_SITES_KEY = "rerun_executed"
-"""Key of the session's metadata that lists the sites that a rerun executed. The records of the
+"""Key of the session metadata that lists the sites executed in a rerun. The records of the
 other sites are copied from the original log.
 """
 RERUN_DRIVER = "rerun"

@@ -206,7 +206,7 @@ class Log(Result, Mapping[str, SiteLog]):
             raise LogError(f"{self.source}: {self.why_empty}, so there is nothing to judge")
 
     def _describe_records(self) -> str:
-        """Returns the length of the session and the numbers of its records, as a string."""
+        """Returns a description of the session's duration and numbers of records."""
         last_times_s = [float(self[name].t_s[-1]) for name in self.sites if len(self[name])]
         length_s = max(last_times_s, default=0.0)
         records = sum(len(self[name]) for name in self.sites)
@@ -328,20 +328,20 @@ class Log(Result, Mapping[str, SiteLog]):
         return "/" + topics.key(self.session["session"], member, channel)
 
     def _event_topics(self) -> list[str]:
-        """Returns the topics of the members' events that the log contains, sorted."""
+        """Returns the event topics of the members that occur in the log, sorted."""
         members = (*self.sites, topics.RECORDER)
         event_topics = {self._topic(member, topics.EVENT) for member in members}
         return sorted(event_topics & self._contents.channels.keys())
 
     def _channel(self, topic: str) -> ChannelMessages:
-        """Returns all messages of one topic of the log, for example of one site's records.
+        """Returns all messages of one topic of the log, for example the records of one site.
 
-        The result is empty if the log does not contain the topic.
+        Empty if the log does not contain the topic.
         """
         return self._contents.channels.get(topic) or ChannelMessages()
 
     def _decode(self, topic: str, kind: type[M]) -> list[M]:
-        """Decodes the messages of a channel, and skips those that are damaged.
+        """Decodes the messages of a channel, skipping those that are damaged.
 
         Messages that cannot be decoded are removed from the channel, so that `unreadable`
         reports them only once even if the channel is decoded again. The log then counts as
@@ -352,7 +352,7 @@ class Log(Result, Mapping[str, SiteLog]):
             kind: Class of the messages.
 
         Returns:
-            The messages that can be decoded, in the order of the file.
+            The messages that can be decoded, in file order.
         """
         channel = self._channel(topic)
         readable = ChannelMessages()
@@ -374,10 +374,10 @@ class Log(Result, Mapping[str, SiteLog]):
         return messages
 
     def _read_events(self, topic: str) -> list[Event]:
-        """Returns the events of one process of the session, such as "lost", in their order.
+        """Returns the events of one process of the session, such as "lost".
 
-        A process that is started again numbers its events from 0 again. The starts are in the
-        order in which they first appear in the file, and the events of a start by number.
+        A process that is restarted numbers its events from 0 again. The starts are in the order
+        in which they first appear in the file, and the events of each start in numerical order.
         """
         events = self._decode(topic, Event)
         boots = list(dict.fromkeys(event.boot for event in events))
@@ -496,23 +496,23 @@ class Log(Result, Mapping[str, SiteLog]):
     def _describe_unexplained_gap(self, site: str) -> str:
         """Describes missing or additional records of a site that the log does not explain.
 
-        The recorder states how many records it received and missed, in the account of the site
-        at the end of the file and in its statistics during the recording. Other gaps show that
-        records were removed, or that two logs were joined. There are two tests:
+        The recorder states how many records it received and missed, both in the account of the
+        site at the end of the file and in its statistics during the recording. Any other gap
+        shows that records were removed, or that two logs were joined. There are two tests:
 
-        1. The account must agree with the records. This is not tested if there is no account
-           (the file was not finished), if the file is only a part of a log (the account
-           includes other parts), or if the log consists of several files (see below).
+        1. The account must match the records. Not tested if there is no account (the file was
+           not finished), if the file is only a part of a log (the account includes other
+           parts), or if the log consists of several files (see below).
         2. The ticks must be consecutive, except for ticks that the site did not execute, and
-           for the number of records that the recorder states as missing. This is not tested if
-           the digests, checksums of all messages, show that nothing was changed.
+           for the number of records that the recorder states as missing. Not tested if the
+           digests, checksums of all messages, show that nothing was changed.
 
         Args:
             site: Name of the site.
 
         Returns:
-            The description. Empty if the records agree with the statements of the recorder, or
-            if a part of the file cannot be read, because records may be missing then.
+            The description. Empty if the records match the statements of the recorder, or if a
+            part of the file cannot be read, because records may then be missing.
         """
         if self.damaged:
             return ""
@@ -674,11 +674,10 @@ class Log(Result, Mapping[str, SiteLog]):
 
     @cached_property
     def _stated_ticks(self) -> dict[str, int]:
-        """Number of control periods (ticks) that each site states when it ends, by site.
+        """Maps each site to the number of ticks that it states when it ends.
 
-        A site (arm controller) states the number in its "end" event. Sites without such an
-        event are left out. A number above that of the scenario is reduced to the number of the
-        scenario.
+        A site states the number in its "end" event. Sites without such an event are left out. A
+        number greater than that of the scenario is reduced to the number of the scenario.
         """
         ticks = {}
         for event in self.events:
@@ -718,20 +717,19 @@ class Log(Result, Mapping[str, SiteLog]):
     def _find_absences(self, site: str, starts: list[tuple[int, int]]) -> list[tuple[int, int]]:
         """Finds the ranges of ticks that a site did not execute because it was not running.
 
-        A tick is one period of the control loop. The process may be started again while the
-        session runs. It then joins at a later tick. The absence before a start ends just before
-        its first tick. It begins after the last tick that the earlier process is known to have
-        executed, from one of three sources:
+        A process that is restarted while the session runs joins at a later tick. The absence
+        before a start ends just before its first tick. It begins after the last tick that the
+        earlier process is known to have executed, from one of three sources:
 
-        - a record (the message with the results of one tick),
+        - a record,
         - the "end" event of the earlier process, which states its number of ticks,
         - events of the kind `LAST`, in which the other sites state how many ticks they had
           received before this start.
 
         Args:
-            site: Name of the site, the process that runs one arm.
-            starts: Its starts in ascending order: the first tick, and the boot, the random
-                number that identifies the start.
+            site: Name of the site.
+            starts: Its starts in ascending order, each with its first tick and its boot (the
+                random number that identifies the start).
 
         Returns:
             The absences, as (first tick, last tick), in ascending order.
@@ -814,7 +812,8 @@ class Log(Result, Mapping[str, SiteLog]):
     def _is_gone(self, site: str) -> bool:
         """Returns True if a site was lost or left, according to the latest event about it.
 
-        Other sites publish such events. The site may have come back after an earlier loss.
+        Such events are published by other sites. The site may have come back after an earlier
+        loss.
         """
         kinds = ("lost", "left", "back", "admit")
         events = [event for event in self.events if event.about == site and event.kind in kinds]
@@ -878,7 +877,7 @@ class Log(Result, Mapping[str, SiteLog]):
         """Creates the object with all records of one arm that `log[name]` returns.
 
         Raises:
-            LogError: A control period is beyond the length of the scenario.
+            LogError: A tick is beyond the duration of the scenario.
         """
         channel = self._channel(self._topic(site, topics.STATE))
         site_log = SiteLog(
@@ -1185,11 +1184,12 @@ def read_link_delays(path: Path, link: str) -> list[TracePoint]:
 
 @lru_cache(maxsize=1)
 def _read_links(path: Path, modified_ns: int, size: int) -> dict[str, list[TracePoint]]:  # noqa: ARG001
-    """Measures the network delays of all links of a log, by the name of the link ("m1->s").
+    """Reads the measured network delays of all links of a log.
 
-    The result for the last file is cached, because a scenario reads the links of a log one
-    after another. `modified_ns` and `size` are not used here, but are part of the key of the
-    cache. If the file is written again, they change, and the file is read again.
+    Maps the name of each link ("m1->s") to its delays. The result for the last file is cached,
+    because a scenario reads the links of a log one after another. `modified_ns` and `size` are
+    only used as part of the cache key: if the file is rewritten, they change and the file is
+    read again.
     """
     try:
         return open_log(path).link_delays

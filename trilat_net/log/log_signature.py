@@ -40,19 +40,19 @@ from .mcap_reader import McapReader, Progress
 from .running_digest import DIGESTS, DigestState, Integrity
 
 SUFFIX = ".sig"
-"""Suffix of the signature's file, after the whole name of the log."""
+"""Suffix of the signature file, appended to the full name of the log."""
 _FORMAT = "trilat-net log signature 1"
-"""Name and version of the format, at the beginning of the signed bytes."""
+"""Name and version of the format, at the start of the signed bytes."""
 _MAX_BYTES = 65_536
-"""Largest size of the file of a key or of a signature, in bytes."""
+"""Maximum size of a key file or signature file, in bytes."""
 
 
 class _LogSignature(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Content of the file beside a log that contains its cryptographic signature.
+    """Content of the file next to a log that contains its cryptographic signature.
 
     Attributes:
         format: Name and version of the format.
-        chain: The signed digests, as the log states them.
+        chain: The signed digests, as stated in the log.
         public_key: Public key of the signer, 32 bytes in base64. It is not trusted. The person
             who checks the log supplies the key of a trusted signer.
         signature: The signature, 64 bytes in base64.
@@ -201,7 +201,7 @@ def _find_problem(path: Path, key: Ed25519PublicKey, progress: Progress | None) 
     """Checks that a log has not been changed since it was signed.
 
     Args:
-        path: The log.
+        path: Path of the log.
         key: Public key of the signer.
         progress: Function that is called after every record of the log.
 
@@ -243,31 +243,31 @@ def _find_problem(path: Path, key: Ed25519PublicKey, progress: Progress | None) 
 
 
 def _signed_bytes(chain: Mapping[str, str]) -> bytes:
-    """Returns the bytes of a log that are signed, in place of the whole file.
+    """Returns the bytes that are signed to represent a complete log.
 
-    They are the name of the format, and the digests, which depend on every byte of the file.
+    These are the name of the format, and the digests, which depend on every byte of the file.
 
     Args:
-        chain: The digests, as the log states them.
+        chain: The digests, as stated in the log.
     """
     facts = json.dumps(dict(chain), sort_keys=True, separators=(",", ":"))
     return f"{_FORMAT}\n{facts}".encode()
 
 
 def _read_chain(path: Path, progress: Progress | None) -> tuple[Integrity, dict[str, str]]:
-    """Reads a whole log, and compares it with the digests that it states at its end.
+    """Reads a complete log, and compares it with the digests stated at its end.
 
-    Digests are checksums of the contents (`running_digest`), which are computed again while the
-    log is read. A log whose digests agree (`DigestState.INTACT`), but whose end mark is
-    missing, counts as unfinished (`DigestState.OPEN`) and is not signed.
+    Digests are checksums of the contents (`running_digest`), which are recomputed while the log
+    is read. A log whose digests match (`DigestState.INTACT`) but whose end mark is missing
+    counts as unfinished (`DigestState.OPEN`) and is not signed.
 
     Args:
-        path: The log.
+        path: Path of the log.
         progress: Function that is called after every record of the log.
 
     Returns:
-        The result of the comparison, and the stated digests by name. They are empty if the log
-        states none.
+        The result of the comparison, and the digests stated in the log. Empty if there are
+        none.
 
     Raises:
         LogError: The log cannot be read.
@@ -285,10 +285,10 @@ def _read_chain(path: Path, progress: Progress | None) -> tuple[Integrity, dict[
 
 
 def _load_key(path: Path, kind: Any, expected: str) -> Any:
-    """Reads a cryptographic key from a file, and checks that it has the expected kind.
+    """Reads a cryptographic key of a given kind from a file.
 
     Args:
-        path: The file.
+        path: Path of the file.
         kind: Class of the key.
         expected: Description of the expected key for the error message.
 

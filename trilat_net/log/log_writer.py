@@ -34,30 +34,32 @@ from .session_scenario import SessionScenario
 Decoded = State | TickRecord | LinkStats | Event | None
 """Decoded message, from which messages for viewers are derived. None if no viewer needs it."""
 ReceiveMessage = Callable[[Any, int], None]
-"""Function that receives one message of the session, and its arrival time in Unix ns."""
+"""Function that takes one message of the session and its arrival time in Unix time, in ns."""
 PutMessage = Callable[[str, bytes, int, int], None]
-"""Function that writes one message: topic, bytes, sending and arrival time in Unix ns."""
+"""Function that writes one message, given its topic, bytes, and sending and arrival times in
+Unix time, in ns.
+"""
 
 
 class _ViewChannels(Protocol):
-    """Numbers of the channels for viewers in a file, by topic."""
+    """Maps the topic of each channel for viewers to its number in a file."""
 
     def __getitem__(self, topic: str) -> int:
         """Returns the number of a topic's channel in an MCAP file.
 
-        The channel is registered in the file at the first access, so that the file declares no
+        The channel is registered in the file on first access, so that the file declares no
         channel without messages.
         """
 
 
 class _LogViews(Protocol):
-    """Interface: derives messages for general viewers from the messages of a session.
+    """Protocol for deriving messages for general viewers from the messages of a session.
 
     Viewers such as Foxglove cannot read the program's own format.
-    `ros2.viz_channels.VizChannels` derives standard messages of ROS 2.
+    `ros2.viz_channels.VizChannels` derives standard ROS 2 messages.
 
     Attributes:
-        receivers: Functions that receive the messages of the session, by the key of the
+        receivers: Maps the key of messages of the session to the function that receives these
             messages.
     """
 
@@ -184,10 +186,10 @@ class LogWriter:
         Args:
             scenario: Scenario of the session.
             session: Name of the session.
-            choice: Filter of the channels that the log contains.
+            choice: Filter that selects the channels to store in the log.
 
         Returns:
-            The numbers of the channels in the file, by key. None for excluded channels.
+            Maps the key of each channel to its number in the file, or None if it is excluded.
         """
         # A schema describes the fields of one kind of messages.
         schemas: dict[str, int] = {}
@@ -285,13 +287,13 @@ class LogWriter:
             raise self._end_with_error(error) from None
 
     def _add_view_message(self, topic: str, data: bytes, publish_ns: int, log_ns: int) -> None:
-        """Adds a message to the log that viewers such as Foxglove display.
+        """Adds a message for viewers such as Foxglove to the log.
 
         Args:
             topic: Topic of the message.
             data: Bytes of the message.
-            publish_ns: Sending time, in Unix time, in ns.
-            log_ns: Arrival time, in Unix time, in ns.
+            publish_ns: Sending time in Unix time, in ns.
+            log_ns: Arrival time in Unix time, in ns.
         """
         publish_ns = min(publish_ns, log_layout.MAX_TIME_NS)
         self._file.add_message(self._view_channels[topic], log_ns, data, publish_ns)
@@ -347,7 +349,7 @@ class LogWriter:
             raise self._end_with_error(error) from None
 
     def _end_with_error(self, error: OSError) -> LogRefused:
-        """Ends the log after an error of the disk, and returns the error to raise."""
+        """Ends the log after a disk error, and returns the error to raise."""
         text = f"the log cannot be written: {error.strerror}; flushed messages are intact"
         self._end_reason = self._end_reason or text
         return LogRefused(text)
@@ -357,9 +359,9 @@ _FINISHED = "the log is finished"
 """Reason why no message can be added to a finished log."""
 
 _ACCOUNTS_BYTES = 16 << 10
-"""Space that is left free in a part of limited size, in bytes.
+"""Space left free in a part of limited size, in bytes.
 
-It is used for the accounts, and for the messages for viewers that follow from one message.
+Reserved for the accounts, and for the viewer messages that result from one message.
 """
 
 
@@ -474,7 +476,7 @@ class LogParts:
         begin: Callable[[Sink, Mapping[str, str]], LogWriter],
         opened: Callable[[Path], LogFile] | None = None,
     ) -> None:
-        """Creates the first of the files into which a long log is divided.
+        """Creates the first file of the log, which may be split into several files.
 
         If a file of the same name exists, an error is raised before anything is created.
         """
@@ -500,12 +502,12 @@ class LogParts:
     def _begin_part(self) -> None:
         """Opens the next file of the log, and writes its beginning.
 
-        A log that is split has several numbered files, its parts. If the beginning cannot be
-        written, the file is removed.
+        A log that is split consists of several numbered files, its parts. If the beginning
+        cannot be written, the file is deleted.
 
         Raises:
             UsageError: The file cannot be created.
-            LogRefused: The disk refused the data.
+            LogRefused: Writing to the disk failed.
         """
         path = log_layout.part_path(self._storage.path, self._number)
         part_metadata: dict[str, str] = {}
@@ -525,10 +527,10 @@ class LogParts:
         self._previous = path.name
 
     def _begin_next_part(self) -> None:
-        """Finishes the file that is being written, and begins the next file of the same log.
+        """Finishes the current file, and begins the next file of the same log.
 
         Raises:
-            LogRefused: The file cannot be created, or the disk refused the data.
+            LogRefused: The file cannot be created, or writing to the disk failed.
         """
         self._writer.finish(self.current_accounts())
         self._previous_digest = self._writer.records_digest
@@ -544,7 +546,7 @@ class LogParts:
     def _is_part_full(self, payload_bytes: int, duration_ns: int) -> bool:
         """Returns True if the next message would exceed a limit of the current file.
 
-        The limits are those of size and duration at which a log is divided into files.
+        These are the limits on size and duration at which a log is split.
 
         Args:
             payload_bytes: Size of the next message, in bytes.

@@ -45,33 +45,36 @@ _READ = {
     Opcode.ATTACHMENT,
     Opcode.HEADER,
 }
-"""Kinds of records that are read. The indexes are not needed to read a whole file."""
+"""Kinds of records that are read. The indexes are not needed to read a complete file."""
 
 KEPT_BYTES = 64 << 20
-"""Memory that the messages of any file may take, in bytes."""
+"""Memory that the messages of any file may use, in bytes."""
 KEPT_RATIO = 300
-"""The messages of a larger file may take this multiple of the size of the file.
+"""For a larger file, the messages may use this multiple of the size of the file.
 
-The largest ratio of logs that trilat-net writes is about 120, for arms at rest in virtual time.
+Among logs written by trilat-net, the largest ratio is about 120, for arms at rest in virtual
+time.
 """
 _CHANNEL_SHARE = 1 / 3
-"""Largest fraction of this memory for one channel."""
+"""Largest fraction of this memory that one channel may use."""
 _DECODED_BYTES = 3_000
 _LONG_BYTES = 300
 _LONG_RATIO = 24
-"""Estimate of the memory of a decoded message: _DECODED_BYTES, and _LONG_RATIO bytes for every
-byte of its payload beyond _LONG_BYTES.
+"""The memory of a decoded message is estimated as _DECODED_BYTES plus _LONG_RATIO bytes for
+each byte of its payload beyond _LONG_BYTES.
 """
 _SKIPPED_BYTES = 100
-"""Estimate of the memory of a message that is not decoded, without its payload."""
+"""Estimated memory of a message that is not decoded, in bytes, excluding its payload."""
 _NAME_BYTES = 600
 _NAME_RATIO = 20
-"""Estimate of the memory of a channel's definition: _NAME_BYTES, and _NAME_RATIO bytes for
-every byte of its record.
+"""The memory of a channel's definition is estimated as _NAME_BYTES plus _NAME_RATIO bytes for
+each byte of its record.
 """
 
 Progress = Callable[[int, int], None]
-"""Function that receives the progress of a task: the processed bytes, and all bytes."""
+"""Function that is called with the progress of a task: the bytes processed so far and the total
+number of bytes.
+"""
 
 
 def shift_progress(progress: Progress | None, before: int, total: int) -> Progress | None:
@@ -134,16 +137,16 @@ class McapMessage(NamedTuple):
 
 
 class _MessageBlock(NamedTuple):
-    """Several messages of one topic, still in their places in a chunk of an MCAP file.
+    """Several messages of one topic that have not yet been copied out of a chunk.
 
-    A chunk is a block of messages of all topics, which is compressed as a whole. Messages are
-    found and copied in blocks, because compiled code does this much faster than a loop over
-    single messages in Python.
+    A chunk is a block of messages of all topics that is compressed as a unit. Messages are
+    found and copied in blocks, because compiled code does this much faster than a Python loop
+    over single messages.
 
     Attributes:
         topic: Topic of the channel.
-        chunk: The unpacked chunk, or the payload of a single message.
-        run: Places of the messages of all channels in this part of the chunk.
+        chunk: The uncompressed chunk, or the payload of a single message.
+        run: Positions of the messages of all channels in this part of the chunk.
         listed: Number of messages in `run`.
         slot: Index by which `run` identifies the channel.
     """
@@ -210,7 +213,7 @@ def _make_single_block(message: McapMessage) -> _MessageBlock:
 
 
 _BLOCK_BYTES = 1 << 12
-"""Smallest size of a chunk whose messages are read in blocks, in bytes."""
+"""Minimum size of a chunk whose messages are read in blocks, in bytes."""
 
 
 class McapReader:
@@ -251,7 +254,7 @@ class McapReader:
         *,
         kept: bool = True,
     ) -> None:
-        """Opens an MCAP file for reading. Only its beginning and its end are read here."""
+        """Opens an MCAP file for reading. Only its beginning and end are read at this point."""
         self.metadata: dict[str, dict[str, str]] = {}
         self.attachments: dict[str, bytes] = {}
         self.channels: dict[str, ChannelInfo] = {}
@@ -348,7 +351,7 @@ class McapReader:
                 self._note_damage(item.frame, error)
 
     def _check_begin(self) -> None:
-        """Checks that the file begins with the eight bytes with which every MCAP file begins.
+        """Raises LogError unless the file begins with the magic bytes of MCAP.
 
         Raises:
             LogError: The file begins with other bytes, and is therefore not an MCAP file.
@@ -371,8 +374,8 @@ class McapReader:
     def _walk(self) -> Iterator[mcap_records.ScannedRecord | mcap_records.Damage]:
         """Yields the records and the damaged parts of the file, and reports the progress.
 
-        The progress is reported when the generator continues, that is, after the caller has
-        handled a record.
+        Progress is reported when the generator resumes, that is, after the caller has handled a
+        record.
         """
         for item in self.scanner.scan():
             if isinstance(item, mcap_records.Damage):
@@ -410,7 +413,7 @@ class McapReader:
         """Adds a record that cannot be decoded to the list of damaged parts of the file.
 
         Args:
-            frame: Place of the record.
+            frame: Position of the record.
             error: The reason.
         """
         # The scanner stops if its own list is too long. A scan must continue to the end of the
@@ -422,28 +425,28 @@ class McapReader:
     def _gave_up(self) -> bool:
         """True if the reader has stopped because the file has too many damaged parts.
 
-        The limit bounds the time and the memory that a file of random bytes can cost.
+        This limits the time and memory that a file of random bytes can cost.
         """
         return self._is_scanned and len(self.damaged) >= mcap_records.MAX_DAMAGED_PARTS
 
     def _unpack(self, record: mcap_records.ScannedRecord) -> bytes:
         """Processes a record of the file, and returns the messages and definitions in it.
 
-        The action depends on the kind of the record:
+        The action depends on the kind of record:
 
-        - A chunk, a compressed block of messages and definitions, is counted and unpacked.
+        - A chunk, a compressed block of messages and definitions, is counted and decompressed.
         - A message or definition outside of chunks is returned in the same format as in a
           chunk.
-        - Metadata, attachments and the header are stored in the attributes of the reader. They
-          contain no messages. This method adds them to the digest, the checksum that is
-          compared with the one in the file. `_read_messages` adds the returned messages and
-          definitions.
+        - Metadata, attachments and the header contain no messages. They are stored in the
+          attributes of the reader and added to the digest, the checksum that is compared with
+          the one in the file. `_read_messages` adds the returned messages and definitions to
+          the digest.
 
         Args:
             record: The record, of a kind in `_READ`.
 
         Returns:
-            The messages and definitions, with the head of each. Empty if there are none.
+            The messages and definitions, each with its header. Empty if there are none.
 
         Raises:
             UnreadableRecord: The record cannot be decoded, or its checksum is wrong.
@@ -479,7 +482,7 @@ class McapReader:
         return b""
 
     def _read_messages(self, record: mcap_records.ScannedRecord) -> Iterator[McapMessage]:
-        """Yields the messages in a record of the file, and stores definitions in it.
+        """Yields the messages in a record of the file, and stores the definitions in it.
 
         The definitions are schemas (formats of messages) and channels (topics).
 
@@ -487,7 +490,7 @@ class McapReader:
             record: The record, of a kind in `_READ`.
 
         Raises:
-            UnreadableRecord: The record makes no sense.
+            UnreadableRecord: The record is invalid.
             LogError: The messages need too much memory.
         """
         yield from self._read_remaining_messages(
@@ -499,14 +502,14 @@ class McapReader:
     ) -> Iterator[McapMessage]:
         """Yields the messages of a record that have not been read yet.
 
-        Messages and definitions are added to the digests. The local variables make this loop
-        fast, which runs for every message of a file.
+        Messages and definitions are added to the digests. Local variables speed up this loop,
+        which runs for every message of a file.
 
         Args:
             partly_read: The record, and how far it has been read.
 
         Raises:
-            UnreadableRecord: The record makes no sense.
+            UnreadableRecord: The record is invalid.
             LogError: The messages need too much memory.
         """
         frame = partly_read.frame
@@ -556,7 +559,7 @@ class McapReader:
         """Stores the definition of a schema or channel that lies between the messages.
 
         The messages before the definition are added to the digest (checksum) of all messages,
-        which leaves out the definitions.
+        which excludes definitions.
 
         Args:
             partly_read: The record, and how far it has been read.
@@ -579,11 +582,10 @@ class McapReader:
     def _finish_record(
         self, partly_read: "_PartlyReadRecord", messages: int, memory: int
     ) -> None:
-        """Concludes the reading of a record after all of its messages have been read.
+        """Finishes reading a record after all of its messages have been read.
 
         The messages after the last definition are added to the digest (checksum) of all
-        messages, and the memory of all messages is subtracted from the memory that may still be
-        used.
+        messages, and the memory of all messages is subtracted from what may still be used.
 
         Args:
             partly_read: The record, and how far it has been read.
@@ -602,13 +604,13 @@ class McapReader:
         """Yields the messages of a record in blocks, and stores its schemas and channels.
 
         Compiled code (`walk_messages`) finds the messages up to the next definition of a schema
-        or channel. The definition is then read, and the search continues after it. If compiled
-        code cannot continue, or if the record is short, the remaining messages are read one by
-        one.
+        or channel. The definition is then read, and the search continues after it. If the
+        compiled code cannot continue, or if the record is short, the remaining messages are
+        read one by one.
 
         Args:
             record: The record, of a kind in `_READ`.
-            is_kept: Function that decides whether the messages of a topic are yielded.
+            is_kept: Function that returns True for the topics whose messages are wanted.
 
         Raises:
             UnreadableRecord: The record cannot be decoded.
@@ -644,10 +646,10 @@ class McapReader:
                 yield _make_single_block(message)
 
     def _clear_run(self) -> chunk_walk.MessageRun:
-        """Returns the arrays that receive the next messages of a chunk, with counts of zero.
+        """Returns the output arrays for the next messages of a chunk, with all counts at 0.
 
-        A chunk is a compressed block of messages. The large arrays are reused. There is a count
-        for each slot, a small number that stands for a channel.
+        The large arrays are reused. There is one count per slot, a small integer that
+        represents a channel.
         """
         sums = np.zeros((4, len(self._slots)), np.int64)
         self._run = self._run._replace(
@@ -658,17 +660,17 @@ class McapReader:
     def _reserve_run_memory(
         self, partly_read: "_PartlyReadRecord", run: chunk_walk.MessageRun
     ) -> bool:
-        """Reserves memory for some messages, unless a channel would exceed its limit.
+        """Reserves memory for several messages, unless a channel would exceed its limit.
 
-        The limit protects against files that were made to exhaust the memory. Messages of the
-        session need more memory than others, because they will be decoded.
+        The limit protects against files crafted to exhaust the memory. Messages of the session
+        need more memory than others, because they will be decoded.
 
         Args:
-            partly_read: The record that contains the messages. The memory is added to it.
+            partly_read: The record that contains the messages, to which the memory is charged.
             run: The messages, counted by channel.
 
         Returns:
-            True if the memory was reserved. False, without a change, if a channel needs too
+            True if the memory was reserved. False, with nothing changed, if a channel needs too
             much memory.
         """
         counts = run.counts.tolist()
@@ -697,15 +699,15 @@ class McapReader:
         run: chunk_walk.MessageRun,
         is_kept: Callable[[str], bool],
     ) -> Iterator[_MessageBlock]:
-        """Yields the messages that were found in a chunk as one block per channel.
+        """Yields the messages found in a chunk as one block per channel.
 
         The blocks are in the order in which the first message of each channel appears.
 
         Args:
-            chunk: The unpacked chunk.
+            chunk: The uncompressed chunk.
             count: Number of messages that were found.
-            run: Places of these messages. It refers to each channel by a small index (slot).
-            is_kept: Function that decides whether the messages of a topic are yielded.
+            run: Positions of these messages. Channels are identified by small indices (slots).
+            is_kept: Function that returns True for the topics whose messages are wanted.
         """
         used_slots = np.flatnonzero(run.counts)
         by_first_message = np.argsort(run.firsts[used_slots])
@@ -740,7 +742,7 @@ class McapReader:
     def _define(self, opcode: int, content: bytes) -> None:
         """Stores the definition of a schema or a channel.
 
-        A schema describes the fields of a kind of messages, and a channel is a sequence of such
+        A schema describes the fields of a kind of message, and a channel is a sequence of such
         messages. If the file defines the same number twice, the first definition counts.
 
         Raises:
@@ -781,8 +783,8 @@ class McapReader:
     def _drop_slot(self, topic: str) -> None:
         """Makes `blocks` read the messages of a topic one by one instead of in blocks.
 
-        This keeps their order if the topic has several channels. The compiled code then has no
-        number (slot) for the channel, and stops at its messages.
+        This preserves their order if the topic has several channels. The compiled code then has
+        no number (slot) for the channel, and stops at its messages.
 
         Args:
             topic: The topic.
@@ -794,11 +796,11 @@ class McapReader:
     def _stop_reading_channel(self, channel: int, frame: mcap_records.RecordFrame) -> None:
         """Stops reading a channel because its messages need too much memory.
 
-        This is reported once as a damaged part of the file.
+        Reported once, as a damaged part of the file.
 
         Args:
             channel: Number of the channel.
-            frame: The first record of which the messages of the channel are not read.
+            frame: The first record from which no messages of the channel are read.
         """
         is_stopped_already = self._channel_memory_left[channel] < 0.0
         if is_stopped_already:
@@ -814,8 +816,8 @@ class McapReader:
     def _reserve_memory(self, amount: int, frame: mcap_records.RecordFrame) -> None:
         """Subtracts an amount from the memory that the contents of this file may still use.
 
-        The limit is a multiple of the size of the file. It protects against small files that
-        were made to fill the memory when they are unpacked.
+        The limit is a multiple of the size of the file. It protects against small files crafted
+        to fill the memory when they are decompressed.
 
         Args:
             amount: Memory in bytes.
@@ -841,11 +843,11 @@ class _PartlyReadRecord:
     """A record of an MCAP file that contains messages, and how far it has been read.
 
     Attributes:
-        frame: Kind and place of the record in the file.
-        data: Messages and definitions of the record, unpacked.
+        frame: Kind and position of the record in the file.
+        data: Uncompressed messages and definitions of the record.
         offset: Offset in `data` up to which they have been read.
         digested: Offset in `data` up to which they have been added to the digest (checksum).
-        messages: Number of messages that have been read.
+        messages: Number of messages read so far.
         memory: Memory that these messages need, in bytes.
     """
 
@@ -858,11 +860,11 @@ class _PartlyReadRecord:
 
 
 _LAST_SIGNED_NS = np.uint64((1 << 63) - 1)
-"""Latest time stamp that fits into a signed number of 64 bits."""
+"""Latest time stamp that fits into a signed 64-bit integer, in ns."""
 
 
 _FIRST_BYTES = 1 << 12
-"""Room for the messages of a topic at the beginning, in bytes."""
+"""Initial space for the messages of a topic, in bytes."""
 
 
 class ChannelMessages:
@@ -904,12 +906,12 @@ class ChannelMessages:
         return self._data[start : self._ends[number]].tobytes()
 
     def _reserve(self, size: int) -> NDArray[np.uint8]:
-        """Returns the array with the contents of all messages, with room for more at its end.
+        """Returns the array with the payloads of all messages, with space for more at its end.
 
-        The array grows at least twofold, so that many small additions stay cheap.
+        The array at least doubles whenever it grows, which keeps many small additions cheap.
 
         Args:
-            size: Number of further bytes.
+            size: Number of additional bytes.
         """
         needed = self._size + size
         if needed > len(self._data):
@@ -957,7 +959,7 @@ class ChannelMessages:
 
 
 def _clip_times(times: "array[int]") -> NDArray[np.int64]:
-    """Converts unsigned times to signed times. Times that are too late are reduced."""
+    """Converts unsigned times to signed times, clipping those that are too late."""
     unsigned = np.array(times, dtype=np.uint64)
     return np.minimum(unsigned, _LAST_SIGNED_NS).astype(np.int64)
 
@@ -1072,10 +1074,10 @@ def _is_log_topic(topic: str) -> bool:
 
 
 def _check_head(reader: McapReader, name: str) -> None:
-    """Checks that an MCAP file is a log of trilat-net: it must describe a session.
+    """Raises LogError unless an MCAP file is a log of trilat-net, which describes a session.
 
     Args:
-        reader: Reader that has read the whole file.
+        reader: Reader that has read the complete file.
         name: Name of the file for the error message.
 
     Raises:

@@ -32,34 +32,38 @@ from mcap.opcode import Opcode
 from ..errors import count_nouns
 
 MAGIC = b"\x89MCAP0\r\n"
-"""Mark at the beginning and at the end of every file."""
+"""Magic bytes at the beginning and end of every file."""
 RECORD_HEAD = struct.Struct("<BQ")
-"""Head of a record before its content: opcode and length of the content."""
+"""Header that precedes the content of a record: opcode and length of the content."""
 RECORD_HEAD_BYTES = RECORD_HEAD.size
-"""Size of the head of a record, in bytes."""
+"""Size of the header of a record, in bytes."""
 MESSAGE_HEAD = struct.Struct("<HIQQ")
-"""Head of a message before its payload: channel, sequence, log time, publish time."""
+"""Header that precedes the payload of a message: channel, sequence, log time, publish time."""
 OP_MESSAGE = int(Opcode.MESSAGE)
-"""Opcode of a message, as an int, because members of an enumeration compare slowly."""
+"""Opcode of a message as an int, because comparing members of an enumeration is slow."""
 DEFINITIONS = (Opcode.SCHEMA, Opcode.CHANNEL)
-"""Kinds of the records that define schemas and channels."""
+"""Kinds of records that define schemas and channels."""
 _FOOTER_BYTES = RECORD_HEAD_BYTES + 20 + len(MAGIC)
-"""Size of a finished file's footer and end mark, in bytes."""
+"""Size of the footer and end mark of a finished file, in bytes."""
 MAX_DAMAGED_PARTS = 100
-"""Number of damaged parts of a file after which reading is given up."""
+"""Number of damaged parts after which reading of a file is abandoned."""
 
 MAX_UNPACKED_BYTES = 32 << 20
-"""Size to which any chunk may unpack, in bytes."""
+"""Uncompressed size that is accepted for any chunk, in bytes."""
 MAX_UNPACKED_RATIO = 32
-"""Large chunks may unpack to this multiple of their compressed size, if that is more."""
+"""For large chunks, uncompressed sizes up to this multiple of the compressed size are accepted,
+if that is more.
+"""
 MAX_WINDOW_BYTES = 32 << 20
-"""Largest window that a Zstandard frame may require, in bytes."""
+"""Largest window size that a Zstandard frame may require, in bytes."""
 _COMPRESSIONS = (b"zstd", b"lz4")
-"""Supported compressions of chunks. Chunks may also be uncompressed."""
+"""Supported compression methods for chunks. Chunks may also be uncompressed."""
 _COMPRESSION_NAME_OFFSET = 28
-"""Offset of the compression's name, with its length before it, in the content of a chunk."""
+"""Offset in the content of a chunk of the name of the compression method, which is preceded by
+its length.
+"""
 _MAX_HEAD_BYTES = _COMPRESSION_NAME_OFFSET + 4 + 32 + 8
-"""Largest size of a chunk's head, with a compression name of at most 32 bytes."""
+"""Maximum size of a chunk's header, for a compression name of at most 32 bytes."""
 
 # Fields of a chunk's head: first log time, last log time, unpacked size, checksum, and the
 # length of the compression's name. The name and the compressed size follow.
@@ -172,13 +176,13 @@ def unpack_chunk(content: bytes) -> bytes:
 
 
 def _unpack(head: ChunkHead, data: memoryview) -> bytes:
-    """Decompresses the records of a chunk, a compressed block of messages.
+    """Decompresses the records of a chunk.
 
-    The memory is bounded by the size that the head of the chunk states, even if damaged data
+    The memory is limited to the size stated in the header of the chunk, even if damaged data
     would decompress to more.
 
     Raises:
-        UnreadableRecord: The data are damaged, or the compression is not supported.
+        UnreadableRecord: The data are damaged, or the compression method is not supported.
     """
     try:
         if head.compression == "zstd":
@@ -443,7 +447,7 @@ class RecordScanner:
     def _end_at(self, footer_end: int) -> None:
         """Checks that an MCAP file has its end mark after the footer, its last record.
 
-        The attributes about the end of the file are set.
+        Sets the attributes that describe the end of the file.
 
         Args:
             footer_end: Offset of the first byte after the footer.
@@ -455,7 +459,7 @@ class RecordScanner:
             self.torn = Damage(footer_end, rest, "its last mark is cut off")
 
     def _resume(self, search_start: int, offset: int, problem: str) -> int | None:
-        """Notes a damaged part, and finds the next readable chunk.
+        """Records a damaged part, and finds the next readable chunk.
 
         If no readable chunk follows, the rest of the file is damaged. The end of the file still
         counts as present if the file ends with a footer.
@@ -466,7 +470,7 @@ class RecordScanner:
             problem: Description of the problem.
 
         Returns:
-            The offset of the chunk. None if no readable chunk follows.
+            The offset of the chunk, or None if no readable chunk follows.
         """
         chunk_offset = self._find_chunk(search_start)
         if chunk_offset is not None:
@@ -482,10 +486,10 @@ class RecordScanner:
         return chunk_offset
 
     def _frame_at(self, offset: int) -> RecordFrame:
-        """Returns kind, position and length of the MCAP record that begins at an offset.
+        """Returns the kind, position and length of the MCAP record that begins at an offset.
 
         Raises:
-            UnreadableRecord: There is no record, or it reaches beyond the end of the file.
+            UnreadableRecord: There is no record, or it extends beyond the end of the file.
         """
         head = self.read(offset, RECORD_HEAD_BYTES)
         if len(head) < RECORD_HEAD_BYTES:
@@ -532,11 +536,11 @@ class RecordScanner:
     def _find_chunk(self, offset: int) -> int | None:
         """Finds the first readable chunk at or after an offset.
 
-        A chunk is recognised by the name of its compression, which has a fixed offset in its
-        head. Therefore uncompressed chunks are not found.
+        A chunk is recognised by the name of its compression method, which has a fixed offset in
+        its header. Uncompressed chunks are therefore not found.
 
         Returns:
-            The offset of the chunk. None if there is no such chunk.
+            The offset of the chunk, or None if there is no such chunk.
         """
         lead_bytes = RECORD_HEAD_BYTES + _COMPRESSION_NAME_OFFSET
         for window_offset in range(offset, self.size, _SCAN_BYTES):
@@ -644,7 +648,7 @@ class _Content(ReadDataStream):
 
 
 def _opcode_name(opcode: int) -> str:
-    """Returns the name of a kind of records, such as "chunk index", for error messages."""
+    """Returns the name of a kind of record, such as "chunk index", for error messages."""
     if opcode not in _OPCODES:
         return f"kind {opcode}"
     return Opcode(opcode).name.lower().replace("_", " ")
@@ -655,4 +659,4 @@ KINDS: dict[int, Any] = {
     kind: getattr(records, kind.name.title().replace("_", ""))
     for kind in _OPCODES - {OP_MESSAGE, Opcode.MESSAGE_INDEX, Opcode.CHUNK}
 }
-"""Class of the `mcap` package for each kind of record that `parse_record` decodes."""
+"""Maps each kind of record that `parse_record` decodes to its class in the `mcap` package."""

@@ -26,7 +26,7 @@ from .mcap_records import MAGIC, OP_MESSAGE, RECORD_HEAD
 from .running_digest import DIGESTS, RunningDigest
 
 _CHUNK_BYTES = 1 << 20
-"""Size of the messages at which a chunk is closed, in bytes before compression."""
+"""Total size of messages at which a chunk is closed, in bytes before compression."""
 
 # Fields of fixed size, in the order of the specification at mcap.dev.
 _MESSAGE = struct.Struct("<BQHIQQ")
@@ -41,12 +41,12 @@ _SUMMARY = (
     Opcode.ATTACHMENT_INDEX,
     Opcode.METADATA_INDEX,
 )
-"""Kinds of the records in the summary at the end of a file, in the order of the file."""
+"""Kinds of records in the summary at the end of a file, in file order."""
 _COMPRESSION = "zstd"
 _FIXED_END_BYTES = 512
-"""Upper bound of the size of the records at the end whose number is fixed, in bytes.
+"""Upper bound on the total size of the records at the end whose number is fixed, in bytes.
 
-These are the statistics without the counts of channels, the offsets of six groups of records,
+These are the statistics without the counts per channel, the offsets of six groups of records,
 the end of the data, the footer and the end mark.
 """
 
@@ -72,39 +72,39 @@ class Sink(Protocol):
 
 
 def _pack_text(text: str) -> bytes:
-    """Encodes a string as MCAP files require: its length in bytes, then its bytes in UTF-8."""
+    """Encodes a string for an MCAP file: its length in bytes, then its bytes in UTF-8."""
     # The name of a file may contain surrogates, which UTF-8 cannot encode.
     data = text.encode(errors="backslashreplace")
     return _pack_bytes(data)
 
 
 def _pack_text_map(texts: Mapping[str, str]) -> bytes:
-    """Encodes a dictionary of strings as MCAP files require.
+    """Encodes a dictionary of strings for an MCAP file.
 
-    The length of the encoded map in bytes comes first, then each key and each value.
+    The length of the encoded dictionary in bytes comes first, then each key and each value.
 
     Args:
-        texts: The map.
+        texts: The dictionary.
     """
     data = b"".join(_pack_text(key) + _pack_text(value) for key, value in texts.items())
     return _pack_bytes(data)
 
 
 def _pack_bytes(data: bytes) -> bytes:
-    """Returns bytes, preceded by their number in 32 bits."""
+    """Returns bytes preceded by their length as a 32-bit integer."""
     return struct.pack("<I", len(data)) + data
 
 
 def _pack_long_bytes(data: bytes) -> bytes:
-    """Returns bytes, preceded by their number in 64 bits."""
+    """Returns bytes preceded by their length as a 64-bit integer."""
     return struct.pack("<Q", len(data)) + data
 
 
 def _pack_record(opcode: int, body: bytes) -> bytes:
-    """Encodes a record of an MCAP file: its kind, the length of its content, and the content.
+    """Encodes an MCAP record: its opcode, the length of its content, and the content.
 
     Args:
-        opcode: Number of the kind of record.
+        opcode: Identifies the kind of record.
         body: Content of the record.
     """
     return RECORD_HEAD.pack(opcode, len(body)) + body
@@ -130,7 +130,7 @@ class McapWriter:
     def __init__(
         self, stream: Sink, library: str, profile: str = "", chunk_bytes: int = _CHUNK_BYTES
     ) -> None:
-        """Begins an MCAP file with the eight bytes that identify the format, and a header."""
+        """Begins an MCAP file with the eight magic bytes of the format, and a header."""
         self.position = 0
         self.messages = 0
         self._stream = stream
@@ -348,14 +348,14 @@ class McapWriter:
         return facts
 
     def _close_chunk(self) -> None:
-        """Writes the open chunk, the block of the newest messages, and the indexes to it.
+        """Writes the open chunk, which contains the newest messages, and the indexes to it.
 
-        The format is defined by the specification of MCAP. Three kinds of records are written:
+        The format is defined by the MCAP specification. Three kinds of records are produced:
 
-        1. Chunk: a head with the time range, the size and the checksum (CRC) of the messages,
+        1. Chunk: a header with the time range, the size and the checksum (CRC) of the messages,
            and the compressed messages.
-        2. Message index, one for each channel with messages in the chunk: the log time of each
-           message, and its offset in the unpacked chunk.
+        2. Message index, one per channel with messages in the chunk: the log time of each
+           message, and its offset in the uncompressed chunk.
         3. Chunk index: the offsets of the chunk and its message indexes. It is only added to
            the summary, which `finish` writes at the end of the file.
 
@@ -432,7 +432,7 @@ class McapWriter:
     def _pack_statistics(self) -> bytes:
         """Encodes the MCAP record with the statistics of the file.
 
-        It contains the numbers of all kinds of records, and the first and last arrival time.
+        It contains the number of records of each kind, and the first and last arrival times.
         """
         first_ns, last_ns = self._span_ns or (0, 0)
         head = _STATISTICS.pack(

@@ -27,7 +27,7 @@ import numpy as np
 from ..core import POSE, POSITION, Array
 
 QUATERNION_AXES = ("qw", "qx", "qy", "qz")
-"""Names of the four numbers of a quaternion, in tables."""
+"""Names of the four components of a quaternion in tables."""
 MATRIX_ENTRIES = ("r11", "r21", "r31", "r12", "r22", "r32")
 """Names of the six numbers of an orientation, with row and column of the rotation matrix."""
 

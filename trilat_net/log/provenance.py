@@ -18,17 +18,17 @@ from ..core import compute_fingerprint
 from ..files import find_version
 
 _PACKAGES = ("numpy", "numba", "msgpack", "msgspec", "mcap", "eclipse-zenoh")
-"""Packages whose versions the provenance states."""
+"""Packages whose versions are part of the provenance."""
 
 
 def _run_git(*arguments: str) -> str | None:
-    """Runs git in the source tree of this program, to find out which version it is.
+    """Runs git in the source tree of this program, to determine its version.
 
     Args:
-        *arguments: Arguments of git, such as "rev-parse", "HEAD".
+        *arguments: Arguments for git, such as "rev-parse", "HEAD".
 
     Returns:
-        The output. None if the source tree is not a git checkout, or if git fails.
+        The output, or None if the source tree is not a git checkout or git fails.
     """
     root = Path(__file__).resolve().parents[2]
     if not (root / ".git").exists():

@@ -34,9 +34,9 @@ _TYPES: dict[str, Any] = {
     "mode": _MODE,
     "rx": list[Stamp],
 }
-"""Types of fields for which `State` declares a wider type. They restrict the values."""
+"""More restrictive types for fields whose type in `State` is too wide."""
 _DEFAULTS = {"sent_ns": 0}
-"""Values of fields that records of older versions do not contain."""
+"""Values of fields that are missing from records of older versions."""
 
 
 class RecordColumns:
@@ -181,11 +181,11 @@ class RecordColumns:
         return counts, numbers.reshape(-1, 3)
 
     def _decode_fields(self, *fields: str, layout: Layout | None = None) -> Iterator[Any]:
-        """Yields the value of a field for every record, or a tuple for several fields.
+        """Yields the value of a field, or a tuple of several fields, for every record.
 
         Args:
             fields: Names of the fields.
-            layout: Lengths of the vectors. None accepts all lengths.
+            layout: Lengths of the vectors. If None, all lengths are accepted.
         """
         get_values: Callable[[Any], Any] = attrgetter(*fields)
         decoder = _find_decoder(fields, layout)
@@ -195,16 +195,16 @@ class RecordColumns:
     def _to_array(
         self, values: Iterable[Any], kind: Any, count: int, layout: Layout | None = None
     ) -> NDArray[Any]:
-        """Decodes values while they are put into an array, and reports an invalid record.
+        """Collects lazily decoded values in an array, and reports an invalid record.
 
         Args:
-            values: The values. They are decoded while they are iterated.
+            values: Iterator that decodes the values.
             kind: Data type of the array.
-            count: Number of values. It is -1 if the number is unknown.
-            layout: Lengths of the vectors, with which the error is found.
+            count: Number of values, or -1 if unknown.
+            layout: Lengths of the vectors, used to find the error.
 
         Raises:
-            WireError: A record is not valid.
+            WireError: A record is invalid.
         """
         try:
             return np.fromiter(values, kind, count)
@@ -214,17 +214,17 @@ class RecordColumns:
     def _find_error(
         self, default: str = "a number is out of range", layout: Layout | None = None
     ) -> WireError:
-        """Finds the first payload that is not a valid record, to name the reason in an error.
+        """Finds the first payload that is not a valid record, and returns its error.
 
-        The fast decoding of single fields does not show which record was wrong. Therefore the
-        records are decoded again as a whole.
+        The fast decoding of single fields does not show which record was invalid, so the
+        records are decoded again completely.
 
         Args:
-            default: Text of the error if every record is valid.
-            layout: Lengths of the vectors. None accepts all lengths.
+            default: Message of the error if every record is valid.
+            layout: Lengths of the vectors. If None, all lengths are accepted.
 
         Returns:
-            The error that occurs if that record is decoded alone.
+            The error that occurs when that record is decoded alone.
         """
         for payload in self._payloads:
             try:
@@ -238,13 +238,13 @@ class RecordColumns:
 def _find_decoder(
     fields: tuple[str, ...], layout: Layout | None
 ) -> msgspec.msgpack.Decoder[Any]:
-    """Returns a decoder for some fields of an encoded record, which skips all other fields.
+    """Returns a decoder for selected fields of an encoded record, which skips all others.
 
-    This is faster than decoding the whole record.
+    This is faster than decoding the complete record.
 
     Args:
         fields: Names of the fields.
-        layout: Lengths that vectors must have. If None, all lengths are accepted.
+        layout: Required lengths of the vectors. If None, all lengths are accepted.
     """
     types = {field.name: field.type for field in msgspec.structs.fields(State)}
     types.update(_TYPES)
@@ -256,10 +256,10 @@ def _find_decoder(
 
 
 def _make_decoder(types: dict[str, Any]) -> msgspec.msgpack.Decoder[Any]:
-    """Creates a decoder for some fields of encoded records. Other fields are skipped.
+    """Creates a decoder for selected fields of encoded records, which skips all others.
 
     Args:
-        types: Types of the fields, by name.
+        types: Maps the name of each field to its type.
     """
     fields: list[Any] = []
     for name, kind in types.items():

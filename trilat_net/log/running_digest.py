@@ -22,15 +22,15 @@ from ..errors import count_nouns
 from .log_layout import SESSION
 
 DIGESTS = "trilat.chain"
-"""Name of the metadata with the digests, at the end of a log."""
+"""Name of the metadata record with the digests, at the end of a log."""
 DIGESTS_KEY = "digest_chain"
-"""Key of the session's metadata that announces the digests and names their algorithm."""
+"""Key of the session metadata that announces the digests and names their algorithm."""
 ALGORITHM = "sha256"
 """Name of the algorithm."""
 RECOVERED = "trilat.recovered"
-"""Name of the metadata that describe the source and the losses of a recovered log."""
+"""Name of the metadata record that describes the source and the losses of a recovered log."""
 PREVIOUS_DIGEST_KEY = "previous_records"
-"""Key of a part's metadata with the digest of the messages in the previous part."""
+"""Key, in the metadata of a part, of the digest of the messages in the previous part."""
 
 
 class DigestState(StrEnum):
@@ -175,7 +175,7 @@ class RunningDigest:
 
 
 def _judge_without_chain(*, is_announced: bool, finished: bool) -> Integrity:
-    """Returns the result of checking a file that contains no hashes.
+    """Returns the result of checking a file that contains no digests.
 
     Args:
         is_announced: True if the beginning of the file announces digests.
@@ -195,4 +195,6 @@ _COVERED = {
     "records": "its messages",
     "about": "its metadata, scenario, schemas or channels",
 }
-"""Part of the log that has changed if an entry of the digests differs, as a noun phrase."""
+"""Maps each entry of the digests to the part of the log that has changed if the entry differs,
+as a noun phrase.
+"""

@@ -32,9 +32,9 @@ from .log_layout import PART, SCENARIO, SESSION, SITE_CHANNELS
 _OVERRUN = "overrun"
 """Kind of the event in which a site lists the ticks that it skipped because it was late."""
 _MAX_STARTS = 64
-"""Largest number of starts of a member whose events are counted separately."""
+"""Maximum number of starts of a member whose events are counted separately."""
 _EVENTS_NUMBERED_SINCE = 3
-"""First version of the schema whose events have numbers."""
+"""First version of the schema in which events are numbered."""
 
 
 class SessionAccounts:
@@ -58,7 +58,7 @@ class SessionAccounts:
         continued: bool = False,
         events: bool = True,
     ) -> None:
-        """Starts the accounts of a session's messages. No message has been counted yet."""
+        """Creates the accounts of a session, with no messages counted yet."""
         self._session = session
         self._continued = continued
         self._rates_hz: dict[str, int] = {}
@@ -201,9 +201,8 @@ class SessionAccounts:
     def _apply_join(self, event: Event) -> None:
         """Handles the event "join" of a site that joins the running session at a stated tick.
 
-        The site (arm controller) published no messages for the ticks (periods of the control
-        loop) before that tick, at least since its previous start ended. These messages must not
-        count as missing.
+        The site published no messages for the ticks before that, at least since its previous
+        start ended. These messages must not count as missing.
         """
         site = event.member
         published_ticks = self._end_ticks.pop(site, 0)
@@ -215,15 +214,14 @@ class SessionAccounts:
             gap.begin_next_start(first, published)
 
     def _apply_overrun(self, event: Event) -> None:
-        """Notes that a site skipped ticks (control periods), so no record of them is missing.
+        """Handles the event of a site that skipped ticks, whose records are then not missing.
 
-        The site reports this in an event, because its computer was too slow.
+        The site reports this because its computer was too slow.
 
         Args:
-            event: Event of the kind `_OVERRUN`. Its command contains ranges of skipped ticks
-                (control periods) in the form "first-last", and its ticks are the number of
-                ticks that have passed. Ranges that are not below this number are not valid, and
-                are ignored.
+            event: Event of the kind `_OVERRUN`. Its command contains ranges of skipped ticks in
+                the form "first-last", and its ticks are the number of ticks that have passed.
+                Ranges that are not below this number are invalid, and are ignored.
         """
         # The number of a tick has at most 12 digits.
         ranges = re.findall(r"(\d{1,12})-(\d{1,12})", event.command)
@@ -238,7 +236,7 @@ class SessionAccounts:
     def _apply_last(self, event: Event) -> None:
         """Handles the event that states how many ticks of a peer's earlier start arrived.
 
-        It gives a lower limit of the number of messages that the peer published before it was
+        This is a lower bound on the number of messages that the peer published before it was
         killed, which shows whether missing messages were lost or never sent.
         """
         site = event.about
@@ -292,9 +290,9 @@ class SessionAccounts:
     def _find_start_gaps(self, site: str, boot: int) -> Iterator[tuple[str, StartGap]]:
         """Yields, for each numbered channel of a site, the gap in its numbers before a start.
 
-        While a site (arm controller) was away, it published nothing. The gap keeps these
-        numbers from counting as missing. It is created when it is first needed. The number of
-        gaps is limited, so that forged events with invented starts cannot fill the memory.
+        While a site was away, it published nothing. The gap prevents these numbers from
+        counting as missing, and is created when it is first needed. The number of gaps is
+        limited, so that forged events with invented starts cannot fill the memory.
 
         Args:
             site: Name of the site.
@@ -328,7 +326,7 @@ class SessionAccounts:
             self._add_expected(site, channel, published)
 
     def _add_expected(self, member: str, channel: str, published: int) -> None:
-        """States that at least `published` messages of a channel exist."""
+        """Records that at least `published` messages of a channel exist."""
         topic = self._topic(member, channel)
         account = self._accounts.get(topic)
         if account is not None:

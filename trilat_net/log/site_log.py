@@ -38,22 +38,24 @@ M = TypeVar("M")
 T = TypeVar("T")
 
 MAX_DECODED_RECORDS = 1 << 16
-"""Largest number of decoded records of a site: a minute at 1 kHz, some 150 MB."""
+"""Maximum number of decoded records of a site: one minute at 1 kHz, about 150 MB."""
 BLOCK_RECORDS = 1 << 11
-"""Number of records that are decoded together."""
+"""Number of records decoded together."""
 HEAVY_BYTES = 12 << 20
 _HEAVY_RATIO = 10
 """The records of a site are heavy if their decoded form is larger than `HEAVY_BYTES`, and also
-larger than `_HEAVY_RATIO` times their encoded form. Only few heavy records are kept decoded,
-because a malicious file could otherwise fill the memory.
+larger than `_HEAVY_RATIO` times their encoded form. Only a few heavy records are cached in
+decoded form, because a malicious file could otherwise fill the memory.
 """
 _HEAVY_BLOCK = 128
-"""Number of heavy records that are decoded together."""
+"""Number of heavy records decoded together."""
 _HEAVY_BLOCKS = 8
-"""Number of blocks of heavy records that are kept decoded."""
+"""Number of blocks of heavy records cached in decoded form."""
 
 DecodeStates = Callable[[Sequence[bytes]], list[State]]
-"""Function that decodes some records. It raises an error if a payload is not a valid record."""
+"""Function that decodes several records, and raises an error if a payload is not a valid
+record.
+"""
 
 
 def freeze(value: T) -> T:
@@ -188,9 +190,9 @@ def decode_records(payloads: Sequence[bytes], decode_block: DecodeStates) -> Seq
 
 
 def _estimate_bytes(state: State) -> int:
-    """Estimates the memory that a decoded record takes, in bytes.
+    """Estimates the memory that a decoded record needs, in bytes.
 
-    Each entry of `rx`, `echo` and `cmd` is a separate Python object, and takes much memory.
+    Each entry of `rx`, `echo` and `cmd` is a separate Python object, and needs much memory.
     """
     entries = len(state.rx) + len(state.echo) + len(state.cmd)
     return 2_000 + 130 * entries + 100 * len(state.used) + 32 * len(state.mem)
@@ -213,7 +215,7 @@ class RecordsByTick(Mapping[int, State]):
 
     @cached_property
     def _ticks(self) -> list[int]:
-        """The ticks as a list, in which a search takes less time than in an array."""
+        """The ticks as a list, which is faster to search than an array."""
         ticks: list[int] = self._array.tolist()
         return ticks
 
@@ -245,14 +247,14 @@ class TimedMessages(NamedTuple, Generic[M]):
 
 
 class _RecordField(cached_property[T]):
-    """Property of `SiteLog` with one field of all records as an array.
+    """Property of `SiteLog` that provides one field of all records as an array.
 
-    The field is decoded when the property is accessed for the first time. The name of the
-    property is the name of the field.
+    The field is decoded when the property is first accessed. The name of the property is the
+    name of the field.
 
     Args:
-        read_column: Function that returns the field of all records (results of control
-            periods), by its name.
+        read_column: Function that takes the name of the field and returns its values in all
+            records.
         meaning: Docstring of the property.
     """
 
@@ -262,7 +264,9 @@ class _RecordField(cached_property[T]):
 
 
 class _RecordVector(cached_property[Array]):
-    """Property of `SiteLog` with one vector of all records as an array, see `_RecordField`.
+    """Property of `SiteLog` that provides one vector of all records as an array.
+
+    See `_RecordField`.
 
     Args:
         meaning: Docstring of the property.
@@ -333,7 +337,7 @@ class SiteLog:
         channel: LawChannel = LawChannel(),  # noqa: B008
         axes: tuple[float, ...] = (),
     ) -> None:
-        """Finds the control period (tick) of each encoded record, and sorts the records."""
+        """Finds the tick of each encoded record, and sorts the records."""
         self.channel = channel
         self.name = name
         self.peers = peers
@@ -382,10 +386,10 @@ class SiteLog:
         return str(find_hook("render a site's records as HTML")(self))
 
     def _read(self, decode_column: Callable[..., T], *arguments: Any) -> T:
-        """Decodes some quantities of all records into arrays that cannot be changed.
+        """Decodes quantities of all records into read-only arrays.
 
         Args:
-            decode_column: Method of `RecordColumns`, or a function of its object.
+            decode_column: Method of `RecordColumns`, or a function that takes such an object.
             *arguments: Further arguments of that method.
 
         Raises:
@@ -396,11 +400,11 @@ class SiteLog:
     def _read_from(
         self, payloads: Sequence[bytes], decode_column: Callable[..., T], *arguments: Any
     ) -> T:
-        """Decodes a field of some records into an array that cannot be changed.
+        """Decodes a field of the given records into a read-only array.
 
         Args:
-            payloads: The encoded records (results of control periods).
-            decode_column: Method of `RecordColumns`, or a function of its object.
+            payloads: The encoded records.
+            decode_column: Method of `RecordColumns`, or a function that takes such an object.
             *arguments: Further arguments of that method, such as the name of the field.
 
         Raises:
@@ -427,7 +431,7 @@ class SiteLog:
             self.__dict__.update(self._read_vectors(*missing))
 
     def _read_vectors(self, *fields: str) -> dict[str, Array]:
-        """Returns vectors of all records by name, each of shape (K, length)."""
+        """Maps the name of each vector to its values in all records, shape (K, length)."""
         if self.indexed is not None:
             return freeze(self.indexed.vectors(fields))
         return self._read(RecordColumns.vectors, self.layout, *fields)
@@ -659,7 +663,7 @@ class SiteLog:
         return self._compute_orientation(self.q_des)
 
     def _compute_orientation(self, poses: Array) -> Array:
-        """Computes unit quaternions from poses, shape (K, m).
+        """Converts poses of shape (K, m) to unit quaternions.
 
         Returns:
             The quaternions, shape (K, 4), or (K, 0) if the site does not follow orientations.
@@ -744,7 +748,7 @@ class SiteLog:
 
     @cached_property
     def _changes(self) -> dict[int, list[str]]:
-        """Texts of the field `cmd` by tick, for the records that contain any."""
+        """Maps each tick whose record has a nonempty field `cmd` to the strings in it."""
         ticks = self.tick
         payloads = self.payloads
         if self.indexed is not None:
@@ -832,11 +836,11 @@ class SiteLog:
     def _find_gaps_ns(self) -> list[tuple[int, float]]:
         """Returns the intervals in which a sample may have arrived although no record shows it.
 
-        Records (results of control periods) are missing before the first record, between
-        records whose ticks (control periods) are not consecutive, and after the last record.
+        Records are missing before the first record, between records whose ticks are not
+        consecutive, and after the last record.
 
         Returns:
-            The intervals (start, end) in ns after the start of the session.
+            The intervals (start, end), in ns after the start of the session.
         """
         states = self.states
         if not states:

@@ -34,17 +34,18 @@ from .mcap_records import (
 )
 
 PAGE_BYTES = 4096
-"""Size of a page, in bytes. Operating systems and disks lose or misplace whole pages of a file.
+"""Size of a page, in bytes. Operating systems and disks lose or misplace entire pages of a
+file.
 """
 _MAX_SALVAGE_BYTES = 64 << 20
-"""Largest part of an incomplete chunk that is read, in bytes."""
+"""Maximum number of bytes read from an incomplete chunk."""
 # Blocks of a Zstandard frame, from RFC 8878, section 3.1.1.2.
 _BLOCK_HEAD_BYTES = 3
 _RUN_LENGTH_BLOCK = 1
 _MAX_BLOCK_BYTES = 1 << 17
 
 InnerRecord = tuple[int, bytes]
-"""A record inside a chunk: its opcode and its content."""
+"""A record inside a chunk, as its opcode and content."""
 
 
 class TornChunk(NamedTuple):
@@ -112,10 +113,10 @@ class TornChunk(NamedTuple):
             yield complete_records
 
     def _unpack(self) -> Iterator[bytes]:
-        """Yields the unpacked blocks, until a block is damaged or incomplete.
+        """Yields the decompressed blocks, until a block is damaged or incomplete.
 
-        It also stops if the total size of the blocks exceeds the size that the head of the
-        chunk states. If the chunk is not compressed, a block is a page of the file.
+        Also stops if the total size of the blocks exceeds the size stated in the header of the
+        chunk. If the chunk is not compressed, a block is a page of the file.
         """
         unpackers: dict[str, Callable[[bytes], Iterator[bytes]]] = {
             "": partial(_iterate_pages, offset=self.offset),
@@ -138,21 +139,21 @@ class TornChunk(NamedTuple):
 def _find_doubtful_page(scanner: RecordScanner, begin: int, end: int) -> int:
     """Finds the first page in a part of a file that was probably not written correctly.
 
-    A page is a block of `PAGE_BYTES` that the operating system writes as a whole. If a computer
+    A page is a block of `PAGE_BYTES` that the operating system writes as a unit. If a computer
     loses power, some pages of a file may be missing or in the wrong place. A page of the part
     is therefore doubtful in two cases:
 
     - It contains only zeros: it was never written.
-    - It is equal to another page, in the part or before it. Compressed data hardly ever repeat
-      a whole page by chance. Probably the page was written to the wrong place.
+    - It equals another page, in the part or before it. Compressed data hardly ever repeat an
+      entire page by chance, so the page was probably written to the wrong place.
 
     Args:
         scanner: Scanner of the file.
         begin: Offset of the part's first byte.
-        end: Offset of the first byte after the part.
+        end: Offset after the part's last byte.
 
     Returns:
-        The offset of the page. It is `end` if no page is doubtful.
+        The offset of the page, or `end` if no page is doubtful.
     """
     # The first boundary of a page in the part: -(-a // b) rounds a / b up.
     first_page = -(-begin // PAGE_BYTES) * PAGE_BYTES
@@ -182,7 +183,7 @@ def _split_records(data: bytearray) -> tuple[list[InnerRecord], int]:
     """Splits decompressed bytes into the complete records at their beginning.
 
     Args:
-        data: The unpacked bytes. They begin with a record.
+        data: The decompressed bytes, which begin with a record.
 
     Raises:
         UnreadableRecord: The bytes are not a record.
@@ -202,7 +203,7 @@ def _split_records(data: bytearray) -> tuple[list[InnerRecord], int]:
 
 
 def _iterate_pages(packed: bytes, offset: int = 0) -> Iterator[bytes]:
-    """Splits bytes at the page boundaries of their file, as disks lose whole pages at once.
+    """Splits bytes at the page boundaries of their file, since disks lose entire pages.
 
     Args:
         packed: The bytes.
@@ -216,10 +217,10 @@ def _iterate_pages(packed: bytes, offset: int = 0) -> Iterator[bytes]:
 
 
 def _unpack_zstd(packed: bytes) -> Iterator[bytes]:
-    """Yields the unpacked complete blocks of a Zstandard frame.
+    """Yields the decompressed data of each complete block of a Zstandard frame.
 
-    A frame consists of a header and blocks (RFC 8878, section 3.1.1.2). The head of a block has
-    3 bytes: bit 0 marks the last block, bits 1 and 2 are the kind, and the others the size.
+    A frame consists of a header and blocks (RFC 8878, section 3.1.1.2). The header of a block
+    has 3 bytes: bit 0 marks the last block, bits 1 and 2 are the kind, and the others the size.
     """
     unpacker: Any = zstandard.ZstdDecompressor(max_window_size=MAX_WINDOW_BYTES).decompressobj()
     start = zstandard.frame_header_size(packed)
@@ -240,7 +241,7 @@ def _unpack_zstd(packed: bytes) -> Iterator[bytes]:
 
 
 def _unpack_lz4(packed: bytes) -> Iterator[bytes]:
-    """Yields the unpacked data of an LZ4 frame by pages, up to the first incomplete part."""
+    """Yields the decompressed data of an LZ4 frame in pages, up to an incomplete part."""
     unpacker = lz4.frame.LZ4FrameDecompressor()
     for page in _iterate_pages(packed):
         yield unpacker.decompress(page)

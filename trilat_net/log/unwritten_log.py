@@ -30,12 +30,12 @@ _NAME = "run"
 class _UnwrittenSiteLog(SiteLog):
     """Results of one arm in a simulation without a log file, with one row per tick.
 
-    A tick is a control period. The class has the arrays of `SiteLog`.
+    Provides the arrays of `SiteLog`.
 
     Args:
         scenario: Scenario of the run.
         site: Name of the site.
-        columns: Fields of the records by name, with a row for each tick of the site.
+        columns: Maps the names of record fields to arrays with one row per tick of the site.
     """
 
     def __init__(self, scenario: Scenario, site: str, columns: Mapping[str, Any]) -> None:

@@ -9,4 +9,4 @@ import math
 VIZ_HZ = 100.0
 """Default rate of the messages with the joints and their error, in Hz."""
 FULL_RATE_HZ = math.inf
-"""Rate that means a message for every record."""
+"""Special rate with which one message is written for every record."""

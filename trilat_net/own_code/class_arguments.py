@@ -17,7 +17,9 @@ _TYPE_NAMES: dict[type, tuple[tuple[type, ...], str]] = {
     int: ((int, float), "a number"),
     str: ((str,), "a text"),
 }
-"""For each checked type, the accepted types of values, and the name of the type in errors."""
+"""Maps each checked type to the accepted types of values and the name of the type in error
+messages.
+"""
 
 
 def make_own_instance(
@@ -106,13 +108,13 @@ def check_arguments(kind: Any, code: str, settings: Mapping[str, Any], path: str
 
 
 def _describe_class(kind: Any, code: str) -> str:
-    """Returns the name of a user's class with the file of its constructor, for errors."""
+    """Returns the name of a user's class and the file of its constructor, for errors."""
     file = getattr(getattr(kind.__init__, "__code__", None), "co_filename", "")
     return f"{code} ({file})" if file else code
 
 
 def _check_type(parameter: inspect.Parameter, value: Any, subject: str, path: str) -> None:
-    """Checks that a value has the type that a user's class expects for an argument.
+    """Raises ScenarioError if a value does not have the type that a user's class expects.
 
     The type is that of the annotation. Without an annotation, it is the type of the default.
     The class may then accept other types such as lists, so only a string in place of a number,
@@ -121,8 +123,8 @@ def _check_type(parameter: inspect.Parameter, value: Any, subject: str, path: st
     Args:
         parameter: The argument.
         value: Its value in the scenario.
-        subject: Name of the class, for the error.
-        path: Path of the table with the arguments, for the error.
+        subject: Name of the class, for the error message.
+        path: Path of the table with the arguments, for the error message.
     """
     annotation = parameter.annotation
     if isinstance(annotation, str):  # a module with `from __future__ import annotations`

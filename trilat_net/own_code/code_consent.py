@@ -42,7 +42,7 @@ from .imported_code import (
 
 AnyScenario = TypeVar("AnyScenario", bound=ScenarioWithCode)
 LawFiles = str | Path | Sequence[str | Path]
-"""Path of a file with a user's code, or several such paths."""
+"""Path of a file with user-written code, or several such paths."""
 
 
 def list_imported_code(scenarios: Iterable[ScenarioWithCode]) -> list[tuple[str, str]]:
@@ -78,8 +78,8 @@ def _list_named_code(scenario: ScenarioWithCode) -> list[NamedCode]:
 def _names_code(kind: object) -> bool:
     """Returns True if scenario entries of the given class name a user's class.
 
-    The result is cached for each class, because `isinstance` with a protocol is slow: without
-    the cache, it took one twelfth of the time to reset a training environment.
+    The result is cached per class, because `isinstance` with a protocol is slow: without the
+    cache, it took one twelfth of the time needed to reset a training environment.
 
     Args:
         kind: Class of an entry of a scenario.
@@ -140,11 +140,12 @@ def import_named_class(code: str, path: str) -> Any:
 
 
 class _RememberedFile(msgspec.Struct):
-    """File with a user's code that a person has permitted to run, as stored on disk.
+    """File with user-written code that a person has permitted to run, as stored on disk.
 
     Attributes:
         file: Path of the file.
-        classes: For each class of the file, the sets of arguments with which it may run.
+        classes: Maps the name of each class in the file to the sets of arguments with which it
+            may run.
     """
 
     file: str
@@ -201,12 +202,12 @@ def allow_logged_code(
 
 
 def _load_remembered_settings(remembered: Mapping[str, _RememberedFile]) -> None:
-    """Loads the arguments for which stored permissions were given.
+    """Loads the arguments to which stored permissions apply.
 
     A message about rejected code can then say which arguments differ.
 
     Args:
-        remembered: Stored permissions, by the hash of the file.
+        remembered: Maps the hash of each file to the stored permissions.
     """
     remembered_settings.clear()
     for sha256, entry in remembered.items():
@@ -222,16 +223,19 @@ def _class_of(key: CodeKey) -> str:
 
 
 def _find_store() -> Path:
-    """Returns the path of the file that stores the user's permissions to run others' code."""
+    """Returns the path of the file that stores the user's permissions to run code."""
     folder = os.environ.get("XDG_CONFIG_HOME") or Path.home() / ".config"
     return Path(folder, "trilat-net", "laws.json")
 
 
 def _read_store() -> dict[str, _RememberedFile]:
-    """Returns the permissions to run code that this user has stored, by the hash of the file.
+    """Returns the permissions to run code that this user has stored.
 
     If nothing was stored, or the file cannot be read, there are no permissions. Earlier
-    versions of the program stored only the path of a file; such an entry permits nothing.
+    versions of the program stored only the path of a file. Such an entry permits nothing.
+
+    Returns:
+        Maps the hash of each file to its permissions.
     """
     # A RuntimeError is raised if the user has no home folder.
     with suppress(OSError, ValueError, RuntimeError):
@@ -246,7 +250,7 @@ def _read_store() -> dict[str, _RememberedFile]:
 
 
 def _write_store(remembered: Mapping[str, _RememberedFile]) -> None:
-    """Replaces the permissions to run code in the user's file by the given permissions."""
+    """Replaces the permissions in the user's file with the given ones."""
     make_folder(_find_store().parent)
     # The file may be a link: people link their settings to a folder under version control.
     store = _find_store().resolve()
@@ -256,19 +260,19 @@ def _write_store(remembered: Mapping[str, _RememberedFile]) -> None:
 def _allow_file(
     file: Path, logged: Mapping[CodeKey, NamedCode], *, other_version: bool
 ) -> tuple[str, list[CodeKey]]:
-    """Permits a file named by the user to run as the code that a log names.
+    """Permits a file named by the user to run as code that a log names.
 
     The file belongs to the code that has the hash of the file. If there is no such code, it
-    belongs to the code whose module has the name of the file; it is then another version of
-    that code.
+    belongs to the code whose module has the name of the file, and is another version of that
+    code.
 
     Args:
-        file: The file.
-        logged: Code that the log names.
-        other_version: If True, the file may be another version.
+        file: Path of the file.
+        logged: Maps the key of the code that the log names to its entry in the scenario.
+        other_version: True if the file may be another version.
 
     Returns:
-        The hash of the file, and the keys of the code that was allowed.
+        The hash of the file, and the keys of the code that was permitted.
 
     Raises:
         UsageError: The file is not code that the log names, or is another version.
@@ -306,18 +310,18 @@ def _compare_hashes(key: CodeKey, sha256: str) -> str:
 
 
 class _LoggedUserLaw(NamedTuple):
-    """Control law that a log names and that is a user's class, with its permission to run.
+    """User-written control law that a log names, with its permission to run.
 
     Attributes:
         code: Class of the law, for example "package.module:Law".
-        sites: Names of the sites (arm controllers) that the law controls.
+        sites: Names of the sites that the law controls.
         settings: Arguments of the class, as readable text.
         allowed: True if the file may run with these arguments.
-        file: The file that a person permitted, or else the file that Python's import finds for
-            the module. None if there is no such file.
+        file: The file that a person permitted, or else the file that Python's import system
+            finds for the module. None if there is no such file.
         changed: Text about the hashes if the file differs from the file that ran. Otherwise
             empty.
-        other_settings: Text about the difference if the code was permitted with other
+        other_settings: Text about the differences if the code was permitted with other
             arguments. Otherwise empty.
     """
 
@@ -374,7 +378,7 @@ def _inspect_user_law(key: CodeKey, law: ImportedLaw, sites: tuple[str, ...]) ->
     Args:
         key: Class, hash and arguments.
         law: The law in the scenario.
-        sites: Names of the sites (arm controllers) that it controls.
+        sites: Names of the sites that it controls.
     """
     consent = key.find_consent()
     sha256 = ""

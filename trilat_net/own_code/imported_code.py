@@ -41,11 +41,12 @@ from .sent_channel import parse_classes
 CLASS_PATTERN = r"^[A-Za-z_]\w*(\.[A-Za-z_]\w*)*:[A-Za-z_]\w*$"
 
 _imported: dict[str, str] = {}
-"""For each module that Python's import has loaded, the hash that its file had then."""
+"""Maps each module that Python's import system has loaded to the hash that its file had then.
+"""
 
 
 Watch = Callable[[int, Callable[[], Any]], Any]
-"""Function that calls a user's code and returns its result, for example with a time limit.
+"""Function that calls user-written code and returns its result, for example with a time limit.
 
 Its arguments are the tick and the call, a function without arguments.
 """
@@ -94,10 +95,10 @@ class NamedCode(Protocol):
 
 
 class _SiteWithCode(Protocol):
-    """Interface of the part of a scenario that describes one arm and the users' classes for it.
+    """Protocol for the part of a scenario that describes one arm and its user-written classes.
 
     These are its control law, the programs that move the arm, and the model of the arm. The
-    checks of permissions search here for users' classes, without importing the scenario's
+    permission checks search here for user-written classes, without importing the scenario's
     types.
     """
 
@@ -126,7 +127,7 @@ class ScenarioWithCode(Protocol):
 
 
 ANY_SETTINGS = "*"
-"""Used in place of the arguments of a class if a permission applies to all arguments.
+"""Replaces the arguments of a class in a permission that applies to all arguments.
 
 Only the worker processes of a study receive such a permission, because a study varies the
 arguments itself.
@@ -273,10 +274,10 @@ CodeConsents = dict[CodeKey, CodeConsent]
 allowed_code: CodeConsents = {}
 """Permissions for this process. Worker processes receive a copy."""
 remembered_settings: dict[tuple[str, str], list[str]] = {}
-"""Arguments that were permitted in earlier sessions, as the JSON text of `CodeKey.settings`.
+"""Arguments that were permitted in earlier sessions, as the JSON strings of `CodeKey.settings`.
 
-The keys are the hash of the file and the name of the class. The texts serve only to explain
-what differs if code is refused; they permit nothing.
+The keys are the hash of the file and the name of the class. The strings only serve to explain
+what differs if code is rejected. They permit nothing.
 """
 
 
@@ -307,9 +308,9 @@ def allowing_any_settings(allowed: CodeConsents) -> Iterator[None]:
 def _list_differences(
     old_settings: Mapping[str, Any], new_settings: Mapping[str, Any]
 ) -> list[str]:
-    """Returns a string for each argument whose value differs, such as "gain = 5 (was 3)".
+    """Returns one string per argument whose value differs, such as "gain = 5 (was 3)".
 
-    An argument that one of the two sets does not contain has its default value in this set.
+    An argument that is missing from one of the two sets has its default value there.
     """
     old_texts = {key: describe_setting(value) for key, value in old_settings.items()}
     new_texts = {key: describe_setting(value) for key, value in new_settings.items()}
@@ -323,7 +324,7 @@ def _list_differences(
 
 
 LONGEST_SETTING = 300
-"""Largest length up to which an argument is shown completely. Paths are usually shorter."""
+"""Maximum length up to which an argument is shown completely. Paths are usually shorter."""
 
 
 def describe_setting(value: Any) -> str:
@@ -343,7 +344,7 @@ def describe_setting(value: Any) -> str:
 
 
 _executed: dict["_CodeSource", Any] = {}
-"""Modules that were executed from a file that a person named, by the content of the file."""
+"""Maps the content of each file that a person named to the module that was executed from it."""
 
 
 class ImportedLaw(LawSettings, frozen=True, tag_field="law", tag="own"):
@@ -399,9 +400,9 @@ class ImportedLaw(LawSettings, frozen=True, tag_field="law", tag="own"):
 
 
 class _CodeSource(NamedTuple):
-    """Python file that defines a user's class, as it was read from disk.
+    """Python file that defines a user's class, as read from disk.
 
-    Its content is stored, so that exactly the checked text is run.
+    The content is stored, so that exactly the checked text is run.
 
     Attributes:
         file: Path of the file.
@@ -466,14 +467,14 @@ def _find_file(code: str, path: str) -> Path:
 def _find_spec(module: str) -> ModuleSpec | None:
     """Finds a module in the same way as an import does, but without importing its packages.
 
-    Only Python's path finder and the finders of editable installations are asked. Other finders
+    Only Python's path finder and the finders of editable installations are used. Other finders
     may run code: that of `distutils` imports the nearest setuptools.
 
     Args:
         module: Name of the module, with dots.
 
     Returns:
-        The spec of the module, which contains its file. None if it is not found.
+        The spec of the module, which contains its file, or None if it is not found.
     """
     finders = [
         finder
@@ -504,8 +505,8 @@ def _find_spec(module: str) -> ModuleSpec | None:
 def _find_import_folder(module: str, file: Path) -> Path:
     """Returns the folder that must be on Python's search path to import a module from a file.
 
-    For a plain module, it is the folder of the file. For a module in packages, it is the folder
-    that contains the outermost package.
+    For a plain module, this is the folder of the file. For a module in packages, it is the
+    folder that contains the outermost package.
     """
     depth = module.count(".") + (file.stem == "__init__")
     return file.parents[min(depth, len(file.parents) - 1)]
@@ -516,7 +517,9 @@ PAGES = {
     "act": ("hand", "policies.md"),
     "step": ("plant", "own-plant.md"),
 }
-"""For each required method, the name of this kind of class, and its documentation page."""
+"""Maps each required method to the name of the kind of class that has it, and its documentation
+page.
+"""
 
 
 def check_class(source: _CodeSource, code: str, path: str, method: str = "torque") -> None:
@@ -554,13 +557,13 @@ def check_class(source: _CodeSource, code: str, path: str, method: str = "torque
 
 
 def _import(module: str, sha256: str) -> Any:
-    """Imports a module in Python's usual way, and reloads it if its file has changed.
+    """Imports a module in Python's usual way, reloading it if its file has changed.
 
     In a notebook, for example, a user may edit a control law and simulate it again.
 
     Args:
         module: Name of the module.
-        sha256: Present hash of its file.
+        sha256: Current hash of its file.
     """
     imported = importlib.import_module(module)
     if _imported.setdefault(module, sha256) != sha256:
@@ -576,7 +579,7 @@ def _execute(module: str, source: _CodeSource) -> Any:
     again, or load a compiled version of it from `__pycache__`.
 
     Args:
-        module: Name that the module gets.
+        module: Name for the module.
         source: The file and its content.
     """
     if source in _executed:
@@ -600,7 +603,7 @@ def _execute(module: str, source: _CodeSource) -> Any:
 
 
 def _name_law_class(kind: type) -> str:
-    """Returns the name with which a scenario names a user's class.
+    """Returns the name by which a scenario refers to a user's class.
 
     For example, the class Spring in the file mylaws.py has the name "mylaws:Spring".
 
@@ -646,11 +649,10 @@ def name_law_classes(value: Any) -> Any:
 def _searching(folder: Path | None) -> Iterator[None]:
     """Makes Python search one folder for modules before all others, inside the `with` block.
 
-    A user's class can thus import other files that lie beside its own file.
+    This lets a user's class import other files from the folder of its own file.
 
     Args:
-        folder: The folder. If None, it is the working directory, unless Python searches it
-            already.
+        folder: The folder. If None, the working directory, unless Python already searches it.
     """
     search_path = str(folder or Path.cwd())
     if folder is None and search_path in sys.path:

@@ -88,7 +88,7 @@ def _find_name_problem(name: str) -> str:
     """Returns the reason why a name is unsuitable for a vector.
 
     A law reads the vector as an attribute of its input, so the name must be an identifier, and
-    must not be an attribute that the input has already.
+    must not be an existing attribute of the input.
 
     Returns:
         The reason. Empty if the name is suitable.

@@ -65,7 +65,7 @@ from trilat_net.scenario import Scenario, parse_embedded
 from .ros2_topics import RELIABLE, BridgeEnds, SiteTopics
 
 POLL_NS = 1_000_000
-"""Shortest time between two polls for messages of the session, in ns."""
+"""Minimum time between two polls for messages of the session, in ns."""
 POLLS_PER_RECORD = 5.0
 """Number of polls in the time between two published records."""
 LOOK_PERIOD_NS = 200_000_000
@@ -73,7 +73,7 @@ LOOK_PERIOD_NS = 200_000_000
 SILENCE_NS = 200_000_000
 """Time without a target after which an arm is released, in ns."""
 SENDER_TIMEOUT_NS = NS_PER_S
-"""Time for which a publisher counts as present after its last message, in ns."""
+"""Time after its last message for which a publisher counts as present, in ns."""
 SAFE_PERIOD_NS = 10_000_000
 """Time between two safe commands to a robot, in ns."""
 DRIVE_PERIOD_S = 0.001
@@ -81,25 +81,25 @@ DRIVE_PERIOD_S = 0.001
 NOTICE_PERIOD_S = 0.5
 """Time between two checks for measurements of a robot, in s."""
 FIRST_NOTICE_NS = 2 * NS_PER_S
-"""Time without a measurement of a robot after which the user is first told, in ns."""
+"""Time without a measurement of a robot after which the user is first notified, in ns."""
 NEXT_NOTICE_NS = 60 * NS_PER_S
-"""Time without a measurement after which the user is told again, in ns."""
+"""Time without a measurement after which the user is notified again, in ns."""
 REQUEST_PERIOD_S = 0.05
-"""Time between two checks for new weights, in s."""
+"""Time between two checks for new dominance factors, in s."""
 TRIGGER = "std_srvs/srv/Trigger"
-"""Type of the services, whose requests have no content."""
+"""Type of the services, whose requests are empty."""
 INBOX_MESSAGES = 4096
 """Capacity of each queue of messages from the session."""
 
 JointNames = Sequence[Sequence[str]]
-"""For each joint of an arm, the names that the joint may have in ROS messages."""
+"""For each joint of an arm, the alternative names of the joint in ROS messages."""
 
 
 class _SingleSender:
-    """Checks for each message of a topic that only one program publishes on the topic.
+    """Checks that only one program publishes on a topic, for each of its messages.
 
     Two programs that command the same arm would move it back and forth. The messages of both
-    are refused until one of them has not published for `SENDER_TIMEOUT_NS`.
+    are rejected until one of them has not published for `SENDER_TIMEOUT_NS`.
 
     Args:
         clock: Clock of this process.
@@ -217,7 +217,7 @@ class TargetTopic:
                 self._release_hand()
 
     def _release_hand(self) -> None:
-        """Releases the arm if the targets of a ROS 2 topic move it at present.
+        """Releases the arm if it is currently moved by targets from a ROS 2 topic.
 
         The next target takes control of the arm again.
         """
@@ -296,13 +296,13 @@ class DominanceTopic:
 
 
 class _SilenceNotice:
-    """Composes notices for the user while a robot sends no measurement.
+    """Composes notices for the user while a robot sends no measurements.
 
     The first notice is due after `FIRST_NOTICE_NS` without a measurement, and further notices
-    are due every `NEXT_NOTICE_NS`. A measurement restarts this sequence.
+    every `NEXT_NOTICE_NS`. A measurement restarts this sequence.
 
     Args:
-        joints: Names that each joint of the arm may have in ROS messages.
+        joints: Alternative names of each joint of the arm in ROS messages.
         clock: Clock of this process.
     """
 
@@ -472,7 +472,7 @@ class RobotArm:
     def _may_apply(self, torque: Sequence[float]) -> bool:
         """Returns True if a torque may be passed on to the robot.
 
-        The robot must be armed, and the torque must have one entry for each joint.
+        The robot must be armed, and the torque must have one entry per joint.
         """
         return self.armed and len(torque) == len(self._joint_order)
 
@@ -487,21 +487,21 @@ def _order_joints(
     controller: Sequence[str],
     safe_command: Sequence[float],
 ) -> list[int]:
-    """Finds the joint of the scenario to which each joint of the controller corresponds.
+    """Finds the joint of the scenario that corresponds to each joint of the controller.
 
     A robot's controller may list its joints in an order that differs from the scenario, and may
-    have further joints.
+    have additional joints.
 
     Args:
-        joints: Names that each joint may have, in the order of the scenario.
+        joints: Alternative names of each joint, in scenario order.
         controller: Names of the joints, in the order of the controller.
-        safe_command: Command to the controller while the arm brakes.
+        safe_command: Command sent to the controller while the arm brakes.
 
     Returns:
         For each joint of the controller, its index in the scenario.
 
     Raises:
-        UsageError: The controller or the safe command does not have one entry for each joint.
+        UsageError: The controller or the safe command does not have one entry per joint.
     """
     joint_count = len(joints)
     joint_order: list[int] = []
@@ -526,12 +526,12 @@ def _order_joints(
 
 
 def _find_joint_indices(joints: JointNames, state: cdr.RosJoints) -> list[int]:
-    """Finds the index of each joint of an arm in a message with joint states.
+    """Finds the index of each joint of an arm in a joint state message.
 
-    The message may contain further joints, and the joints may have any order.
+    The message may contain additional joints, in any order.
 
     Args:
-        joints: Names that each joint may have, in the order of the arm.
+        joints: Alternative names of each joint, in the order of the arm.
         state: The message.
 
     Returns:
@@ -585,9 +585,9 @@ def read_joint_target(joints: JointNames, data: bytes) -> list[float]:
 
 
 def _check_finite(numbers: Sequence[float]) -> list[float]:
-    """Returns the numbers of a ROS 2 message as a list, after a check that all are finite.
+    """Returns the numbers of a ROS 2 message as a list, after checking that all are finite.
 
-    NaN or an infinite number could make a robot move without control.
+    A NaN or infinity could make a robot move uncontrollably.
 
     Raises:
         ValueError: A number is not finite.
@@ -632,10 +632,8 @@ def read_vector_target(
 class _Bridge:
     """Connects one running session with ROS 2.
 
-    When the object has been created, ROS programs see its topics and services. `run` then
+    Once the object has been created, ROS programs see its topics and services. `run` then
     publishes the records, events and statistics of the session.
-
-    A record is the result of one tick, a period of a site's control loop.
 
     Args:
         ends: Connections to ROS and to the session.
@@ -643,8 +641,8 @@ class _Bridge:
         epoch_unix_ns: Start of the session in Unix time, in ns.
 
     Attributes:
-        targets: Topics that command an arm, by name.
-        dominance: Topics that set the weights with which a site follows its peers, by name.
+        targets: Maps the names of topics that command an arm to the subscriptions.
+        dominance: Maps the names of topics that set dominance factors to the subscriptions.
     """
 
     def __init__(self, ends: BridgeEnds, scenario: Scenario, epoch_unix_ns: int) -> None:
@@ -697,10 +695,10 @@ class _Bridge:
         _serve_orders(graph, running, scenario.names)
 
     def _subscribe_dominance(self, site: str, running: RunningSession) -> None:
-        """Subscribes to the topic that sets the weights with which a site follows its peers.
+        """Subscribes to the topic that sets the dominance factors of a site.
 
         Changes from before the start of the bridge are read first, because they determine the
-        present weights, which the bridge publishes.
+        current dominance factors, which the bridge publishes.
 
         Args:
             site: Name of the site.
@@ -721,9 +719,9 @@ class _Bridge:
         ends.graph.subscribe(topic, cdr.FLOAT64_ARRAY, dominance.receive)
 
     def _subscribe_target(self, site: str) -> None:
-        """Subscribes to the topic with which a ROS program moves an arm, as its operator.
+        """Subscribes to the topic on which a ROS program moves an arm, as its operator.
 
-        A person or a program in ROS can thus move an arm of the session.
+        This lets a person or a program in ROS move an arm of the session.
 
         Args:
             site: Name of the arm's site, whose scenario must allow a live hand.
@@ -790,17 +788,16 @@ class _Bridge:
         return False
 
     def _have_sites_left(self) -> bool:
-        """Returns True if sites were present and all have left. The bridge may then end."""
+        """Returns True if sites were present and all have left, so that the bridge may end."""
         return self._has_seen_site and not self._present
 
     def _publish_messages(self, rate_hz: float) -> bool:
         """Publishes the records, events and statistics that have arrived from the session.
 
-        The bridge calls this repeatedly, so that ROS programs see the newest states of the
-        arms.
+        Called repeatedly, so that ROS programs see the newest states of the arms.
 
         Returns:
-            True if another session has begun under the same name.
+            True if another session with the same name has begun.
         """
         for record in read_messages(self._records, State):
             if record.site in self._sites:
@@ -831,7 +828,7 @@ class _Bridge:
         return has_new_epoch
 
     def _publish_diagnostics(self) -> None:
-        """Publishes the state of all sites on /diagnostics, which tools of ROS display.
+        """Publishes the state of all sites on /diagnostics, which ROS tools display.
 
         No message is composed while no ROS program subscribes.
         """
@@ -857,7 +854,7 @@ def _describe_target(
 
     Args:
         scenario: Scenario of the session.
-        site: Name of the site (process that runs the arm), which must have a live operator.
+        site: Name of the site, which must have a live operator.
         hand: Connection to the site, in the role of the operator. Its method `turn` sends joint
             angles, `push` a force, and `move` a position of the end effector.
         frame: Name of the coordinate frame of the positions and forces in the messages.
@@ -866,7 +863,7 @@ def _describe_target(
         topic: Name of the topic.
         type: Name of the ROS type of its messages.
         read: Function that converts an encoded message to a target: joint angles, a force or a
-            position. It raises ValueError if the message is not valid.
+            position. Raises ValueError for an invalid message.
         send: Function that sends the target to the site.
     """
     operator = scenario.sites[site].find_live_hand(is_open=True)
@@ -890,7 +887,7 @@ def _describe_target(
 
 
 def _list_joint_names(scenario: Scenario, site: str) -> list[tuple[str, ...]]:
-    """Lists the names by which ROS 2 messages may call each joint of an arm.
+    """Lists the alternative names of each joint of an arm in ROS 2 messages.
 
     Args:
         scenario: Scenario of the session.
@@ -916,7 +913,7 @@ def _serve_orders(graph: Ros2Graph, running: RunningSession, sites: Sequence[str
     Args:
         graph: Connection to the ROS programs.
         running: The session.
-        sites: Names of its sites.
+        sites: Names of the sites of the session.
     """
 
     def serve(order: Callable[..., list[str]], *site: str) -> None:
@@ -943,7 +940,7 @@ def _send_order(order: Callable[..., list[str]], *sites: str) -> bytes:
 
     Args:
         order: Method of `RunningSession` that sends the order.
-        *sites: Names of the sites. If there are no names, the order is sent to all sites.
+        *sites: Names of the sites. If omitted, the order is sent to all sites.
 
     Returns:
         The encoded response, with the replies of the sites or the error.
@@ -964,7 +961,7 @@ def _repeat_in_thread(
 
     Args:
         period_s: Time between two calls, in s.
-        act: The function.
+        act: Function to call repeatedly.
         finish: Function that is called once after the thread has ended.
     """
     is_over = threading.Event()
@@ -1120,11 +1117,11 @@ def _describe_inputs(ends: BridgeEnds, bridge: _Bridge, robots: Iterable[str]) -
 
     Args:
         ends: Connections to ROS and to the session.
-        bridge: The bridge of the session, which contains the topics with targets.
+        bridge: The bridge of the session, which contains the target topics.
         robots: Names of the sites whose arm is a ROS robot.
 
     Returns:
-        A clause for each topic, such as "/session/s/robot_states measures the arm of s".
+        One clause per topic, such as "/session/s/robot_states measures the arm of s".
     """
     clauses = [f"/{topic} commands an arm" for topic in bridge.targets]
     for site in robots:
@@ -1141,7 +1138,7 @@ def _open_robot(
     say: Callable[[str], None],
     joints: JointNames = (),
 ) -> Iterator[RobotArm]:
-    """Connects the ROS robot of a site, as a context manager.
+    """Context manager that connects the ROS robot of a site.
 
     Inside the `with` block, joint states and torques are exchanged. At its end, the robot
     receives its safe command.
@@ -1151,8 +1148,8 @@ def _open_robot(
         site: Name of the site whose arm is the robot.
         robot: Settings of the robot.
         say: Function that prints a line for the user.
-        joints: Names that each joint may have, in the order of the scenario. If empty, the
-            names in the settings are used.
+        joints: Alternative names of each joint, in scenario order. If empty, the names in the
+            settings are used.
 
     Yields:
         The robot.
@@ -1190,11 +1187,11 @@ def _await_site(ends: BridgeEnds, stopped: Callable[[], bool], *, running: bool)
     Args:
         ends: Connections to ROS and to the session.
         stopped: Function that returns True to end the wait.
-        running: True to wait until a site runs. If False, a site that still waits for others is
-            accepted.
+        running: True to wait until a site is running. If False, a site that is still waiting
+            for others is accepted.
 
     Returns:
-        The identity of the site. `None` if `stopped` returned True.
+        The identity of the site, or None if `stopped` returned True.
     """
     members = SessionMembers(ends.bus, ends.clock, ends.session)
     for info in members.find(stopped=stopped, timeout_s=None):

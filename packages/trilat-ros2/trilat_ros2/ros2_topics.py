@@ -24,7 +24,7 @@ from trilat_net.scenario import Scenario
 RELIABLE = QualityOfService()
 """Quality of service of most topics."""
 LATCHED = QualityOfService(latched=True, depth=1)
-"""Quality of service of topics whose last message late subscribers receive."""
+"""Quality of service of topics that send their last message to late subscribers."""
 
 
 class BridgeEnds(NamedTuple):

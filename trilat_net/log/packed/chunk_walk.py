@@ -26,9 +26,9 @@ _LOG_TIME = 6
 _PUBLISH_TIME = _LOG_TIME + 8
 
 CAPACITY = 1 << 13
-"""Largest number of messages that one walk finds."""
+"""Maximum number of messages found in one walk."""
 MOST_CHANNELS = 1 << 16
-"""Number of channels that the head of a message can state."""
+"""Number of different channels that the header of a message can represent."""
 
 WALKED = 0
 """The walk ended at the end of the chunk, or after `CAPACITY` messages."""

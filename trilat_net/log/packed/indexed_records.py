@@ -28,9 +28,11 @@ _INTS = {
     "busy_us": (record_scan.LATE, (BEFORE_BUSY,)),
     "sent_ns": (record_scan.LATE, (BEFORE_BUSY, BEFORE_SENT)),
 }
-"""Integer fields: the mark before a field, and the literals between the mark and the field."""
+"""For each integer field, the mark before the field, and the literals between the mark and the
+field.
+"""
 _TICK, _BOOT, _MODE = range(3)
-"""Columns of the heads, see `record_scan.scan_records`."""
+"""Columns of the array `heads`, see `record_scan.scan_records`."""
 
 
 class IndexedRecords:
@@ -62,7 +64,7 @@ class IndexedRecords:
         marks: NDArray[np.int32],
         counts: NDArray[np.int32],
     ) -> None:
-        """Stores encoded records, with the positions of their values from `of_payloads`."""
+        """Stores encoded records, with the positions of their values found by `of_payloads`."""
         self.messages = messages
         self._peers = peers
         self._layout = layout
@@ -132,7 +134,7 @@ class IndexedRecords:
         return field in _INTS
 
     def _gather_ints(self, mark: int, gaps: Sequence[int]) -> Ints:
-        """Reads integers at known distances behind a position in each encoded record.
+        """Reads integers at known distances after a position in each encoded record.
 
         The result has the shape (K, number of gaps). A gap is the number of bytes before an
         integer.
@@ -193,7 +195,7 @@ class IndexedRecords:
         return bits
 
     def _gather_floats(self, mark: int, places: Sequence[int]) -> Ints:
-        """Reads the bits of floats at fixed distances behind a position in each encoded record.
+        """Reads the bits of floats at fixed distances after a position in each encoded record.
 
         The result has the shape (K, number of distances).
         """
@@ -208,11 +210,11 @@ class IndexedRecords:
         return bits
 
     def _vector_places(self) -> dict[str, tuple[int, int, int]]:
-        """Returns where the vectors, such as joint angles, lie in an encoded record, by name.
+        """Locates the vectors, such as joint angles, in an encoded record.
 
         Returns:
-            For each vector: the column of `marks` with the position from which its offset
-            counts, the offset of its first number in bytes, and its length in numbers.
+            Maps each vector to the column of `marks` with the position from which its offset is
+            counted, the offset of its first entry in bytes, and its number of entries.
         """
         exact = self._exact
         names = list(self._layout.lengths())

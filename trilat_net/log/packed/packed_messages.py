@@ -14,8 +14,8 @@ Ints = NDArray[np.int64]
 Bytes = NDArray[np.uint8]
 
 PADDING = 16
-"""Number of bytes after the last message, so that eight bytes can be loaded at every offset of
-a message, and after the head of a number at its end.
+"""Number of bytes after the last message. They make it possible to load eight bytes at any
+offset of a message, and after the header of a number at its end.
 """
 
 

@@ -19,10 +19,10 @@ from .packed_messages import Ints
 _encode = msgspec.msgpack.Encoder().encode
 _WORD_BYTES = 8
 _FIRST_FIELDS = 22
-"""Number of fields of a record without the optional vectors."""
+"""Number of fields of a record, excluding the optional vectors."""
 _OPTIONAL_VECTORS = ("x", "xd", "wrench", "ch", "hand", "bodies")
 NUMBER_BYTES = 9
-"""Length of an encoded floating-point number."""
+"""Length of an encoded floating-point number, in bytes."""
 
 # Indices of the literals before single values. Those of vectors and peers follow.
 BEFORE_BOOT, BEFORE_TICK, BEFORE_TIME, BEFORE_MODE, BEFORE_USED, BEFORE_ARRIVALS = range(6)
@@ -115,12 +115,12 @@ class RecordLayout(NamedTuple):
 
 
 def _array_head(length: int) -> bytes:
-    """Returns the bytes with which an encoded list (MessagePack) of a given length begins."""
+    """Returns the first bytes of an encoded list (MessagePack) of a given length."""
     return _encode([None] * length)[:-length] if length else _encode([])
 
 
 def _map_head(length: int) -> bytes:
-    """Returns the bytes with which an encoded map (MessagePack) of a given length begins."""
+    """Returns the first bytes of an encoded map (MessagePack) of a given length."""
     pair_bytes = len(_encode("00")) + len(_encode(None))
     encoded = _encode({f"{n:02}": None for n in range(length)})
     return encoded[: len(encoded) - length * pair_bytes]

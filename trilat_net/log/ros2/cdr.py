@@ -22,9 +22,9 @@ from typing import Any, NamedTuple
 from ...records import NS_PER_S
 
 ENCODING = "cdr"
-"""Encoding of the messages, as MCAP calls it."""
+"""Name of the message encoding in MCAP."""
 SCHEMA_ENCODING = "ros2msg"
-"""Encoding of the message definitions, as MCAP calls it."""
+"""Name in MCAP of the encoding of the message definitions."""
 JOINT_STATE = "sensor_msgs/msg/JointState"
 FLOAT64_ARRAY = "std_msgs/msg/Float64MultiArray"
 STRING = "std_msgs/msg/String"
@@ -44,13 +44,14 @@ DIAGNOSTICS = "diagnostic_msgs/msg/DiagnosticArray"
 _HEAD = b"\x00\x01\x00\x00"
 """Header of a message: plain CDR, little-endian, no options."""
 _LAST_S = (1 << 31) - 1
-"""Latest time stamp of ROS 2, in s. A stamp contains the seconds in a signed number of 32 bits.
-"""
+"""Latest time stamp of ROS 2, in s. A stamp contains the seconds as a signed 32-bit integer."""
 _POSE_BYTES = 7 * 8
-"""Size of a transform: position and quaternion, seven floats of 8 bytes."""
+"""Size of a transform in bytes: position and quaternion, seven floats of 8 bytes."""
 
 DEFINITIONS = resources.files("trilat_net.log.ros2") / "definitions"
-"""Text files of ROS: message types, the quality of service of a bag, and the planar arm."""
+"""Folder of the ROS text files: message types, the quality of service of a bag, and the planar
+arm.
+"""
 _PACKED_TYPES = (
     JOINT_STATE,
     FLOAT64_ARRAY,
@@ -71,18 +72,18 @@ def _read_definition(type_name: str) -> bytes:
 
 
 ROS2_SCHEMAS = {type_name: _read_definition(type_name) for type_name in _PACKED_TYPES}
-"""Complete definitions of the message types that this module encodes, by name."""
+"""Maps the name of each message type that this module encodes to its complete definition."""
 
 
 def _pack_fields(offset: int, *values: int | str) -> bytes:
-    """Encodes numbers of 32 bits and strings.
+    """Encodes 32-bit integers and strings.
 
-    A string is encoded as its length with the terminating zero, then its bytes.
+    A string is encoded as its length including the terminating zero, followed by its bytes.
 
     Args:
         offset: Position of the first field, in bytes after the header. It determines the
             padding.
-        *values: The numbers and strings.
+        *values: The integers and strings.
     """
     data = b""
     for value in values:
@@ -96,7 +97,7 @@ def _pack_fields(offset: int, *values: int | str) -> bytes:
 
 
 def _count_padding(offset: int, size: int) -> int:
-    """Returns the number of bytes of padding before a field of `size` bytes at `offset`."""
+    """Returns the number of padding bytes before a field of `size` bytes at `offset`."""
     return -offset % size
 
 
@@ -201,7 +202,7 @@ class TransformPacker:
     """
 
     def __init__(self, frames: Sequence[tuple[str, str]]) -> None:
-        """Computes the positions of all fields in a transform message from the frames' names.
+        """Computes the positions of all fields in a transform message from the frame names.
 
         This is done once, so that encoding a message only fills in numbers.
         """
@@ -375,8 +376,8 @@ def pack_diagnostics(stamp_ns: int, diagnoses: Sequence[Diagnosis]) -> bytes:
 class _CdrReader:
     """Decodes a ROS 2 message field by field, in the order of its definition.
 
-    Every call of a method returns the next field. All methods raise a ValueError if the message
-    ends before the field does.
+    Every method call returns the next field. All methods raise ValueError if the message ends
+    before the field does.
 
     Args:
         payload: The message with its header of four bytes.

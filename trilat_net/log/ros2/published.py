@@ -41,16 +41,17 @@ if TYPE_CHECKING:
     from ...log import Log
 
 Topics = dict[str, Ros2Channel]
-"""Descriptions of the topics of one site, by their names within trilat-net."""
+"""Maps the trilat-net name of each topic of one site to its description."""
 
 IsWanted = Callable[[str], bool]
-"""Function that returns True if the message of a topic is needed, by its name in trilat-net."""
+"""Function that takes the trilat-net name of a topic and returns True if its message is needed.
+"""
 
 _OK = 0
 _WARNING = 1
 _ERROR = 2
 _LEVELS = {"run": _OK, "fault": _ERROR, "diverged": _ERROR}
-"""Levels in `/diagnostics` by mode. Other modes have the level `_WARNING`."""
+"""Maps modes to levels in `/diagnostics`. Other modes have the level `_WARNING`."""
 _QUATERNION_TEXT = "unit quaternion, each nearest to the one before"
 _NO_ROTATION = (0.0, 0.0, 0.0)
 """Angular part of a velocity or wrench, if the sites share only positions."""
@@ -65,7 +66,9 @@ COMMON_TOPICS = {
     FRAMES_TOPIC: Ros2Channel(cdr.TRANSFORMS, _FRAMES_METADATA),
     DIAGNOSTICS: Ros2Channel(cdr.DIAGNOSTICS, _DIAGNOSTICS_METADATA),
 }
-"""Topics that all sessions have in common, by their names without the leading "/"."""
+"""Maps the names, without the leading "/", of topics common to all sessions to their
+descriptions.
+"""
 
 
 _INDEX_ERRORS = (
@@ -76,7 +79,7 @@ _INDEX_ERRORS = (
     ValueError,
     OverflowError,
 )
-"""Errors of the library `mcap` for a file whose index cannot be read."""
+"""Errors raised by the library `mcap` for a file whose index cannot be read."""
 
 
 class Ros2Topics(dict[str, Ros2Channel]):
@@ -211,13 +214,13 @@ class SiteMessages:
         self.topics = self._list_topics(peers)
 
     def _list_topics(self, peers: Sequence[str]) -> Topics:
-        """Lists the topics of the site (arm controller), by their names in trilat-net.
+        """Maps the trilat-net name of each topic of the site to its description.
 
         The topics of the reference depend on whether the sites exchange joint angles or the
         pose of the end effector.
 
         Args:
-            peers: Names of the other sites.
+            peers: Names of the peers.
         """
         channels = self._channels
         topics: Topics = {}
@@ -249,7 +252,7 @@ class SiteMessages:
         return topics | self._list_array_topics()
 
     def _describe_pose(self, subject: str) -> Ros2Channel:
-        """Returns a topic with poses of the end effector or of its reference."""
+        """Describes a topic with poses of the end effector or of its reference."""
         about = {
             "content": f"pose of {subject}",
             "unit": "m",
@@ -259,7 +262,7 @@ class SiteMessages:
         return Ros2Channel(cdr.POSE, about)
 
     def _describe_twist(self, subject: str) -> Ros2Channel:
-        """Returns a topic with velocities of the end effector or of its reference."""
+        """Describes a topic with velocities of the end effector or of its reference."""
         about = {
             "content": f"velocity of {subject}",
             "unit": "m/s, rad/s",
@@ -336,8 +339,7 @@ class SiteMessages:
     ) -> NamedMessages:
         """Encodes the reference of the joints, and the pose of the end effector.
 
-        This applies if the sites (arm controllers) share joint angles. The pose is computed
-        from them.
+        Used if the sites share joint angles. The pose is computed from them.
         """
         if is_wanted("reference"):
             data = self._pack_reference(stamp_ns, record.q_des, record.qd_des)
@@ -350,8 +352,8 @@ class SiteMessages:
     ) -> NamedMessages:
         """Encodes the motion of the end effector, its reference, and the wrench on it.
 
-        This applies if the sites share the position or pose of the end effector instead of the
-        joint positions. The task scale enlarges or reduces the motion that the sites share:
+        Used if the sites share the position or pose of the end effector instead of the joint
+        positions. The task scale enlarges or reduces the motion that the sites share:
 
             shared motion = scale * motion of this arm.
 
@@ -361,12 +363,12 @@ class SiteMessages:
 
         Args:
             record: The record of one tick of the site.
-            stamp_ns: Time of the record, in Unix time, in ns.
+            stamp_ns: Time of the record in Unix time, in ns.
             is_wanted: Function that returns True if a program has subscribed to the topic with
-                a name.
+                a given name.
 
         Yields:
-            The name of each wanted topic in trilat-net, and the message.
+            The trilat-net name of each wanted topic, and the message.
         """
         motions = [
             ("tip", record.x, record.xd),
@@ -400,7 +402,7 @@ class SiteMessages:
         linear: Sequence[float],
         angular: Sequence[float],
     ) -> bytes:
-        """Encodes the linear and the angular part of a quantity in the frame of the site."""
+        """Encodes the linear and angular parts of a quantity in the frame of the site."""
         return cdr.pack_frame_vectors(stamp_ns, self.frame, *linear, *angular)
 
     def _pack_pose(
@@ -414,10 +416,9 @@ class SiteMessages:
 
         Args:
             topic: Name of the topic. Successive quaternions of a topic do not jump.
-            record: The record (result of a control period).
-            pose: The pose that the sites (arm controllers) exchange. Empty if they exchange
-                joint angles.
-            stamp_ns: Time of the message, in Unix time, in ns.
+            record: The record.
+            pose: The pose that the sites exchange. Empty if they exchange joint angles.
+            stamp_ns: Time of the message in Unix time, in ns.
         """
         rotation_vector = self._compute_rotation_vector(record, pose)
         quaternion = compute_quaternion(rotation_vector)
@@ -428,13 +429,11 @@ class SiteMessages:
         return self._pack_vectors(stamp_ns, position, aligned_quaternion)
 
     def _compute_position(self, record: State, pose: Sequence[float]) -> Sequence[float]:
-        """Returns the position of the arm's end effector from a record, in m.
+        """Returns the position of the end effector in a record, in m.
 
         Args:
-            record: The record (result of a control period), whose joint angles are used if
-                there is no pose.
-            pose: The pose that the sites (arm controllers) exchange. Empty if they exchange
-                joint angles.
+            record: The record. Its joint angles are used if there is no pose.
+            pose: The pose that the sites exchange. Empty if they exchange joint angles.
         """
         if pose:
             coordinates = pose[:POSITION]
@@ -455,21 +454,20 @@ class SiteMessages:
         return self._arm.end_effector_orientation(record.q)
 
     def _pack_arrays(self, record: State, is_wanted: IsWanted) -> NamedMessages:
-        """Encodes the numbers of a record that have no standard ROS type, as labelled arrays.
+        """Encodes the quantities of a record with no standard ROS type, as labelled arrays.
 
         These are the error e = q - q_des, and the arrays that viewers receive at a reduced rate
-        ("slow"): the exogenous torque, the estimated parameters, the numbers that the control
-        law sends, and the mode. In `pack_slow_arrays`, the slow arrays are encoded together,
-        and only the wanted ones are yielded.
+        ("slow"): the exogenous torque, the estimated parameters, the vectors that the control
+        law sends, and the mode. `pack_slow_arrays` encodes the slow arrays together, and only
+        the wanted ones are yielded.
 
         Args:
-            record: The record (result of a control period) of one tick (control period) of the
-                site.
+            record: The record of one tick of the site.
             is_wanted: Function that returns True if a program has subscribed to the topic with
-                a name.
+                a given name.
 
         Yields:
-            The name of each wanted topic in trilat-net, and the message.
+            The trilat-net name of each wanted topic, and the message.
         """
         channels = self._channels
         array_topics = [_name_array_topic(name) for name in channels.record_arrays]
@@ -524,12 +522,12 @@ class SiteMessages:
 
 
 def _name_array_topic(name: str) -> str:
-    """Returns the topic of an array. The topic `mode` already contains the mode as a string."""
+    """Returns the topic of an array. The topic `mode` already holds the mode as a string."""
     return "mode_number" if name == "mode" else name
 
 
 def _fill_rotation(values: Sequence[float]) -> list[float]:
-    """Returns the angular part of a velocity or wrench. It is zero if there is none."""
+    """Returns the angular part of a velocity or wrench, or zeros if there is none."""
     angular = [*values[POSITION:], *_NO_ROTATION]
     return angular[:POSITION]
 

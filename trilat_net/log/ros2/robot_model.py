@@ -28,14 +28,14 @@ SPACING_M = 1.5
 _RADIUS_M = 0.035
 """Radius of the plain shape of a link, in m."""
 _SHAPE_COLOURS = ("0 0.27 0.53 1", "0.73 0.33 0.4 1", "0.87 0.67 0.2 1", "0.4 0.4 0.4 1")
-"""Colours of the plain shapes, site by site: red, green, blue and opacity, from 0 to 1."""
+"""Colours of the plain shapes, one per site: red, green, blue and opacity, from 0 to 1."""
 
 Vector = tuple[float, float, float]
 """A vector x, y, z."""
 Quaternion = tuple[float, float, float, float]
 """A unit quaternion x, y, z, w."""
 Transform = tuple[Vector, Quaternion]
-"""The pose of a frame in its parent: origin in m, and rotation."""
+"""The pose of a frame relative to its parent: origin in m, and rotation."""
 FramePose = tuple[Sequence[float], Sequence[float]]
 """The same pose as two sequences: origin in m, and quaternion x, y, z, w."""
 
@@ -52,11 +52,11 @@ class _JointFrame(NamedTuple):
 
     Attributes:
         origin_m: Origin of the link's frame in the parent link's frame, in m.
-        rotation: Rotation of the link's frame at the joint position 0.
+        rotation: Rotation of the link's frame at joint position 0.
         axis: Axis of the joint in the frame of the link, a unit vector.
-        is_prismatic: True if the joint slides along its axis instead of turning about it.
-        q_index: Index of the joint's position in q. It is -1 for a joint that does not move,
-            such as a finger of a gripper.
+        is_prismatic: True if the joint slides along its axis instead of rotating about it.
+        q_index: Index of the joint's position in q, or -1 for a joint that does not move, such
+            as a finger of a gripper.
     """
 
     origin_m: Vector
@@ -124,7 +124,7 @@ def rotate_vector(rotation: Quaternion, vector: Vector) -> Vector:
 
 
 def _rotate_about(axis: Vector, angle: float) -> Quaternion:
-    """Returns the quaternion of a rotation about a unit vector by an angle in rad."""
+    """Returns the quaternion for a rotation about a unit vector by an angle in rad."""
     half_angle = angle / 2.0
     sine = math.sin(half_angle)
     cosine = math.cos(half_angle)
@@ -147,7 +147,7 @@ def compute_quaternion(rotation_vector: Vector) -> Quaternion:
 
 
 def _rotate_upright(down: Sequence[float]) -> Quaternion:
-    """Returns the shortest rotation that turns a direction to -z.
+    """Returns the shortest rotation that takes a given direction to -z.
 
     Args:
         down: The direction of gravity. It need not be a unit vector.
@@ -169,7 +169,7 @@ def _rotate_upright(down: Sequence[float]) -> Quaternion:
 
 
 def _convert_rpy(rpy: Sequence[float]) -> Quaternion:
-    """Returns the rotation by roll, pitch and yaw in rad, about the fixed x, y and z axes."""
+    """Returns the rotation for roll, pitch and yaw in rad, about the fixed x, y and z axes."""
     roll, pitch, yaw = rpy
     yaw_rotation = _rotate_about(_Z_AXIS, yaw)
     pitch_rotation = _rotate_about(_Y_AXIS, pitch)
@@ -179,7 +179,8 @@ def _convert_rpy(rpy: Sequence[float]) -> Quaternion:
 
 
 _PLANAR = (DEFINITIONS / "planar.urdf").read_text(encoding="utf-8")
-"""URDF of the planar arm, with placeholders for names of joints and lengths of links."""
+"""URDF of the planar arm, with placeholders for the names of joints and the lengths of links.
+"""
 
 
 def name_ros_joints(scenario: Scenario, site: str) -> list[str]:
@@ -313,7 +314,7 @@ def _list_joints(root: Element, base: str) -> list[Element]:
     """Lists the joints of a URDF below a link, parents before children.
 
     Args:
-        root: The URDF.
+        root: Root element of the URDF.
         base: Name of the link.
     """
     joints_of_parent: dict[str, list[Element]] = {}
@@ -346,16 +347,16 @@ def _get_link(joint: Element, end: str) -> str:
 
 
 def _parse_vector(element: Element | None, key: str, default: Vector) -> Vector:
-    """Parses an attribute with three numbers.
+    """Parses an attribute that contains three numbers.
 
-    The default is returned if the attribute does not contain three finite numbers. This is
-    possible only in branches of the URDF that are not part of the arm, because `read_urdf`
-    checks the arm.
+    The default is returned if the attribute does not contain three finite numbers. This can
+    happen only in branches of the URDF that are not part of the arm, because `read_urdf` checks
+    the arm.
 
     Args:
         element: Element of the URDF. None if it is absent.
         key: Name of the attribute.
-        default: The default.
+        default: Value to return if the attribute is invalid.
     """
     if element is None:
         return default
@@ -396,13 +397,13 @@ def _read_joint_frame(joint: Element, joint_names: Sequence[str]) -> _JointFrame
 def _describe_robot(root: Element, site: str, site_number: int) -> str:
     """Returns the URDF of a site's arm as a string for viewers.
 
-    The site's name is put in front of the names of the links, so that several arms with the
-    same URDF can be shown together. Links get plain shapes if the URDF contains none, because
-    the arm would otherwise be invisible.
+    The names of the links are prefixed with the name of the site, so that several arms with the
+    same URDF can be shown together. If the URDF contains no shapes, plain shapes are added to
+    the links, because the arm would otherwise be invisible.
 
     Args:
-        root: The URDF, which is changed.
-        site: Name of the site (arm controller).
+        root: Root element of the URDF, which is modified.
+        site: Name of the site.
         site_number: Index of the site, which determines the colour.
     """
     has_shapes = root.find("link/visual") is not None
@@ -443,7 +444,7 @@ def _add_shape(link: Element, end_m: Vector, colour: str, site: str) -> None:
         link: The link's element in the URDF.
         end_m: The point in the frame of the link, in m.
         colour: Red, green, blue and opacity, from 0 to 1.
-        site: Name of the site (arm controller), which makes the name of the material unique.
+        site: Name of the site, which makes the name of the material unique.
     """
     x, y, z = end_m
     length_m = math.hypot(x, y, z)

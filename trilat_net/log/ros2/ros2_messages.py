@@ -29,16 +29,16 @@ from . import cdr
 from .robot_model import RobotModel, name_ros_joints
 
 EVENTS = "events"
-"""Channel of the session's events as plain text."""
+"""Channel with the events of the session as plain text."""
 LINES = "log"
-"""Channel of the session's events as log lines, with time and level."""
+"""Channel with the events of the session as log lines, with time and level."""
 SENT_PREFIX = "sent_"
-"""Prefix of the arrays with the vectors that a law sends: "sent_E", "sent_u_to_m2"."""
+"""Prefix of arrays for the vectors that a law sends: "sent_E", "sent_u_to_m2"."""
 
 ROBOT = "robot_description"
-"""Channel with the URDF of an arm."""
+"""Channel that contains the URDF of an arm."""
 FRAMES = "tf"
-"""Channel with the frames of an arm's links."""
+"""Channel that contains the frames of an arm's links."""
 
 NamedMessages = Iterator[tuple[str, bytes]]
 """Encoded messages, each with the name of its channel or topic."""
@@ -73,7 +73,7 @@ class Ros2Channel(NamedTuple):
 
 
 Ros2Channels = Mapping[str, Ros2Channel]
-"""Channels of standard ROS 2 messages, by topic."""
+"""Maps topics to channels of standard ROS 2 messages."""
 
 
 class StandardChannels:
@@ -96,7 +96,7 @@ class StandardChannels:
     def __getitem__(self, topic: str) -> int:
         """Returns the number of a topic's channel in an MCAP file.
 
-        The channel is registered in the file at the first access, so that the file declares no
+        The channel is registered in the file on first access, so that the file declares no
         channel without messages.
         """
         if topic not in self._channel_numbers:
@@ -109,7 +109,7 @@ class StandardChannels:
         return self._channel_numbers[topic]
 
     def _get_schema_number(self, kind: str) -> int:
-        """Returns the number of a message type, and registers the type if necessary."""
+        """Returns the number of a message type, registering the type if necessary."""
         if kind not in self._schema_numbers:
             definition = cdr.ROS2_SCHEMAS[kind]
             schema_number = self._file.register_schema(kind, cdr.SCHEMA_ENCODING, definition)
@@ -122,7 +122,7 @@ SESSION_CHANNELS = {
     LINES: Ros2Channel(cdr.LOG, {"content": "the same as lines of a log"}),
 }
 ROBOT_METADATA = {"content": "URDF, with links named after their site"}
-"""Metadata of a channel with the URDF of an arm."""
+"""Metadata of a channel that contains the URDF of an arm."""
 _FRAMES_METADATA = {
     "content": "frames of the links",
     "unit": "m",
@@ -143,9 +143,9 @@ _LEVELS = {
     "refused": cdr.RosLogLevel.WARN,
     "clock fault": cdr.RosLogLevel.WARN,
 }
-"""Level of an event in the log of ROS by its kind. Other kinds have the level INFO."""
+"""Maps the kind of an event to its level in the ROS log. Other kinds have the level INFO."""
 NUMBERS_BY_MODE_WORD = {word: float(mode) for mode, word in MODE_WORDS.items()}
-"""Number of each mode in messages for viewers, by the name of the mode in records."""
+"""Maps the name of each mode in records to its number in messages for viewers."""
 _MODE_NUMBERS: dict[Mode | str, float] = {mode: float(mode) for mode in MODE_WORDS}
 _MODE_NUMBERS.update(NUMBERS_BY_MODE_WORD)
 """Number of a mode, which is a `Mode` in a `TickRecord` and a word in a `State`."""
@@ -172,21 +172,21 @@ def pack_event(event: Event, stamp_ns: int) -> NamedMessages:
 class _ArrayChannel:
     """A channel for viewers whose messages are arrays of a fixed shape.
 
-    The messages have the ROS type `std_msgs/msg/Float64MultiArray`.
+    The messages are of ROS type `std_msgs/msg/Float64MultiArray`.
 
     Args:
         content: Description of the numbers.
         unit: Unit of the numbers.
-        entry_names: For each axis of the array, the names of the entries along it.
+        entry_names: For each dimension of the array, the names of the entries along it.
 
     Attributes:
         channel: Description of the channel, with its metadata.
         size: Number of entries of an array.
-        pack: Function that encodes an array, from its numbers row by row.
+        pack: Function that encodes an array, given its entries row by row.
     """
 
     def __init__(self, content: str, unit: str, *entry_names: Sequence[str]) -> None:
-        """Describes a channel of number arrays, and prepares the encoding of its messages."""
+        """Describes a channel of arrays, and prepares the encoding of its messages."""
         joined_names = [" ".join(axis_entries) for axis_entries in entry_names]
         metadata = {
             "content": content,
@@ -205,7 +205,7 @@ class _ArrayChannel:
 
 
 ArrayChannels = dict[str, _ArrayChannel]
-"""Array channels by the last part of their topic."""
+"""Maps the last part of the topic of each array channel to the channel."""
 
 
 class Ros2SiteChannels:
@@ -230,7 +230,7 @@ class Ros2SiteChannels:
     """
 
     def __init__(self, scenario: Scenario, site: str) -> None:
-        """Describes all ROS 2 channels of a site (arm controller) and of its network links."""
+        """Describes all ROS 2 channels of a site and of its network links."""
         arm = scenario.arms[site]
         self._arm = arm
         self._peers = scenario.peers(site)
@@ -267,7 +267,7 @@ class Ros2SiteChannels:
         }
 
     def _make_error_array(self) -> _ArrayChannel:
-        """Returns the array channel of the synchronisation error of the pose or the joints."""
+        """Returns the array channel for the synchronisation error of the pose or the joints."""
         if self._arm.shares_pose:
             shared = self._arm.counts.shared
             axes = TASK_AXES[:shared]
@@ -277,7 +277,7 @@ class Ros2SiteChannels:
         return _ArrayChannel("q - q_des", units, labels)
 
     def _make_estimate_array(self) -> _ArrayChannel:
-        """Returns the array of the estimated parameters of the arm."""
+        """Returns the array channel for the estimated parameters of the arm."""
         labels = _make_labels(name for name, _ in self._arm.parameters)
         if self._arm.chain is not None:
             return _ArrayChannel("estimate", "kg, kg m, kg m^2", labels)
@@ -285,7 +285,7 @@ class Ros2SiteChannels:
         return _ArrayChannel("estimate of Eq. (24)", units, labels)
 
     def _make_statistics_arrays(self) -> ArrayChannels:
-        """Returns the arrays that are computed from the statistics of links."""
+        """Returns the array channels that are computed from link statistics."""
         peers = self._peers
         return {
             "link_age": _ArrayChannel("age of the sample in use", "ms", peers),
@@ -413,7 +413,7 @@ class Ros2SiteChannels:
 
 
 def _make_labels(names: Iterable[str]) -> list[str]:
-    """Returns names with underscores in place of spaces, because spaces separate labels."""
+    """Replaces spaces in names with underscores, because spaces separate labels."""
     labels: list[str] = []
     for name in names:
         parts = name.split()
@@ -422,10 +422,10 @@ def _make_labels(names: Iterable[str]) -> list[str]:
 
 
 def _make_sent_arrays(scenario: Scenario, site: str) -> ArrayChannels:
-    """Returns an array channel for each vector that a site's control law sends.
+    """Returns one array channel for each vector that a site's control law sends.
 
-    They have the order of the vectors in a record (result of a control period). A vector for a
-    single receiver (peer) has the name of the receiver in its topic.
+    The channels are in the order of the vectors in a record. The topic of a vector for a single
+    receiver (peer) contains the name of the receiver.
     """
     arrays: ArrayChannels = {}
     peers = scenario.peers(site)
@@ -446,12 +446,12 @@ def _make_sent_arrays(scenario: Scenario, site: str) -> ArrayChannels:
 
 
 def _convert_to_ms(us: int) -> float:
-    """Converts a time to ms. The value -1, a time that was not measured, becomes NaN."""
+    """Converts a time from us to ms. -1, which represents a missing value, becomes NaN."""
     return us / 1e3 if us != -1 else math.nan
 
 
 Record = State | TickRecord
-"""A record as a site publishes it, or as the kernel returns it."""
+"""A record as published by a site or as returned by the kernel."""
 SignalRow = Sequence[float]
 """The values of all curves at one time, or the values of one curve at all times."""
 
@@ -504,7 +504,7 @@ def stack_signals(records: Sequence[Record]) -> list[SignalRow]:
 
 
 def _transpose(rows: Iterable[SignalRow]) -> list[SignalRow]:
-    """Returns the columns of a table as rows: one sequence per curve, not per record."""
+    """Transposes a table, returning one sequence per curve instead of one per record."""
     return [*zip(*rows, strict=True)]
 
 
@@ -521,9 +521,9 @@ def _compute_errors(
 
 
 def _list_modes(records: Sequence[Record]) -> list[float]:
-    """Returns the operating mode of each record as a number, or one number if all are equal.
+    """Returns the mode of each record as a number, or one number if all are equal.
 
-    Equal modes have equal extremes, for which a single number suffices.
+    If all modes are equal, their extremes are equal too, and a single number suffices.
     """
     modes = [record.mode for record in records]
     first_mode = modes[0]

@@ -27,7 +27,7 @@ from .robot_model import SPACING_M, WORLD
 from .ros2_messages import Ros2Channel
 
 _SUFFIX = ".rviz"
-"""Suffix of the templates, and of configurations."""
+"""Suffix of the file names of templates and configurations."""
 
 
 def write_rviz_config(log: Path, *, force: bool = False) -> Path:
@@ -93,10 +93,10 @@ def build_rviz_config(topics: Mapping[str, Ros2Channel]) -> str:
 
 
 def _fill_template(template: str, **values: str) -> str:
-    """Returns a text in which placeholders are replaced by values.
+    """Returns the text of a template with its placeholders replaced.
 
     Args:
-        template: Name of the file of the template, without its suffix.
+        template: Name of the template file, without its suffix.
         **values: Value of each placeholder.
     """
     text = (DEFINITIONS / f"{template}{_SUFFIX}").read_text(encoding="utf-8")

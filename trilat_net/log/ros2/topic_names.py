@@ -52,15 +52,17 @@ TOPICS = {
     "robot_states": ("robot/joint_states", "robot/measured_js"),
     "robot_commands": ("robot/commands", "robot/commands"),
 }
-"""Name of each topic below `/<session>/<site>` in each of `NAMINGS`, by its name in trilat-net.
+"""Maps the trilat-net name of each topic to its name below `/<session>/<site>` in each of
+`NAMINGS`.
 
 CRISP is a set of ROS 2 controllers. CRTK is the convention of the da Vinci Research Kit. A
-vector that a control law sends has the same name in both: "sent_" and the name of the vector.
+vector that a control law sends has the same name in both: "sent_" followed by the name of the
+vector.
 """
 FRAMES_TOPIC = "tf"
-"""Topic with the poses of all links, under the name that tools of ROS expect."""
+"""Topic for the poses of all links, with the name that ROS tools expect."""
 DIAGNOSTICS = "diagnostics"
-"""Topic with the status of all sites, under the name that tools of ROS expect."""
+"""Topic for the status of all sites, with the name that ROS tools expect."""
 
 
 class RobotTable(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -197,7 +199,7 @@ def _list_names(naming: str) -> dict[str, str]:
 
 
 def _read_names_file(source: str) -> TopicTable:
-    """Reads a user's file with names of ROS 2 topics and with settings of robots.
+    """Reads a user's file with names of ROS 2 topics and settings of robots.
 
     Raises:
         UsageError: The file cannot be read, or is not valid TOML.
@@ -225,11 +227,11 @@ def _read_names_file(source: str) -> TopicTable:
 
 
 def _check_names(source: str, names: Mapping[str, object]) -> None:
-    """Checks that the topics that a user renamed exist, and that ROS 2 permits the new names.
+    """Raises UsageError if a renamed topic does not exist or its new name is invalid in ROS 2.
 
     Args:
         source: Name of the file, for the error message.
-        names: Names in ROS 2, by the name in trilat-net.
+        names: Maps names in trilat-net to names in ROS 2.
 
     Raises:
         UsageError: A topic does not exist, or a name is not valid.
@@ -245,7 +247,7 @@ def _check_names(source: str, names: Mapping[str, object]) -> None:
 
 
 def _check_unique_names(source: str, table: TopicTable) -> None:
-    """Checks that no two quantities have the same topic name in ROS 2.
+    """Raises UsageError if two quantities have the same topic name in ROS 2.
 
     Args:
         source: Name of the file, for the error message.

@@ -32,32 +32,35 @@ from .ros2_messages import Record, Ros2Channel, SignalRow
 SLOW_VIZ_HZ = 10.0
 """Rate of the messages with exogenous torque, estimate and mode, in Hz.
 
-If there is a message for every record with the joints, the same applies to these channels.
+If every record results in a message with the joints, the same applies to these channels.
 """
 MAX_PENDING_BYTES = 1 << 13
-"""Largest size of a site's messages that are not written yet, in bytes, for two joints."""
+"""Maximum size of a site's messages that are still to be written, in bytes, for two joints."""
 SENT_PENDING_BYTES = 512
 """Additional size for each number that the site's control law sends, in bytes. Each number may
 be a separate array.
 """
 
 StampedRow = tuple[int, SignalRow]
-"""Time in Unix ns, and the values of all curves at this time."""
+"""Time in Unix time, in ns, and the values of all curves at this time."""
 WriteRow = Callable[[int, SignalRow, int], None]
-"""Function that writes the values of all curves at one time: time, values, arrival time."""
+"""Function that writes the values of all curves at one time, given the time, the values and the
+arrival time.
+"""
 
 _get_tick = attrgetter("tick")
 
 
 class _BucketOutput:
-    """Writes two messages for each time interval: at its end, and half an interval later.
+    """Writes two messages per time interval: at its end, and half an interval later.
 
     A message contains the values of all curves of a viewer at one time (a row). An interval is
     called a bucket. The second row is written by `flush`, or before the first row of the next
     bucket.
 
     Args:
-        write: Function that writes a row: time, values, and arrival time in Unix ns.
+        write: Function that writes a row, given its time, its values, and the arrival time in
+            Unix time, in ns.
     """
 
     def __init__(self, write: WriteRow) -> None:
@@ -106,22 +109,21 @@ class _BucketOutput:
 
 
 class _SiteBuckets:
-    """The buckets of one site (arm controller).
+    """The buckets of one site.
 
-    A fast bucket contains records (results of control periods), and becomes two messages with
-    the joints. A slow bucket contains the rows of several fast buckets, and becomes two
-    messages with the other curves.
+    A fast bucket contains records, and becomes two messages with the joints. A slow bucket
+    contains the rows of several fast buckets, and becomes two messages with the other curves.
 
     Args:
         scenario: Scenario of the session.
         site: Name of the site.
         views_hz: Rate of the messages with the joints, in Hz.
-        epoch_unix_ns: Unix time of tick 0, in ns. It is 0 in virtual time.
+        epoch_unix_ns: Unix time of tick 0, in ns; 0 in virtual time.
         put: Function that writes a message.
 
     Attributes:
-        channels: Channels of the site, by topic.
-        max_pending_bytes: Largest size of the messages that are not written yet, in bytes.
+        channels: Maps the topic of each channel of the site to its description.
+        max_pending_bytes: Maximum size of the messages that are still to be written, in bytes.
     """
 
     def __init__(
@@ -194,11 +196,11 @@ class _SiteBuckets:
         file. The file itself is written before the first frames.
 
         Args:
-            stamp_ns: Time of the values, in Unix time, in ns.
+            stamp_ns: Time of the values in Unix time, in ns.
             row: Values of all curves at this time, see `ros2_messages.stack_signals`. For n
                 joints it begins with the positions, the references, the velocities and the
-                efforts (torques), n numbers each.
-            log_ns: Arrival time that the log states for the messages, in Unix time, in ns.
+                efforts (torques), each with n entries.
+            log_ns: Arrival time to store in the log with the messages, in Unix time, in ns.
         """
         n = self._joint_count
         positions_and_references = row[: 2 * n]
@@ -231,14 +233,14 @@ class _SiteBuckets:
     def _write_slow(self, stamp_ns: int, row: SignalRow, log_ns: int) -> None:
         """Writes the quantities that viewers need less often than the joints.
 
-        They are the external torque, the estimate of the arm, the numbers that the law sends,
+        These are the external torque, the estimate of the arm, the vectors that the law sends,
         and the mode.
         """
         for name, data in self._site_channels.pack_slow_arrays(row):
             self._write_message(name, data, stamp_ns, log_ns)
 
     def _write_message(self, name: str, data: bytes, stamp_ns: int, log_ns: int) -> None:
-        """Writes a message to the channel with a name, the last part of the topic."""
+        """Writes a message to the channel whose topic ends in a given name."""
         topic = self._topics[name]
         self._put(topic, data, stamp_ns, log_ns)
 
@@ -273,10 +275,10 @@ class _SiteBuckets:
         self._records.append(record)
 
     def _add_late_record(self, record: Record, log_ns: int) -> None:
-        """Keeps a record whose bucket was written already, because the record arrived late.
+        """Stores a record that arrived after its bucket was written.
 
-        Late records (results of control periods) of one bucket are collected, and written as
-        soon as a late record of another bucket arrives.
+        Late records of one bucket are collected, and written as soon as a late record of
+        another bucket arrives.
         """
         bucket = record.tick // self._bucket_ticks
         if self._late_records:
@@ -325,17 +327,16 @@ class _SiteBuckets:
     def _close_bucket(self, next_bucket: int, log_ns: int) -> None:
         """Reduces the records of the open bucket to two messages, and opens another bucket.
 
-        The first message is written now, and the second one half a bucket later
-        (`_BucketOutput`). Records (results of control periods) of older buckets that arrived
-        late are written first.
+        The first message is written now, and the second half a bucket later (`_BucketOutput`).
+        Late records of older buckets are written first.
 
         The slow curves, such as the estimate, are reduced a second time: a slow bucket consists
         of `_slow_ratio` fast buckets, and contains their extremes. It also becomes two
-        messages, the first one at its end and the second one half a slow bucket later.
+        messages, the first written at its end and the second half a slow bucket later.
 
         Args:
-            next_bucket: Number of the bucket that is opened, counted from tick 0.
-            log_ns: Arrival time that the log states for the messages, in Unix time, in ns.
+            next_bucket: Number of the bucket to open, counted from tick 0.
+            log_ns: Arrival time to store in the log with the messages, in Unix time, in ns.
         """
         self._flush_late_records(log_ns)
         if self._records:
@@ -364,10 +365,10 @@ class _SiteBuckets:
         self._first_tick = self._bucket_ticks * next_bucket
 
     def _flush_late_records(self, log_ns: int) -> None:
-        """Writes for viewers the records that arrived after their interval was written.
+        """Writes the records that arrived after their bucket was written.
 
-        As for other intervals (buckets), the minimum and the maximum of each curve are written,
-        here on the fast and on the slow channels at once.
+        As for other buckets, the minimum and the maximum of each curve are written, here to the
+        fast and slow channels at once.
         """
         if self._late_records:
             rows = self._decimate(self._late_records)
@@ -377,10 +378,10 @@ class _SiteBuckets:
             self._late_records = []
 
     def _select_slow_columns(self, rows: Iterable[StampedRow]) -> list[StampedRow]:
-        """Returns the values of curves that need fewer points per second than the joint angles.
+        """Selects the values of curves that need fewer points per second than the joint angles.
 
         Args:
-            rows: Values of all curves at some times.
+            rows: Values of all curves, one row per time.
         """
         slow_row = self._site_channels.slow_row
         return [(stamp_ns, row[slow_row]) for stamp_ns, row in rows]
@@ -388,13 +389,12 @@ class _SiteBuckets:
     def _decimate(self, records: list[Record]) -> list[StampedRow]:
         """Reduces the records of a bucket to the minimum and the maximum of each curve.
 
-        A bucket is a time interval. Its two rows get the times at the beginning and in the
-        middle of the interval, so that the rows of successive buckets are evenly spaced. The
-        extremes of different curves occur at different times. Therefore no exact time exists.
+        A bucket is a time interval. The extremes of different curves occur at different times,
+        so the two rows have no exact time. They are stamped with the beginning and the middle
+        of the interval, which spaces the rows of successive buckets evenly.
 
         Args:
-            records: The records (results of control periods) of the bucket, at least one. They
-                are sorted by time in place.
+            records: The records of the bucket, at least one. Sorted by time in place.
 
         Returns:
             Two rows with their times, or one row for a single record.
@@ -417,16 +417,16 @@ class _SiteBuckets:
 def _stamp_extremes(stamps_ns: Sequence[int], curves: Iterable[SignalRow]) -> list[StampedRow]:
     """Reduces the curves of a time interval to two rows: the extremes of each curve.
 
-    A row contains one value of each curve at one time. The first row contains the extreme of
-    each curve (minimum or maximum) that occurs first, and the second row the other extreme.
+    A row contains one value per curve. The first row contains the extreme of each curve
+    (minimum or maximum) that occurs first, and the second row the other extreme.
 
-    The extremes of different curves occur at different times. Therefore no exact time of a row
-    exists. The rows get the times at the beginning and in the middle of the interval instead,
-    so that the rows of successive intervals are evenly spaced.
+    The extremes of different curves occur at different times, so the rows have no exact time.
+    They are stamped with the beginning and the middle of the interval, which spaces the rows of
+    successive intervals evenly.
 
     Args:
-        stamps_ns: Times of the values in the interval, in Unix time, in ns. At least one.
-        curves: For each curve its values in the interval, in the order of time.
+        stamps_ns: Times of the values in the interval in Unix time, in ns, at least one.
+        curves: For each curve its values in the interval, in chronological order.
 
     Returns:
         The two rows, each with its time. Only one row if there is a single time.
@@ -469,7 +469,7 @@ class VizChannels:
         views_hz: float,
         put: PutMessage,
     ) -> None:
-        """Prepares channels for viewers such as Foxglove. No message is written yet."""
+        """Prepares the channels for viewers such as Foxglove. No message is written yet."""
         self._epoch_unix_ns = epoch_unix_ns
         self._put = put
 
@@ -502,8 +502,8 @@ class VizChannels:
     def _add_event(self, event: Event, log_ns: int) -> None:
         """Writes an event of the session for viewers, as text and as a line for the ROS log.
 
-        An event from before the start of the session states no time. Its arrival time is used
-        instead.
+        An event from before the start of the session states no time, so its arrival time is
+        used.
         """
         stamp_ns = log_ns
         if event.t_ns >= 0:
