@@ -410,7 +410,7 @@ class ContentCheck:
             expected += count_skipped_ticks(message.cmd)
         if number != expected:
             raise UnreadableRecord(
-                f"message {number} of {topic} stands where message {expected} was expected"
+                f"message {number} of {topic} was found where message {expected} was expected"
             )
 
     def _check_tick(self, topic: str, record: State) -> None:

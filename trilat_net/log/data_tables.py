@@ -78,7 +78,7 @@ _POSES = ("q_des", "x")
 """Vectors in `_TASK_VECTORS` that contain an orientation. The others contain an angular
 velocity or a torque.
 """
-_STEADY_QUATERNION = "a unit quaternion w, x, y, z, each nearest to the one before"
+_STEADY_QUATERNION = "a unit quaternion w, x, y, z, with signs that avoid jumps"
 """Text that is part of the meaning of orientation columns."""
 
 
@@ -291,7 +291,7 @@ class Table:
         names = np.array(site.peers, dtype=np.object_)[index]
         delay = "the age of its stamp; in virtual time every sample arrives at the next tick"
         if live:
-            delay = "its one-way delay, by the offset of the clocks in force"
+            delay = "its one-way delay, computed with the clock offset in use"
         columns = (
             *_make_time_columns(
                 site.tick[row], site.t_s[row], site.log_time_ns[row], site.publish_time_ns[row]
@@ -300,14 +300,14 @@ class Table:
                 name="peer",
                 values=names,
                 unit="",
-                meaning="whose sample came",
+                meaning="peer that sent the sample",
                 source="rx[][0]",
             ),
             Column(
                 name="sample_tick",
                 values=entries[:, 1].copy(),
                 unit="tick",
-                meaning="its tick, at the peer's rate",
+                meaning="tick of the sample, at the peer's rate",
                 source="rx[][1]",
             ),
             Column(
@@ -321,7 +321,7 @@ class Table:
         return cls(
             site.name,
             "arrivals",
-            f"a sample that {site.name} took in, by the tick that did",
+            f"a sample that {site.name} received, with the tick that took it in",
             columns,
         )
 
@@ -404,7 +404,7 @@ class Table:
             columns.append(
                 Column(name=field, values=values, unit=unit, meaning=text, source=field)
             )
-        return cls(EVENTS_TABLE, "", "something that happened once", tuple(columns))
+        return cls(EVENTS_TABLE, "", "an event of the session", tuple(columns))
 
 
 # An entry of the section "Attributes:" in a docstring: name of the field and its meaning.
@@ -415,13 +415,13 @@ _UNITS_BY_ENDING = {"ns": "ns", "us": "us", "ppb": "ns/s"}
 _COMPLETE_TEXTS = {
     "qd_des": "derivative of the reference, Eq. (6)",
     "delay_max_us": (
-        "per peer, largest one-way delay since the last statistics; -1 where nothing came"
+        "per peer, largest one-way delay since the last statistics; -1 if none arrived"
     ),
-    "offset_us": "per peer, its clock minus this site's clock, as in force",
-    "late": "per peer, samples that came after they were due",
-    "duplicate": "per peer, samples that came twice",
+    "offset_us": "per peer, its clock minus this site's clock, as currently used",
+    "late": "per peer, samples that arrived after they were due",
+    "duplicate": "per peer, samples that arrived twice",
     "refused": "per peer, samples whose stamp was out of range",
-    "lost": "per peer, samples that the link's model lost",
+    "lost": "per peer, samples lost by the link's model",
 }
 """Meanings of fields whose description in the docstring cannot be understood on its own."""
 
@@ -516,20 +516,20 @@ def _make_time_columns(
     )
     if tick is not None:
         yield Column(
-            name="tick", values=tick, unit="tick", meaning="number of the tick", source="tick"
+            name="tick", values=tick, unit="tick", meaning="tick number", source="tick"
         )
     yield Column(
         name="log_time_ns",
         values=log_ns,
         unit="ns",
-        meaning="when it came to the recorder, Unix time",
+        meaning="time of arrival at the recorder, Unix time",
         source="log_time",
     )
     yield Column(
         name="publish_time_ns",
         values=publish_ns,
         unit="ns",
-        meaning="when it was sent, Unix time",
+        meaning="time of sending, Unix time",
         source="publish_time",
     )
 
@@ -768,7 +768,7 @@ def _make_bodies_columns(site: SiteLog, bodies: Iterable[str]) -> Iterator[Colum
     for body_index, body in enumerate(bodies):
         position_start = pose_length * body_index
         for index, axis in enumerate("xyz", position_start):
-            text = f"{axis} of the place of {body}, a body of its plant"
+            text = f"{axis} position of {body}, a body of its plant"
             yield _make_number_column(
                 site=site, field="bodies", n=index, stem=f"{body}_{axis}", unit="m", text=text
             )
@@ -811,7 +811,7 @@ def _make_sample_columns(site: SiteLog, peer: str, rate_hz: int) -> Iterator[Col
         name=f"used_{peer}_tick",
         values=used_ticks,
         unit="tick",
-        meaning=f"tick of the sample of {peer} in use",
+        meaning=f"tick of the sample from {peer} in use",
         source=source,
         known=known,
     )
@@ -819,7 +819,7 @@ def _make_sample_columns(site: SiteLog, peer: str, rate_hz: int) -> Iterator[Col
         name=f"age_{peer}_ms",
         values=age_ms,
         unit="ms",
-        meaning=f"now minus the stamp of the sample of {peer} in use",
+        meaning=f"time since the stamp of the sample from {peer} in use",
         source=f"t_ns, {source}",
         known=known,
     )

@@ -194,7 +194,7 @@ def check_signatures(
         if problem:
             finding.add(str(path), None, problem)
     files = "file is" if len(paths) == 1 else count_nouns(len(paths), "file is", "files are")
-    return finding.conclude(f"the {files} as the owner of {key_file} signed")
+    return finding.conclude(f"the {files} as signed by the owner of {key_file}")
 
 
 def _find_problem(path: Path, key: Ed25519PublicKey, progress: Progress | None) -> str:

@@ -182,7 +182,7 @@ def _judge_without_chain(*, is_announced: bool, finished: bool) -> Integrity:
         finished: True if the file was finished.
     """
     if not is_announced:
-        return Integrity(DigestState.ABSENT, "no digest chain: an older program made it")
+        return Integrity(DigestState.ABSENT, "no digest chain: written by an older program")
     if not finished:
         text = "its digest chain is not closed: the file was not finished"
         return Integrity(DigestState.OPEN, text)

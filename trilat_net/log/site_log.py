@@ -587,37 +587,37 @@ class SiteLog:
     qd_des = _RecordVector("Derivative of the reference, shape (K, m), rad/s.")
     tau = _RecordVector("Control torque of Eq. (13), shape (K, n), N m.")
     tau_x = _RecordVector(
-        "Exogenous torque in the sign of Eq. (8), shape (K, n), N m. The torque on the arm is "
-        "its negative.",
+        "Exogenous torque with the sign of Eq. (8), shape (K, n), N m. The torque on the arm "
+        "is its negative.",
     )
     theta_hat = _RecordVector(
         "Estimate of the arm's dynamic parameters, Eq. (15), shape (K, P). Those of a two-link "
         "arm are defined in Eq. (24)."
     )
     x = _RecordVector(
-        "In task space, the position and the rotation vector of the end effector as recorded, "
-        "shape (K, m), m and rad. "
-        "The vector jumps where it passes half a turn. `orientation` does not jump."
+        "In task space, the recorded position and rotation vector of the end effector, shape "
+        "(K, m), m and rad. The vector jumps where it passes half a turn. `orientation` does "
+        "not jump."
     )
     xd = _RecordVector("Derivative of x, shape (K, m), m/s and rad/s.")
     wrench = _RecordVector(
         "Wrench in task space that is equivalent to tau_x, shape (K, m), N and N m."
     )
     ch = _RecordVector(
-        "All numbers that the site's control law sends to its peers, shape (K, C). `sent` has "
-        "them by name."
+        "All entries of the vectors that the site's control law sends to its peers, shape "
+        "(K, C). `sent` maps the name of each vector to its entries."
     )
     hand = _RecordVector(
         "Action of the person or program that holds the arm, shape (K, h), see `HandInForce`."
     )
     bodies = _RecordVector(
-        "Poses of the b bodies of the site's plant as recorded, shape (K, 7 b), m and "
-        "quaternions. The plant is a simulated environment that the arm moves in."
+        "Recorded poses of the b bodies in the site's plant, a simulated environment of the "
+        "arm, shape (K, 7 b), m and quaternions."
     )
     mem = _RecordField(
         _read_objects,
-        "State of the site and its control law that no other field contains, shape (K,), a "
-        "list of numbers each.",
+        "State of the site and its control law that is in no other field, shape (K,), as a "
+        "list of numbers per record.",
     )
     t_ns = _RecordField(
         _read_ints,
@@ -625,13 +625,13 @@ class SiteLog:
     )
     late_us = _RecordField(
         _read_ints,
-        "Delay of the tick's start after its nominal time, shape (K,), us. It is 0 in virtual "
+        "Time from the nominal to the actual start of the tick, shape (K,), us; 0 in virtual "
         "time.",
     )
     sent_ns = _RecordField(
         _read_ints,
-        "Time at which each record was sent, since the epoch, both read from the site's own "
-        "clock, shape (K,), ns.",
+        "Time since the epoch at which each record was sent, on the site's own clock, shape "
+        "(K,), ns.",
     )
 
     @cached_property
