@@ -253,8 +253,8 @@ class _RecordField(cached_property[T]):
     name of the field.
 
     Args:
-        read_column: Function that takes the name of the field and returns its values in all
-            records.
+        read_column: Function that takes a `SiteLog` and the name of the field, and returns its
+            values in all records.
         meaning: Docstring of the property.
     """
 

@@ -344,7 +344,7 @@ def describe_setting(value: Any) -> str:
 
 
 _executed: dict["_CodeSource", Any] = {}
-"""Maps the content of each file that a person named to the module that was executed from it."""
+"""Maps each file that a person named, with its content, to the module executed from it."""
 
 
 class ImportedLaw(LawSettings, frozen=True, tag_field="law", tag="own"):
